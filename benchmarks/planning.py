@@ -41,12 +41,12 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 from real_robots import DATA, problem_of
 
-from calib_ros.apply import choice
+from calib_ros.apply import planning
 from calib_ros.apply.candidates import Visibility, draw_candidates
-from calib_ros.apply.choice import choose
 from calib_ros.apply.design import Candidates, Design, accuracy, predicted
-from calib_ros.apply.placement import place
+from calib_ros.apply.planning import choose
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.workspace import place
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain import Frame
@@ -77,7 +77,7 @@ def naive(design, candidates, count):
     space = Candidates(design, candidates)
     rows, size = space.rows, space.rows.shape[2]
     each = [row.T @ row for row in rows]
-    start = space.known + choice.ROUNDING * np.eye(size)
+    start = space.known + planning.HALF_THE_DIGITS * np.eye(size)
 
     def best(others, free):
         information = start + sum(each[k] for k in others)
@@ -179,7 +179,7 @@ def simulated(arm, oriented, draws):
                     ]
                 )
             )
-        share = choice.efficiency(design, candidates, chosen, unseen)
+        share = planning.efficiency(design, candidates, chosen, unseen)
         least = accuracy(design, candidates[chosen], unseen)[-1] * np.sqrt(share)
         row['bound'] = 1e3 * float(least)
         for count in (25, 50):

@@ -31,5 +31,18 @@ def filled(samples, columns=BOTH, **options):
     return fill(track(**options), samples, columns)
 
 
+def stamps_of(ms):
+    return np.array([round(each * MS) for each in ms], dtype=np.int64)
+
+
 def at(made, *ms, **options):
-    return made.at(np.array([round(each * MS) for each in ms], dtype=np.int64), **options)
+    return made.at(stamps_of(ms), **options)
+
+
+def causes(made, *ms):
+    return made.causes(stamps_of(ms))
+
+
+def came(made, *ms):
+    """Return the signs of the last moves before some times [ms]."""
+    return made.approach(stamps_of(ms), at(made, *ms).joints)

@@ -5,14 +5,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.apply.design import Design
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics import inverse, se3
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +45,7 @@ class Visibility:
                 f'the cone must be between 0 and 180 degrees, not {np.degrees(self.cone):g}'
             )
 
-    def sees(self, design: Design, joints: FloatArray) -> NDArray[np.bool_]:
+    def sees(self, design: Design, joints: FloatArray) -> Flags:
         """Return (N,) whether the target can be measured at joint values (N, n)."""
         base = {'base': design.chain.base, **dict(design.chain.frames)}[design.base]
         poses = design.targets(joints)
@@ -93,7 +94,7 @@ def draw_candidates(
     return found[:count]
 
 
-def visit_order(joints: FloatArray, velocities: FloatArray) -> NDArray[np.intp]:
+def visit_order(joints: FloatArray, velocities: FloatArray) -> Index:
     """Return a fast order (N,) in which to visit configurations (N, n).
 
     The slowest joint, at `velocities` (n,) [rad/s or m/s], determines the time of a move. Nearest
@@ -124,3 +125,90 @@ def visit_order(joints: FloatArray, velocities: FloatArray) -> NDArray[np.intp]:
 def travel_times(joints: FloatArray, velocities: FloatArray) -> FloatArray:
     """Return the times (N, N) [s] of the moves between configurations (N, n)."""
     return np.asarray(np.abs((joints[:, None] - joints[None]) / velocities).max(axis=2))
+
+
+CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+PLANE = [7, 5, 0, 2]
+"""Corners of the plane x = z of the cube, round about."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestPoses:
+    """Joint values (5, n) [rad or m] of the test poses P1 to P5, and the edge [m] of the cube."""
+
+    __test__ = False  # no test class, whatever its name
+
+    joints: FloatArray
+    edge: float
+
+
+class _Cubes(NamedTuple):
+    """Cubes about reachable centres (M, 4, 4), with the joint values (M, n) and (M, 8, n)."""
+
+    centres: FloatArray
+    middle: FloatArray
+    corners: FloatArray
+
+    def select(self, index: NDArray[np.generic]) -> _Cubes:
+        """Return some of the cubes."""
+        return _Cubes(*(each[index] for each in self))
+
+
+def iso_9283_poses(
+    design: Design,
+    rng: np.random.Generator,
+    visibility: Visibility | None = None,
+    centres: int = 500,
+    edge: float = 0.02,
+) -> TestPoses:
+    """Return five poses to verify an arm in the largest cube found (ISO 9283:1998, 6.10.2).
+
+    The arm reaches the cube and the device sees it, beside the z axis of the base; its edges are
+    parallel to the base frame. All poses have one orientation: P1 is at the centre, P2 to P5 on a
+    diagonal plane, each a tenth of the diagonal away from a corner. Cubes grow about so many
+    reachable `centres`, from this `edge` [m] on, while inverse kinematics tracks their corners. An
+    arm that cannot keep its orientation in any, as with fewer than six joints, is refused.
+    """
+    middle = draw_candidates(design, centres, rng, visibility)
+    start = np.repeat(middle[:, np.newaxis], 8, axis=1)
+    cubes = _at(design, visibility, _Cubes(design.targets(middle), middle, start), edge)
+    for factor in 1.3**0.5 ** np.arange(5):  # finer and finer
+        while len((grown := _at(design, visibility, cubes, edge * factor)).centres):
+            cubes, edge = grown, edge * factor
+    if not len(cubes.centres):
+        raise InputError(
+            'the arm keeps one orientation in no cube of its workspace: choose test poses '
+            'yourself; new ones anywhere will do'
+        )
+    travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
+    best = cubes.select(travel.argmin()[np.newaxis])
+    wanted = _poses(design, best.centres, 0.8 * edge)[0, PLANE]
+    found = inverse.solve(design.chain, wanted, best.corners[0, PLANE], design.base, design.tool)
+    if not found.converged.all():
+        raise InputError(
+            'the arm does not reach the inside of the cube that it reaches: try --seed'
+        )
+    return TestPoses(np.concatenate([best.middle, found.joints]), edge)
+
+
+def _at(design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float) -> _Cubes:
+    """Return those cubes that may have this edge [m]."""
+    count, _, joints = cubes.corners.shape
+    wanted = _poses(design, cubes.centres, edge).reshape(-1, 4, 4)
+    start = cubes.corners.reshape(-1, joints)
+    found = inverse.solve(design.chain, wanted, start, design.base, design.tool)
+    reached = found.converged
+    if visibility is not None:
+        reached &= visibility.sees(design, found.joints)
+    whole = reached.reshape(count, 8).all(axis=1)
+    middle = se3.invert(design.chain.frame(design.base).matrix) @ cubes.centres
+    whole &= np.abs(middle[:, :2, 3]).max(axis=1) > 0.5 * edge
+    return cubes._replace(corners=found.joints.reshape(count, 8, joints)).select(whole)
+
+
+def _poses(design: Design, centres: FloatArray, edge: float) -> FloatArray:
+    """Return the poses (M, 8, 4, 4) at the corners of cubes about centres (M, 4, 4)."""
+    turn = design.chain.frame(design.base).matrix[:3, :3]
+    poses = np.repeat(centres[:, np.newaxis], 8, axis=1)
+    poses[:, :, :3, 3] += edge * CORNERS @ turn.T
+    return poses

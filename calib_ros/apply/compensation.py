@@ -25,7 +25,7 @@ import numpy as np
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.following import Follower, Solution
+from calib_ros.kinematics.inverse import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits

@@ -1,24 +1,219 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How many poses to measure, which, in what order, and the accuracy to expect."""
+"""How many poses to measure, which of many candidates, and the accuracy to expect.
+
+A pose with the rows A (m, P) of information (`design.py`) is judged by a matrix of m x m:
+
+    d       ln det(M + A^T A) - ln det M = ln det(I + A C A^T)          (O1, Borm and Menq 1991)
+    task    tr V C - tr V (M + A^T A)^-1 = tr (I + A C A^T)^-1 A C V C A^T
+            with V the mean of J^T J over the poses of a task: tr V C is the mean squared error
+    o2-o5   observability indices (`identifiability.observability`), from eigenvalues
+
+Poses are chosen one by one, the best first, and then exchanged one by one while that helps
+(Fedorov 1972, Mitchell 1974). A trace over A^T A, quick for all candidates at once, bounds `d` and
+`task` from above: only candidates whose bound passes the best are judged in full. The indices o2
+to o5 say nothing while M is singular: there the choice by `d` is where exchanges start.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy import linalg
 
 from calib_ros.apply.candidates import travel_times, visit_order
-from calib_ros.apply.choice import choose, efficiency
-from calib_ros.apply.design import Design, accuracy, predicted
-from calib_ros.errors import InputError
+from calib_ros.apply.design import Candidates, Design, accuracy, information_of, predicted, times
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.identification.identifiability import indices_of
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import Criterion
+from calib_ros.settings import CRITERIA, Criterion
 from calib_ros.shown import Shown, as_frame
+
+INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
+Traces: TypeAlias = Callable[[FloatArray], FloatArray]
+"""Returns tr A K A^T (N,) of all candidates with a symmetric matrix K (P, P)."""
+
+
+def choose(
+    design: Design,
+    candidates: FloatArray,
+    count: int,
+    criterion: Criterion = 'd',
+    task: FloatArray | None = None,
+    apart: float = STILL,
+    told: Told = nobody,
+    start: Index | None = None,
+    exchanged: bool = True,
+) -> Index:
+    """Choose poses to measure among candidates (N, n) [rad or m].
+
+    Return the indices (count,) of the chosen poses, the most informative first. The criterion
+    `task` needs joint values (T, n) at which the arm must be accurate. Any two poses differ by at
+    least `apart` [rad or m] in the joint that moves most. Exchanges begin at `start`, indices
+    (count,), if a good choice is known; a quick choice skips them.
+    """
+    if count < 1:
+        raise ConfigError(f'at least one pose must be chosen, not {count}')
+    space = Candidates(design, candidates)
+    worth = _Worth(space, criterion, task)
+    first = worth if criterion == 'task' else _Worth(space, 'd')
+    pick = _Pick(space, apart)
+    told(f'{count} poses')
+    for k in range(count):
+        pick.add(pick.best(first) if start is None else int(start[k]))
+    rounds = 1
+    while exchanged and pick.exchange(worth):
+        rounds += 1
+        told(f'{count} poses, exchange {rounds}')
+    return pick.in_order(first)
+
+
+class _Pick:
+    """The candidates chosen so far, and the information that they bring."""
+
+    def __init__(self, space: Candidates, apart: float) -> None:
+        self._joints, self._rows = space.joints, space.rows
+        size = len(space.known)
+        self._upper = np.triu_indices(size)
+        each = np.swapaxes(space.rows, 1, 2) @ space.rows
+        self._each = each[(slice(None), *self._upper)]
+        self._start = space.known + HALF_THE_DIGITS * np.eye(size)  # invertible
+        self._apart = apart
+        self._near: list[Flags] = []
+        self._blocked = np.zeros(len(space.rows), dtype=np.intp)
+        self.information = self._start
+        self.chosen: list[int] = []
+
+    def best(self, worth: _Worth) -> int:
+        """Return the best candidate not chosen yet."""
+        free = np.flatnonzero(self._blocked == 0)
+        if not free.size:
+            raise InputError(
+                f'only {len(self.chosen)} of {len(self._rows)} candidates are {self._apart:g} '
+                'apart from each other: give more candidates, or plan fewer poses'
+            )
+        most = worth.at_most(self.information, self._traces)[free]
+        few = min(int(np.sqrt(free.size)), free.size - 1)
+        likely = free[np.argpartition(-most, few)[: few + 1]]
+        least = worth.of(self.information, self._rows[likely]).max()
+        promising = free[most >= least - HALF_THE_DIGITS * abs(least)]
+        return int(promising[worth.of(self.information, self._rows[promising]).argmax()])
+
+    def add(self, index: int, place: int | None = None) -> None:
+        """Choose a candidate."""
+        near = np.abs(self._joints - self._joints[index]).max(axis=1) <= self._apart
+        place = len(self.chosen) if place is None else place
+        self.chosen.insert(place, index)
+        self._near.insert(place, near)
+        self._blocked += near
+        self.information = self.information + information_of(self._rows[index])
+
+    def exchange(self, worth: _Worth) -> bool:
+        """Exchange every chosen candidate for the best one; return whether any was changed."""
+        rows = self._rows[self.chosen]
+        self.information = self._start + information_of(rows)  # no rounding left
+        changed = False
+        for place in range(len(self.chosen)):
+            old = self.chosen.pop(place)
+            self._blocked -= self._near.pop(place)
+            self.information = self.information - information_of(self._rows[old])
+            new = self.best(worth)
+            ours, theirs = worth.of(self.information, self._rows[[new, old]])
+            if ours - theirs > HALF_THE_DIGITS * abs(theirs):
+                changed = True
+            else:
+                new = old
+            self.add(new, place)
+        return changed
+
+    def in_order(self, worth: _Worth) -> Index:
+        """Return the chosen, the best first."""
+        left, ordered, information = list(self.chosen), [], self._start
+        while left:
+            best = left.pop(int(worth.of(information, self._rows[left]).argmax()))
+            information = information + information_of(self._rows[best])
+            ordered.append(best)
+        return np.array(ordered)
+
+    def _traces(self, matrix: FloatArray) -> FloatArray:
+        """Return tr A K A^T (N,) of all candidates with a symmetric matrix K (P, P)."""
+        twice = 2.0 * matrix - np.diag(np.diag(matrix))
+        return np.asarray(self._each @ twice[self._upper])
+
+
+class _Worth:
+    """What candidates are worth by a criterion."""
+
+    def __init__(
+        self, space: Candidates, criterion: Criterion, task: FloatArray | None = None
+    ) -> None:
+        if criterion not in CRITERIA:
+            raise UnknownNameError('criterion', criterion, CRITERIA)
+        if criterion == 'task' and task is None:
+            raise ConfigError('the criterion "task" needs the poses of a task')
+        self._criterion, self._factor = criterion, space.factor
+        self._wanted = None
+        if criterion == 'task' and task is not None:
+            self._wanted = space.of_task(task)
+
+    def of(self, information: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return the worth (N,) of candidates with rows (N, m, P) from information (P, P)."""
+        if self._criterion in INDICES:
+            # of M + A^T A, in sigma per metre or radian
+            back = times(rows, self._factor)
+            total = self._factor.T @ information @ self._factor + np.swapaxes(back, 1, 2) @ back
+            singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
+            return indices_of(singular)[self._criterion]
+        root = _root(information)
+        seen = times(rows, root)
+        turned = np.swapaxes(seen, 1, 2)
+        whole = np.eye(seen.shape[1]) + seen @ turned
+        if self._wanted is None:
+            return np.asarray(np.linalg.slogdet(whole)[1])
+        spread = times(seen, root.T @ self._wanted @ root) @ turned
+        return np.asarray(np.trace(np.linalg.solve(whole, spread), axis1=1, axis2=2))
+
+    def at_most(self, information: FloatArray, traces: Traces) -> FloatArray:
+        """Return what no worth (N,) passes: ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
+        if self._criterion in INDICES:  # every candidate is judged in full
+            return np.full_like(traces(information), np.inf)
+        root = _root(information)
+        inverse = root @ root.T
+        if self._wanted is None:
+            return np.asarray(6.0 * np.log1p(traces(inverse) / 6.0))
+        return traces(inverse @ self._wanted @ inverse)  # without (I + A C A^T)^-1
+
+
+def _root(information: FloatArray) -> FloatArray:
+    """Return L (P, P) with L L^T = M^-1."""
+    lower = linalg.cholesky(information, lower=True)
+    return np.asarray(linalg.solve_triangular(lower, np.eye(len(lower)), lower=True).T)
+
+
+def efficiency(
+    design: Design, candidates: FloatArray, chosen: Index, task: FloatArray | None
+) -> float:
+    """Return a lower bound on how good a choice is against the best choice of as many candidates.
+
+    For the criterion `d`, or `task` with the poses of one, as a share of poses: with 0.9 even the
+    best choice would need 90 % of them. Both criteria are convex, and the tangent at the choice
+    (Kiefer and Wolfowitz 1960) bounds what the candidates with the steepest slopes would bring.
+    """
+    space = Candidates(design, candidates)
+    ridge = HALF_THE_DIGITS * np.eye(len(space.known))
+    root = _root(space.known + information_of(space.rows[chosen]) + ridge)
+    slope = root @ root.T
+    if task is not None:
+        slope = slope @ space.of_task(task) @ slope
+    each = np.einsum('nmp,nmp->n', times(space.rows, slope), space.rows)
+    start = float(np.sum(slope * space.known))
+    steepest = np.sort(each)[-len(chosen) :]
+    return float((start + each[chosen].sum()) / (start + steepest.sum()))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,7 +241,7 @@ class Plan(Shown):
     """
 
     joints: FloatArray
-    visit: NDArray[np.intp]
+    visit: Index
     travel: float
     accuracy: FloatArray
     at_random: FloatArray
@@ -72,7 +267,7 @@ def plan(
     velocities: FloatArray | None = None,
     draws: int = 25,
     told: Told = nobody,
-    chosen: NDArray[np.intp] | None = None,
+    chosen: Index | None = None,
 ) -> Plan:
     """Plan a number of measurements, and compare them with so many random draws.
 
@@ -112,7 +307,7 @@ def fewest(
     criterion: Criterion = 'd',
     apart: float = STILL,
     told: Told = nobody,
-) -> NDArray[np.intp]:
+) -> Index:
     """Return the indices (K,) of the fewest poses with the accuracy `wanted`, the best first.
 
     It is the predicted RMS position error [m] at the task poses (T, n).

@@ -134,7 +134,6 @@ def _derivatives(
 
 
 def _columns(names: Sequence[str], program: Program) -> list[int]:
-    """Return the columns of the arm's joints in a program."""
     shape = program.positions.shape
     if len(shape) != 2 or shape[1] != len(program.names):
         raise InputError(f'{len(program.names)} joint names do not fit positions of shape {shape}')
@@ -159,7 +158,6 @@ def _columns(names: Sequence[str], program: Program) -> list[int]:
 
 
 def _put(values: FloatArray, columns: Sequence[int], new: FloatArray) -> FloatArray:
-    """Return values (N, m) with some columns replaced."""
     replaced = values.copy()
     replaced[:, columns] = new
     return replaced

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -193,8 +192,7 @@ def drive(
     joints = configurations[leg] + share[:, None] * step
     within = cell.dwell * np.arange(1, cell.poses_per_dwell + 1) / (cell.poses_per_dwell + 1)
     pose_times = (np.arange(len(configurations))[:, None] * period + within).ravel()
-    return _stamps(times, start_ns), joints, _stamps(pose_times, start_ns)
-
-
-def _stamps(times: Sequence[float] | FloatArray, start_ns: int) -> NDArray[np.int64]:
-    return start_ns + np.round(np.asarray(times) * 1e9).astype(np.int64)
+    stamps, pose_stamps = (
+        start_ns + np.round(each * 1e9).astype(np.int64) for each in (times, pose_times)
+    )
+    return stamps, joints, pose_stamps

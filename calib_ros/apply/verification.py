@@ -27,12 +27,11 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from calib_ros.apply.candidates import PLANE
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
-from calib_ros.apply.iso9283 import PLANE
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import configurations
@@ -46,7 +45,7 @@ from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
@@ -117,7 +116,7 @@ class Verification(Shown):
     comparison: Comparison
     tolerance: float | None
     confidence: float
-    group: NDArray[np.intp]
+    group: Index
     rms: float
     lower: float
     upper: float
@@ -199,12 +198,16 @@ def verify(
     numbers = np.unique(np.geomspace(len(moments), most, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    holds = arm.holds(rms)
-    decided = None if tolerance is None else _decided(tolerance, lower, upper, numbers)
-    verdict, common = decided or (HOLDS[holds], None), 1.0
+    holds, needed, common = arm.holds(rms), None, 1.0
+    verdict = HOLDS[holds]
+    if tolerance is not None:
+        deciding = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
+        needed = int(numbers[deciding[0]]) if deciding.size else None
+        verdict = 'PASS' if upper[0] <= tolerance else 'FAIL'
+        verdict = 'UNDECIDED' if lower[0] <= tolerance < upper[0] else verdict
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
-    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
+    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), verdict, needed, common)
     known = (commanded is not None, fitted, holds, arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
@@ -236,17 +239,6 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
             'usual (calib_ros plan --iso9283)'
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
-
-
-def _decided(
-    tolerance: float, lower: FloatArray, upper: FloatArray, numbers: NDArray[np.intp]
-) -> tuple[Verdict, int | None]:
-    """Return the verdict by the first limits, and which of the numbers of poses would decide."""
-    decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
-    needed = int(numbers[decided[0]]) if decided.size else None
-    if lower[0] <= tolerance < upper[0]:
-        return 'UNDECIDED', needed
-    return ('PASS' if upper[0] <= tolerance else 'FAIL'), needed
 
 
 def _check(

@@ -8,9 +8,8 @@ import argparse
 
 import numpy as np
 
-from calib_ros.apply import placement, workspace
-from calib_ros.apply.placement import task_of
-from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.apply import workspace
+from calib_ros.apply.workspace import Spread, Survey, in_base, regions, task_of
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -54,8 +53,8 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
         with screen.work('placing the task') as work:
             where = (region, options.cells, options.turns)
-            found = placement.place(arm, task, options.aim, options.model, *where, told=work)
-        screen.say(placement.in_words(found, options.aim, options.model))
+            found = workspace.place(arm, task, options.aim, options.model, *where, told=work)
+        screen.say(workspace.in_words(found, options.aim, options.model))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)

@@ -26,7 +26,7 @@ from calib_ros.files.salvage import (
 from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Told, nobody
-from calib_ros.sampling.account import Account
+from calib_ros.sampling.hints import Account
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession

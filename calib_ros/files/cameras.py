@@ -16,9 +16,9 @@ from calib_ros.files.boards import lens_of, read_board
 from calib_ros.files.detector import Detector
 from calib_ros.files.images import image_of
 from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.messages import Source, parse_sources
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
-from calib_ros.sampling.sources import Source, parse_sources
 
 NO_INFO = Refusal('before any CameraInfo', 'no CameraInfo of it has come')
 

@@ -19,8 +19,7 @@ from calib_ros.files.bags import rosbag2, typestore
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.progress import Told, nobody
-from calib_ros.sampling.messages import JOINT_STATE
-from calib_ros.sampling.sources import VALIDATION
+from calib_ros.sampling.messages import JOINT_STATE, VALIDATION
 
 
 @dataclass(frozen=True, eq=False)

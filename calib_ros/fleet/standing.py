@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
-from calib_ros.apply.chart import Drift, drift
+from calib_ros.apply.confidence import Drift, drift
 from calib_ros.errors import CalibrationError
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row

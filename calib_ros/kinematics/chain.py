@@ -111,10 +111,8 @@ class Chain(Shown):
     def _find_parallel(self) -> tuple[str, ...]:
         """Return the joints whose row joins two (nearly) parallel axes, one at least revolute.
 
-        At a prismatic axis only the direction counts, but there, too, theta tilts a parallel axis
-        only to second order, and beta is needed for a complete model.
-        Row i leads from axis i to axis i + 1 in the standard convention and from axis i - 1 to
-        axis i in the modified one.
+        At a prismatic axis, too, theta tilts a parallel axis only to second order. Row i leads
+        from axis i to the next in the standard convention, and to it in the modified one.
         """
         first, last = (0, 1) if self.convention == 'standard' else (1, 0)
         rows = self.joints[first : len(self.joints) - last]
@@ -138,10 +136,8 @@ class Chain(Shown):
         """
         frames = {name: self.frame(name) for name in self.frame_names}
         names = [name for frame in frames for name in parameters_of(frame)]
-        names += [
-            Parameter(name, DELAY) for name, each in frames.items() if each.delay is not None
-        ]
-        cameras = [name for name, each in frames.items() if each.lens is not None]
+        names += [Parameter(name, DELAY) for name in frames if frames[name].delay is not None]
+        cameras = [name for name in frames if frames[name].lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         for joint in self.joints:
             left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
@@ -194,10 +190,8 @@ class Chain(Shown):
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with another base or tool frame, which may be a new one."""
-        if name == 'base':
-            return replace(self, base=frame)
-        if name == 'tool':
-            return replace(self, tool=frame)
+        if name in ('base', 'tool'):
+            return replace(self, base=frame) if name == 'base' else replace(self, tool=frame)
         return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
 
     def with_effects(self, names: Sequence[str]) -> Chain:

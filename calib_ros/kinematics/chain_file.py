@@ -120,6 +120,9 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     parallel = content.get('parallel')
     if parallel is not None and not (isinstance(parallel, list) and _texts(parallel)):
         raise ConfigError(f'{where}: "parallel" must be a list of joint names, not {parallel!r}')
+    gravity = content.get('gravity')
+    gravity = list(Chain.gravity) if gravity is None else gravity
+    x, y, z = parse_numbers(gravity, 3, f'{where}: gravity').tolist()
     try:
         return Chain(
             name=parse_name(content.get('name', Path(where).stem), f'{where}: name'),
@@ -127,7 +130,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
             joints=tuple(_joint(row, f'{where}: joint {k + 1}') for k, row in enumerate(rows)),
             parallel=None if parallel is None else tuple(parallel),
             **parse_frames(content, where),
-            **_gravity(content, where),
+            gravity=(x, y, z),
         ).with_effect_values(
             {
                 name: parse_number(value, f'{where}: effects: {name}')
@@ -228,7 +231,6 @@ def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> st
 
 
 def _flag(content: dict[str, Any], where: str, default: bool) -> bool:
-    """Return whether a frame or lens is fixed."""
     fixed = content.get('fixed', default)
     if not isinstance(fixed, bool):
         raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
@@ -246,13 +248,6 @@ def dictionary(value: object, where: str) -> dict[str, Any]:
     if not isinstance(value, dict) or not _texts(value):
         raise ConfigError(f'{where} must be a mapping of names, not {value!r}')
     return value
-
-
-def _gravity(content: dict[str, Any], where: str) -> dict[str, Any]:
-    if content.get('gravity') is None:
-        return {}
-    x, y, z = parse_numbers(content['gravity'], 3, f'{where}: gravity').tolist()
-    return {'gravity': (x, y, z)}
 
 
 def _joint(row: object, where: str) -> Joint:

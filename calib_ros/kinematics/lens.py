@@ -18,11 +18,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.parameter import LENS_KINDS
-from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray, Index
 from calib_ros.values import SAME
 
 
@@ -178,7 +177,7 @@ def view(
     lens: Lens,
     axes: FloatArray,
     origin: FloatArray,
-    owner: NDArray[np.intp],
+    owner: Index,
     points: FloatArray,
     on_flange: bool,
 ) -> View:

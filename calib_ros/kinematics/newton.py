@@ -14,9 +14,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, Flags, FloatArray, Index
 
 
 class Normal(NamedTuple):
@@ -32,12 +31,12 @@ class Minimum(NamedTuple):
 
     x: FloatArray
     cost: FloatArray
-    settled: NDArray[np.bool_]
+    settled: Flags
     iterations: int
 
 
 def minimise(
-    linearise: Callable[[FloatArray, NDArray[np.intp]], Normal],
+    linearise: Callable[[FloatArray, Index], Normal],
     start: FloatArray,
     move: Callable[[FloatArray, FloatArray], FloatArray] = np.add,
     fall: float = 0.0,

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 FloatArray: TypeAlias = NDArray[np.float64]
+Flags: TypeAlias = NDArray[np.bool_]
+Index: TypeAlias = NDArray[np.intp]
 ROUNDS = 100
 """Steps to a fixed point, which ends in far fewer unless there is none."""
 ROUNDING = 1e-12

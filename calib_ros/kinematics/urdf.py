@@ -189,7 +189,6 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
 
 
 def _row(joint: DescribedJoint) -> Joint:
-    """Return the row of a joint, without geometry."""
     kind: JointType = 'prismatic' if joint.type == 'prismatic' else 'revolute'
     return Joint(joint.name, kind, lower=joint.lower, upper=joint.upper)
 

@@ -161,7 +161,6 @@ def parse_urdf(text: str) -> Description:
 
 
 def _robot(text: str) -> ET.Element:
-    """Return the root of the text of a URDF."""
     if _DOCTYPE.search(text):
         raise ConfigError(
             'the URDF has a <!DOCTYPE>, in which entities can stand for anything: remove it, no '

@@ -9,9 +9,8 @@ from dataclasses import astuple, replace
 
 import numpy as np
 
-from calib_ros.apply.placement import Placements
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.apply.workspace import Placements, Spread, Survey, in_base, regions
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash

@@ -15,8 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from calib_ros.apply.placement import Placements
-from calib_ros.apply.workspace import Survey, rms_map
+from calib_ros.apply.workspace import Placements, Survey, rms_map
 from calib_ros.escapes import one_line
 from calib_ros.identification.identification import Identification
 from calib_ros.kinematics.se3 import FloatArray

@@ -28,9 +28,9 @@ from sensor_msgs.msg import JointState, PointCloud2
 from trajectory_msgs.msg import JointTrajectory
 
 from calib_ros.apply.candidates import draw_candidates
-from calib_ros.apply.choice import choose
 from calib_ros.apply.compensation import Compensator, in_words
 from calib_ros.apply.design import Design
+from calib_ros.apply.planning import choose
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError

@@ -1,16 +1,32 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The boundary around every callback: an exception in one would end the spinning."""
+"""Where errors end: around every callback, every service, and the node as a whole.
+
+An exception in a callback would end the spinning.
+"""
 
 from __future__ import annotations
 
+import os
+import signal
+import sys
+import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
-from rclpy.exceptions import InvalidHandle
+import rclpy
+from rclpy.exceptions import InvalidHandle, ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError, trouble
+from calib_ros.ros.arguments import NODE, typed, usage
 
 Answer = tuple[bool, str]
 
@@ -67,3 +83,123 @@ class Boundary:
 
     def _log(self) -> None:
         self._logger.error(f'internal error: {traceback.format_exc()}')
+
+
+class DeferredTrigger:
+    """A Trigger service whose work runs on a thread of its own.
+
+    Jazzy's executors send the answer through the service's `send_response` right after the
+    callback, on the same thread. It is replaced here by one that holds the answer of an accepted
+    call back until its work has ended. An async callback starves the node's timers in rclpy's
+    single-threaded executor. Several threads, one for each such service and one for the rest,
+    would need a lock around all that the session holds, and cost an idle node 13 % more. A call
+    that comes meanwhile is refused at once.
+
+    `prepare` returns a snapshot, on the executor's thread, and `work` answers with it. `answer`
+    takes the name and either, and makes an answer of what it returns or raises.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        name: str,
+        answer: Callable[[str, Callable[[], Answer]], Answer],
+        prepare: Callable[[], Any],
+        work: Callable[[Any], Answer],
+    ) -> None:
+        self._answer = partial(answer, name)
+        self._prepare, self._work = prepare, work
+        self._thread: threading.Thread | None = None
+        self._running = threading.Event()
+        self._snapshot: list[Any] = []
+        self._service = node.create_service(Trigger, name, self._on_call)
+        self._send = self._service.send_response
+        self._service.send_response = self._send_unless_deferred
+
+    def join(self, timeout: float) -> bool:
+        """Wait for the work [s]; return whether it has ended."""
+        if self._thread is not None:
+            self._thread.join(timeout)
+        return self._thread is None or not self._thread.is_alive()
+
+    def _on_call(self, request: Any, response: Any) -> Any:
+        def prepare() -> Answer:
+            if self._running.is_set():
+                return False, 'refused: the call before is still running, wait for its answer'
+            self._snapshot = [self._prepare()]
+            return True, ''
+
+        response.success, response.message = self._answer(prepare)
+        return response
+
+    def _send_unless_deferred(self, response: Any, header: Any) -> None:
+        if not self._snapshot:
+            self._send(response, header)
+            return
+        snapshot = self._snapshot.pop()
+        self._running.set()
+        self._thread = threading.Thread(
+            target=self._run, args=(snapshot, response, header), daemon=True
+        )
+        self._thread.start()
+
+    def _run(self, snapshot: Any, response: Any, header: Any) -> None:
+        response.success, response.message = self._answer(lambda: self._work(snapshot))
+        self._running.clear()  # before the answer: the caller may call again at once
+        try:
+            self._send(response, header)
+        except Exception:  # the node is gone meanwhile, and with it the one who asked
+            return
+
+
+def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
+    """Run the node that is made until SIGINT or SIGTERM; return the exit status.
+
+    rclpy must not see the signals: its handler invalidates the context while messages are taken.
+    """
+    command = typed(sys.argv if arguments is None else [NODE, *arguments])
+    parser = usage(NODE)
+    try:
+        parser.parse_args(remove_ros_args(command)[1:])
+    except rclpy_implementation.UnknownROSArgsError as err:
+        parser.error(f'unknown ROS arguments: {err}')
+    except rclpy_implementation.RCLInvalidROSArgsError as err:
+        parser.error(str(err))
+    stop = threading.Event()
+    _handle_signals(lambda number, frame: stop.set())
+    node = executor = None
+    status, finished = 0, True
+    try:
+        rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
+        node = make()
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        node.announce()
+        while not stop.is_set() and rclpy.ok():
+            executor.spin_once(timeout_sec=0.1)
+    except ExternalShutdownException:
+        pass
+    except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
+        print(f'calibration_node: {err}', file=sys.stderr)
+        status = 1
+    except OSError as err:  # a journal of another user, say
+        print(f'calibration_node: {trouble(err)}', file=sys.stderr)
+        status = 1
+    finally:
+        _handle_signals(signal.SIG_IGN)  # a second one must not interrupt the clean-up
+        if node is not None:
+            finished = node.close()
+            status = 1 if node.lost else status
+        if executor is not None:
+            executor.shutdown()
+        rclpy.try_shutdown()
+    if not finished:  # the interpreter cannot end while a thread computes
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    return status
+
+
+def _handle_signals(handler: Any) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handler)

@@ -13,21 +13,79 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.errors import LONGEST, shortened
+from calib_ros.errors import LONGEST, CalibrationError, ConfigError, shortened
 from calib_ros.files.archive import Archive
+from calib_ros.files.history import History
+from calib_ros.files.rows import (
+    Filing,
+    Row,
+    identified,
+    judged,
+    measured_at,
+    samples_hash,
+    settings_hash,
+)
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Identification, Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.validation import ErrorFigures
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.progress import Progress
 from calib_ros.report import words
 from calib_ros.report.reports import reasons_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
-from calib_ros.ros.filer import Filer
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.settings import Settings
+
+
+class Filer:
+    """Files results of one robot, by its serial number, in a folder or URL; without one nothing.
+
+    Identifications begin with the `nominal` chain.
+    """
+
+    def __init__(self, place: str, serial: str, nominal: Chain) -> None:
+        self._history = History(place) if place else None
+        self.serial, self._nominal = serial, nominal
+        if place and not serial:
+            raise ConfigError('a history needs the serial number of the robot: set serial as well')
+
+    def identified(self, problem: Problem, result: Identification, settings: Settings) -> str:
+        """File an identification; return in words why that was not possible."""
+        return self._file(lambda: identified(result, self._about(problem, settings)))
+
+    def validated(
+        self, session: CalibrationSession, figures: tuple[ErrorFigures, ErrorFigures], holds: bool
+    ) -> str:
+        """File how a session's calibration does on its samples, as `identified` does."""
+        calibration = session.calibration
+        assert calibration is not None  # else there were no figures
+        chain, verdict = calibration.chain, 'holds' if holds else 'does not hold'
+
+        def row() -> Row:
+            about = self._about(session.problem(), session.settings, table_hash(chain))
+            return judged(chain, figures[1], figures[0], verdict, about)
+
+        return self._file(row)
+
+    def _about(self, problem: Problem, settings: Settings, *more: str) -> Filing:
+        sets = (*problem.sets, *problem.judging)
+        hashed = settings_hash(self._nominal, settings, *more)
+        return Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
+
+    def _file(self, row: Callable[[], Row]) -> str:
+        try:
+            if self._history is not None:
+                self._history.file(row())
+        except (CalibrationError, OSError) as err:
+            return f'; not filed in the history: {err}'
+        return ''
+
 
 ANSWER_LENGTH = LONGEST // 2
 """Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
@@ -80,13 +138,13 @@ class Identifying:
         self._advice = ''  # of the last identification, that on what is graver first
         self._report: Path | None = None  # of the last identification, if it was refused
 
-    def snapshot(self, topics: Sequence[str], serial: str) -> Snapshot:
+    def snapshot(self, topics: Sequence[str]) -> Snapshot:
         """Return the problem and all that goes with it, as they are now."""
         session, self._advice, self._report = self._session, '', None
         problem = session.problem()
         samples = tuple(session.usable)
         origin = {
-            'robot_serial': serial,
+            'robot_serial': self._filer.serial,
             'topics': topics,
             'first_stamp_ns': min(sample.stamp_ns for sample in samples),
             'last_stamp_ns': max(sample.stamp_ns for sample in samples),

@@ -37,22 +37,18 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.report import words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary
-from calib_ros.ros.deferred import DeferredTrigger
+from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
 from calib_ros.ros.diagnostics import Diagnostics
-from calib_ros.ros.filer import Filer
-from calib_ros.ros.identifying import Identifying, Snapshot
+from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
-from calib_ros.ros.running import run
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
 from calib_ros.sampling.problems import check_settings
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import STANDARD, parse_sources
 
 DIAGNOSTICS_PERIOD = 1.0
 """Time [s] between two reports on /diagnostics, as is usual there."""
@@ -123,7 +119,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     def _serve(self) -> list[DeferredTrigger]:
         """Create the services; return those that work on a thread of their own."""
         for kind, name, callback in (
-            (Trigger, '~/cancel', self._on_cancel),
+            (Trigger, '~/cancel', lambda request: self._identifying.progress.cancel()),
             (Trigger, '~/capture', self._on_capture),
             (Trigger, '~/remove_last', self._on_remove_last),
             (Trigger, '~/validate', self._on_validate),
@@ -132,8 +128,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             (SetBool, '~/record', self._on_record),
         ):
             self.create_service(kind, name, self._answering(name, callback))
+        identify = self._identifying
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
-            ('~/identify', self._to_identify, self._identifying.run),
+            ('~/identify', lambda: identify.snapshot(self._inputs.topics), identify.run),
             ('~/export', self._keeper.exportable, self._keeper.export),
             ('~/save', self._keeper.to_save, self._on_save),
             ('~/check', self.session.recent, self._on_check),
@@ -165,10 +162,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     # Parameters
 
     def _configuration(self) -> str:
-        """Return what this node is set to as a parameter file."""
         given = self._given
-        named = ('base_link', 'tip_link', 'serial')
-        more = {name: getattr(given, name) for name in named if getattr(given, name)}
+        more = {**given.links, 'serial': given.serial}
+        more = {name: value for name, value in more.items() if value}
         return words.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
@@ -183,7 +179,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return SetParametersResult(successful=True)
 
     def _take_parameters(self, changes: Sequence[Any]) -> None:
-        """Take over settings that have changed while the node runs."""
         self._take_messages()
         settings = changed(self.session.settings, changes)
         if settings != self.session.settings:
@@ -192,7 +187,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     # Topics in
 
     def _streams(self) -> list[Stream]:
-        """Return what is heard: joint states and measurements."""
         settings = self.session.settings
         streams = [
             Stream(topic, JOINT_STATE) for topic in settings.joint_topics or ('joint_states',)
@@ -224,7 +218,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return super().create_subscription(msg_type, topic, taken, *args, **more)
 
     def _take_messages(self) -> None:
-        """Take what has come in the order in which it came."""
         for problem in feed(self.session, self._inputs.take(), deserialised):
             self.get_logger().error(problem)
 
@@ -237,7 +230,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self.get_logger().error(f'poses are kept in memory only: {self._archive.error}')
 
     def _resume(self) -> None:
-        """Go on with the newest journal of this robot."""
         samples, warnings = self._archive.resume()
         self.session.restore(samples)
         for warning in warnings:
@@ -270,15 +262,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._take_messages()
         return begin(*arguments)
 
-    def _to_identify(self) -> Snapshot:
-        return self._identifying.snapshot(self._inputs.topics, self._given.serial)
-
     def _accept(self, found: Calibration, published: Published, samples: Sequence[Sample]) -> None:
         self._keeper.adopt(found, published, samples)
         self._guide.show(found)
-
-    def _on_cancel(self, request: Any) -> Answer:
-        return self._identifying.progress.cancel()
 
     def _on_capture(self, request: Any) -> Answer:
         socket = self.get_parameter('socket').value
@@ -355,7 +341,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return words
 
     def _answers(self) -> dict[str, Any]:
-        """Return for the diagnostics what came of calls and requests."""
         return {
             'last identification': self._identifying.last,
             'observability': self._identifying.observability,

@@ -10,26 +10,80 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros.atomic import confined, write_file
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.archive import Archive
 from calib_ros.files.export import exports, urdf_foot
 from calib_ros.files.vendors import vendor_files
 from calib_ros.identification.calibration import Calibration, parse_calibration
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import parse_chain, read_text
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf import corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.ros import to_ros
-from calib_ros.ros.broadcast import Broadcast
 from calib_ros.ros.parameters import Given
 from calib_ros.ros.to_ros import LATCHED
+from calib_ros.sampling.messages import parse_sources
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import parse_sources
+
+
+class Broadcast:
+    """Publishes where the arm stands, and where on its flange the target is.
+
+    The arm's base and flange are the links of the URDF that the chain lies between, if the chain
+    is that of a URDF; else the frames before and behind the DH table. Where the device is on the
+    flange (`in_hand`) the base leads to the target that stands, and the tool to the camera.
+    """
+
+    def __init__(self, node: Node, given: Given, in_hand: bool, urdf: str) -> None:
+        self._node, self._given, self._in_hand = node, given, in_hand
+        self._publisher = None
+        if not given.base_frame and not given.flange_frame:
+            return
+        try:
+            from tf2_msgs.msg import TFMessage
+        except ImportError as err:
+            raise ConfigError(
+                f'base_frame and flange_frame need tf2_msgs ({err}): apt install '
+                'ros-jazzy-tf2-msgs, or leave them empty'
+            ) from err
+        self._type = TFMessage
+        self._publisher = node.create_publisher(TFMessage, '/tf_static', to_ros.LATCHED)
+        self._base = self._tool = np.eye(4)
+        if urdf:
+            described = chain_from_urdf(urdf, **given.links)
+            self._base = described.frame('base').matrix
+            self._tool = described.frame('tool').matrix
+
+    def publish(self, chain: Chain, world: str) -> None:
+        """Publish the frames of a calibrated chain whose measurements are in a frame `world`."""
+        if self._publisher is None:
+            return
+        given, transforms = self._given, []
+        target = given.target_frame
+        stands, moves = (target, world) if self._in_hand else (world, target)
+        if not world:
+            self._node.get_logger().warning('the measurements name no frame: /tf_static lacks it')
+        if given.base_frame and stands:
+            base = chain.frame('base').matrix @ se3.invert(self._base)
+            transforms.append(self._transform(stands, given.base_frame, base))
+        if given.flange_frame and moves:
+            tool = se3.invert(self._tool) @ chain.frame('tool').matrix
+            transforms.append(self._transform(given.flange_frame, moves, tool))
+        self._publisher.publish(self._type(transforms=transforms))
+
+    def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:
+        message = TransformStamped(child_frame_id=child, transform=to_ros.transform(matrix))
+        message.header.frame_id = parent
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        return message
+
 
 FILENAMES = ('target_filename', 'calibration_filename')
 """Parameters that name files."""
@@ -51,12 +105,7 @@ class Keeper:
     """Keeps the calibration of a session, its publishers and its files together."""
 
     def __init__(
-        self,
-        node: Node,
-        session: CalibrationSession,
-        archive: Archive,
-        given: Given,
-        urdf: str,
+        self, node: Node, session: CalibrationSession, archive: Archive, given: Given, urdf: str
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
         self._given, self._urdf = given, urdf
@@ -151,8 +200,7 @@ class Keeper:
         chain, record = calibration.chain, calibration.record
         links = self._given.links
         forms = exports(chain, nominal, joints, record)
-        ends = {'base_link': links['base_link'], 'tip_link': links['tip_link']}
-        forms += vendor_files(chain, nominal, record, self._urdf, ends)
+        forms += vendor_files(chain, nominal, record, self._urdf, links)
         files = {each.name: each.content for each in forms}
         if self._urdf:
             text = corrected_urdf(self._urdf, chain, **links)

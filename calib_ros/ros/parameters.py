@@ -9,9 +9,10 @@ Every field of `Settings` is a parameter of the same name, with its text and its
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from types import SimpleNamespace
+from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
@@ -35,36 +36,16 @@ DESCRIPTION_WAIT = 2.0 * SILENCE
 """Time [s] for which the node waits for the robot's description."""
 
 
-class Links(TypedDict):
-    """The links of a URDF between which the arm is; None for those that are found."""
+class Given(SimpleNamespace):
+    """Parameters by their names, and the `settings`, with which a node was started.
 
-    base_link: str | None
-    tip_link: str | None
-
-
-@dataclass(frozen=True)
-class Given:
-    """Parameters that a node was started with; what may change is read where it is used."""
-
-    chain: str
-    base_link: str
-    tip_link: str
-    serial: str
-    history: str
-    data_dir: str
-    allowed_folders: tuple[str, ...]
-    resume: bool
-    autoload: bool
-    candidates: str
-    base_frame: str
-    flange_frame: str
-    target_frame: str
-    settings: Settings
+    What may change is read where it is used.
+    """
 
     @property
-    def links(self) -> Links:
-        """Return the links that are given."""
-        return Links(base_link=self.base_link or None, tip_link=self.tip_link or None)
+    def links(self) -> dict[str, Any]:
+        """Return the links of a URDF between which the arm is; None for those that are found."""
+        return {'base_link': self.base_link or None, 'tip_link': self.tip_link or None}
 
 
 def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
@@ -92,8 +73,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
             'parameter "chain" is not set: give the chain file of the robot, for example '
             '--ros-args -p chain:=ur10e'
         )
-    known = own | {'settings': settings}
-    return Given(**{each.name: known[each.name] for each in fields(Given)}), [*overrides]
+    return Given(**own, settings=settings), [*overrides]
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:

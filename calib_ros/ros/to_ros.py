@@ -47,14 +47,13 @@ def dh_parameters(chain: Chain) -> Float64MultiArray:
 
 def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) -> PoseStamped:
     """Return the pose of the target at joint values (n) of a stamp."""
-    found = transform(chain.forward(np.array([joints]))[0])
-    at = found.translation
+    matrix = chain.forward(np.array([joints]))[0]
     message = PoseStamped()
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
     message.header.frame_id = frame_id
-    message.pose.position = Point(x=at.x, y=at.y, z=at.z)
-    message.pose.orientation = found.rotation
+    message.pose.position = Point(**dict(zip('xyz', matrix[:3, 3].tolist(), strict=True)))
+    message.pose.orientation = transform(matrix).rotation
     return message
 
 

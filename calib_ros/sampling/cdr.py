@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.kinematics.se3 import Flags, Index
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORM, TRANSFORMS, Readings
 from calib_ros.values import MOST_NAMES
 
@@ -61,7 +62,7 @@ class Layout:
     mask: NDArray[np.uint8]
     last: slice
 
-    def among(self, rows: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def among(self, rows: NDArray[np.uint8]) -> Flags:
         """Tell which of some messages (N, ...) have this layout."""
         part = slice(self.begin, len(self.mask))
         if (rows[:, part] == self.text[part]).all():  # the usual case, at half the cost
@@ -76,7 +77,7 @@ class Alike:
     """Messages of one layout: which of a batch they are, and their bytes (N, ...)."""
 
     layout: Layout
-    which: NDArray[np.intp]
+    which: Index
     rows: NDArray[np.uint8]
 
     def of(self, k: int) -> Readings:

@@ -11,22 +11,27 @@ live robot, and whatever is not used is counted by its cause.
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.hints import Hint, restless, sparse
-from calib_ros.sampling.making import ROW_WIDTH, Maker, Matched, Numbered
-from calib_ros.sampling.rows import Stamps
+from calib_ros.sampling.making import ROW_WIDTH, Maker, Numbered
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, Slice, StreamKey
-from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
+from calib_ros.sampling.slices import (
+    JOINTS,
+    NO_ACCIDENT,
+    Piece,
+    Series,
+    Slice,
+    Stamps,
+    StreamKey,
+    Waiting,
+)
+from calib_ros.sampling.stops import SAMPLED, Known, Plan, Rests, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
-from calib_ros.sampling.waiting import Waiting
 from calib_ros.settings import Settings
 
 REST_S = 0.5 * Settings.shortest_stop
@@ -64,9 +69,7 @@ class Collector:
         """What no sample is made of in the ordinary course of things, by cause."""
         self.notes: Counter[str] = Counter()
 
-    def known(
-        self, now_ns: int | None
-    ) -> tuple[tuple[Stamps, FloatArray], list[tuple[Stamps, FloatArray]]]:
+    def known(self, now_ns: int | None) -> tuple[Series, list[Series]]:
         """Return stamps and joint values, and stamps and rows (N, ROW_WIDTH) of waiting positions.
 
         Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
@@ -89,8 +92,10 @@ class Collector:
         can tell: none comes late for them, and there is room. That one is the first of those
         beyond two stamps of joints between which nobody else has anything to do.
         """
+        if self.track.full:  # the older half is let go: nothing may be held any longer
+            self._round(self._complete_ns)
         if self.track.full:
-            self._make_room()
+            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
         count = len(given)
         joints = given.where(JOINTS)
         stamps = given.times[joints]
@@ -165,11 +170,8 @@ class Collector:
         """Return what looks wrong with the joint states, of so many measurements."""
         needed = self.rests.needed(self.settings.still)
         between = self.dropped[f'measurements: {APART}']
-        found = [
-            None if needed is None else restless(needed, self.settings.still),
-            sparse(between, measurements, self.settings.max_gap),
-        ]
-        return [hint for hint in found if hint is not None]
+        found = [] if needed is None else [restless(needed, self.settings.still)]
+        return found + sparse(between, measurements, self.settings.max_gap)
 
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
@@ -226,7 +228,9 @@ class Collector:
         if place:
             stamps = self.track.samples()[0]
             stamps = stamps[stamps >= begin]
-            self.maker.in_socket(place, stamps, self.track.at(stamps, standing=True))
+            joints = self.track.at(stamps, standing=True).joints
+            came = self.track.approach(stamps[:1], joints[:1])[0]
+            self.maker.in_socket(place, int(stamps[-1]), joints, came)
             return 1, ''
         self._round(begin)  # a stop before is not waited for any longer
         before, dropped = len(self.maker.fresh), self.dropped.copy()
@@ -257,13 +261,16 @@ class Collector:
         self._sort()
         if until <= self._settled_ns:
             return
+        plan = Plan(self._settled_ns, self._sampled_ns)
         if self.settings.mode == 'continuous':
-            self._take_each(until, rounds)
+            for end in (*(each - self._late_ns for each in rounds[:-1]), until):
+                plan.sample(0, end)
         else:
-            until = self._take_stops(until, rounds, ends_here)
-        self._settled_ns = max(self._settled_ns, until)
+            self._plan_stops(plan, until, rounds or (self.track.newest_ns,), ends_here)
+        self._carry_out(plan)
+        self._sampled_ns, self._settled_ns = plan.sampled_ns, plan.done_ns
         margin = round((REST_S + self.settings.max_gap) * 1e9)
-        self.track.release(min(until, self._complete_ns) - margin)
+        self.track.release(min(plan.done_ns, self._complete_ns) - margin)
 
     def _sort(self) -> None:
         twice = self.track.sort()
@@ -274,52 +281,28 @@ class Collector:
             if twice:
                 self.dropped['measurements: same stamp twice'] += twice
 
-    def _take_each(self, until: int, rounds: Sequence[int]) -> None:
-        """Make a sample of every measurement up to a stamp of the joints, round by round."""
-        ends = np.maximum.accumulate(np.array(rounds[:-1], dtype=np.int64)) - self._late_ns
-        found: list[Numbered] = []
-        for key, rows in sorted(self.waiting.items()):
-            stamps = rows.stamps - self.delay_ns
-            due = stamps <= until
-            if not due.any():
-                continue
-            motion = self.track.at(stamps[due])
-            self._count_causes(motion.cause)
-            good = motion.cause == 0
-            index = np.flatnonzero(due)[good]
-            numbers, stamps = np.searchsorted(ends, stamps[index]), rows.stamps[index]
-            values, motion = rows.values[index], motion.rows(good)
-            matched = Matched(key, numbers, stamps, values, motion, self.delay_ns)
-            found += self.maker.of_each(matched)
-            rows.keep(~due)
-        self.maker.add(found)
-
-    def _take_stops(self, until: int, rounds: Sequence[int], ends_here: bool) -> int:
-        """Make samples of the stops that end before a stamp; return what has been dealt with."""
+    def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
+        """Plan a sample of each stop that ends before a stamp, and note which pass unseen."""
         settings = self.settings
-        newest = self.track.newest_ns
         stands = self.track.standing(settings.still, REST_S)
         shortest = round(settings.shortest_stop * 1e9)
-        seen = seen_stops(stands, rounds or (newest,), self._settled_ns, self._late_ns, shortest)
-        for found, now in zip(seen, rounds or (newest,), strict=True):
+        seen = seen_stops(stands, rounds, self._settled_ns, self._late_ns, shortest)
+        for found, now in zip(seen, rounds, strict=True):
             self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS, now))
-        plan = Plan(self._settled_ns, self._sampled_ns)
-        plan.of_stands(stands, until, None if ends_here else newest, settings)
-        stops = plan.stops
-        if stops:
+        plan.of_stands(stands, until, None if ends_here else self.track.newest_ns, settings)
+        if stops := plan.stops:
             spans = [(plan.begins[k], plan.ends[k]) for k in stops]
-            where = self.track.where(np.sum(spans, axis=1) // 2)
-            known = self._known.meets(spans, where, 2.0 * settings.still)
-            for k in itertools.compress(stops, known):
-                plan.why[k] = SAMPLED
-        self._carry_out(plan)
-        self._sampled_ns = plan.sampled_ns
-        return plan.done_ns
+            where = self.track.at(np.sum(spans, axis=1) // 2, standing=True).joints
+            for k, span, joints in zip(stops, spans, where, strict=True):
+                if self._known.meets(*span, joints, 2.0 * settings.still):
+                    plan.why[k] = SAMPLED
 
     def _carry_out(self, plan: Plan) -> None:
         """Make a sample of each stream at the stops of a plan, and count what is not used."""
         self.rests.sampled += len(plan.stops)
-        ends, calm = np.array(plan.ends), np.array(plan.begins) + round(self.settings.settle * 1e9)
+        moving = self.settings.mode == 'continuous'
+        settle = 0 if moving else round(self.settings.settle * 1e9)
+        ends, calm = np.array(plan.ends), np.array(plan.begins) + settle
         wanted = np.array([not why for why in plan.why], dtype=bool)
         found: list[Numbered] = []
         for key, rows in sorted(self.waiting.items()):
@@ -329,27 +312,26 @@ class Collector:
                 continue
             stamps = stamps[:due]
             numbers = np.searchsorted(ends, stamps)
-            inside = wanted[numbers]
-            if not inside.all():
-                cause = self.track.causes(stamps[~inside])
-                self._count_causes(cause)
-                for k, count in Counter(numbers[~inside][cause == 0].tolist()).items():
-                    self.unused[f'measurements: {plan.why[k]}'] += count
-            early = inside & (stamps < calm[numbers])
+            cause = self.track.causes(stamps)
+            self._count_causes(cause)
+            known, inside = cause == 0, wanted[numbers]
+            for k, count in Counter(numbers[known & ~inside].tolist()).items():
+                self.unused[f'measurements: {plan.why[k]}'] += count
+            early = known & inside & (stamps < calm[numbers])
             if early.any():
                 self.unused['measurements: the arm had just stopped'] += int(early.sum())
-            good = np.flatnonzero(inside & ~early)
-            if len(good):
-                motion = self.track.at(stamps[good], standing=True)
-                self._count_causes(motion.cause)
-                good, motion = good[motion.cause == 0], motion.rows(motion.cause == 0)
+            good = np.flatnonzero(known & inside & ~early)
             if len(good):
                 more = len(good) - len(np.unique(numbers[good]))
                 if key.images and more:
                     self.unused['measurements: of a stop of which one image is used'] += more
-                numbers, stamps, values = numbers[good], rows.stamps[good], rows.values[good]
-                matched = Matched(key, numbers, stamps, values, motion, self.delay_ns)
-                found += self.maker.of_stops(matched, self.settings.sigma_position)
+                motion = self.track.at(stamps[good], standing=not moving)
+                piece = Piece(key, numbers[good], rows.stamps[good], rows.values[good])
+                begins = np.flatnonzero(np.diff(piece.places, prepend=-1))
+                begins = np.arange(len(good)) if moving else begins
+                came = self.track.approach(stamps[good[begins]], motion.joints[begins])
+                delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
+                found += self.maker.samples(piece, motion, begins, came, delay, sigma)
             rows.release(due)
         self.maker.add(found)
 
@@ -358,21 +340,16 @@ class Collector:
         self.maker.forget(sample)
         self._known.forget(sample.stamp_ns - round(1e9 * sample.delay))
 
-    def _count_causes(self, cause: NDArray[np.intp]) -> None:
+    def _count_causes(self, cause: Index) -> None:
         for k, text in enumerate(CAUSES[1:], start=1):
             count = int((cause == k).sum())
             if count:
                 self.dropped[f'measurements: {text}'] += count
 
-    def _make_room(self) -> None:
-        """Let go the older half of the samples of some joints; nothing may be held any longer."""
-        self._round(self._complete_ns)
-        if self.track.full:
-            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
-
     def start_anew(self) -> None:
         """Go on after the clock jumped back: finish what came before, keep the samples."""
         self.finish()
         self.notes['the clock jumped back'] += 1
-        self.track.clear()
+        settings = self.settings
+        self.track = Track(self._revolute.tolist(), settings.max_gap, settings.joint_buffer)
         self._newest_ns = self._advanced_ns = self._settled_ns = self._sampled_ns = 0

@@ -5,22 +5,28 @@
 The speed of the target by the joints and the chain, and the speed by the measurements, are the
 same signal twice. Angular speed depends on no frame; linear speed is that of the flange, near
 enough to that of the target for a start. The lag of the greatest correlation is refined by a
-parabola; the identification then fits the rest as a parameter (`base.delay`).
+parabola; in motion the identification then fits the rest as a parameter (`base.delay`).
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.rows import Stamps
+from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.sampling.collector import Collector
+from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
+from calib_ros.sampling.making import POSITION, QUAT
+from calib_ros.sampling.slices import JOINTS, Piece, Rows, Series, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
+from calib_ros.shown import NAMED
+from calib_ros.values import MOST_NAMES
 
 SMOOTHING = 0.5 * Settings.max_gap
 """Time over which speeds are taken [s]; short against a move, long against the noise."""
@@ -106,7 +112,7 @@ def find_delay(
     )
 
 
-def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
+def _rivals(score: FloatArray, best: int) -> Index:
     """Return at which other peaks of the correlation as much of the speeds is left."""
     found = peaks(score, RISE)
     others = found[found != best]
@@ -114,8 +120,11 @@ def _rivals(score: FloatArray, best: int) -> NDArray[np.intp]:
     return np.asarray(others[left < ALIKE * least])
 
 
-def peaks(score: FloatArray, rise: float) -> NDArray[np.intp]:
-    """Return where correlations (N,) rise by so much above the valleys towards higher ones."""
+def peaks(score: FloatArray, rise: float) -> Index:
+    """Return where correlations (N,) rise by so much above the valleys towards higher ones.
+
+    As scipy.signal.find_peaks, which takes 0.4 s and 35 MB to load.
+    """
     padded = np.pad(score, 1, constant_values=-1.0)
     found = []
     tops = (padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:])
@@ -158,7 +167,7 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
     part = slice(*known)
     other[part] = second[part] - second[part].mean()
 
-    def total(values: FloatArray, shift: NDArray[np.intp] | int = 0) -> FloatArray:
+    def total(values: FloatArray, shift: Index | int = 0) -> FloatArray:
         running = np.concatenate([[0.0], np.cumsum(values)])
         return np.asarray(running[end + shift] - running[begin + shift])
 
@@ -170,3 +179,153 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
     least = np.finfo(float).eps * (one @ one) * (other @ other)
     good = (count * STEP >= LEAST_MOTION) & (squares > least)
     return np.where(good, products / np.sqrt(np.where(good, squares, 1.0)), -1.0)
+
+
+WATCH_NS = round(5e9 * LEAST_MOTION)
+"""Time over which a watch looks."""
+DENSE_NS = round(0.8e9 * STEP)
+"""Time in which it keeps one sample; more tell no more of speeds."""
+EARLY = SMOOTHING / 2.0**0.5
+"""Time [s] by which measurements of a stop may be stamped too early: the accuracy of one delay. Of
+what then shows the arm leaving, most is left out as spikes; the rest moves the mean by less than
+the noise of a measurement."""
+
+
+class Clocks:
+    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops.
+
+    Joint values and poses are watched while the arm moves. Once the clocks are seen to agree that
+    ends until measurements at stops show unrest: where a clock was moved they do, and are left out
+    or refused. In mode continuous, which has no stops, it goes on.
+    """
+
+    def __init__(self, chain: Chain, settings: Settings) -> None:
+        self.settings = settings
+        self._chain = chain
+        self._continuous = settings.mode == 'continuous'
+        self._found: Delay | None = None  # in the motion that is sampled
+        self._looked_ns = 0
+        self._joints = Rows(len(chain.joints), settings.pose_buffer)
+        self._poses: dict[StreamKey, Rows] = {}
+        self._unrest = self._taken = self._agreed = 0
+        self._awake = True
+        self._seen: Delay | None = None
+        self._unclear: Delay | None = None  # one with rivals, while no other was seen
+        self._moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
+        """By how much [s] it changed, and after how many samples at least."""
+
+    @property
+    def delay(self) -> Delay | None:
+        """Return how late the measurements are stamped, as far as the motion shows."""
+        if not self._continuous:
+            return self._seen
+        return None if self._found is None or self._found.rivals else self._found
+
+    def wake(self, unrest: int, calm: int, taken: int) -> None:
+        """Watch again if more measurements at stops were not at rest.
+
+        Before the first of these there were `calm` samples; so many are `taken` by now.
+        """
+        if unrest > self._unrest and not self._awake:
+            self._awake, self._agreed = True, calm
+        self._unrest, self._taken = unrest, taken
+
+    def take(self, pieces: Sequence[Piece]) -> None:
+        """Watch values of all joints, and measured positions with the rotation if known."""
+        for key, _, stamps, numbers in pieces if self._awake else ():
+            rows = self._joints
+            if isinstance(key, StreamKey):
+                if not key.is_place or (key not in self._poses and len(self._poses) == MOST_NAMES):
+                    continue
+                rows = self._poses.setdefault(key, Rows(7, rows.capacity))
+            elif len(key) < rows.width:
+                continue
+            last = rows.stamps[-1:] if rows.count else np.array([-DENSE_NS])
+            fresh = np.flatnonzero(np.diff(stamps // DENSE_NS, prepend=last // DENSE_NS))
+            fresh = fresh[: rows.capacity - rows.count]
+            rows.extend(stamps[fresh], numbers[fresh, : rows.width])
+
+    @property
+    def _begun_ns(self) -> int | None:
+        return int(self._joints.stamps[0]) if self._joints.count else None
+
+    def calm(self, given: Slice) -> tuple[int, int]:
+        """Return stamps of joints between which there is nothing to look for."""
+        begun = self._begun_ns
+        if begun is None:
+            begun = int(given.times[given.where(JOINTS)[:1]].sum())
+        return begun - WATCH_NS, begun + WATCH_NS
+
+    def look(self, now_ns: int) -> None:
+        """Look what the motion shows if it is time to, and begin anew."""
+        if not (self._awake and self._begun_ns and abs(now_ns - self._begun_ns) > WATCH_NS):
+            return
+        joints, poses = self._joints, self._poses.values()
+        for rows in (joints, *poses):
+            rows.sort()
+        measured = [(rows.stamps, rows.values) for rows in poses]
+        found = self._delay_of((joints.stamps, joints.values), measured)
+        joints.release(joints.count)
+        self._poses.clear()
+        if found is None:
+            return
+        known = self._seen
+        every = (found.seconds, *found.rivals)
+        # Speeds over SMOOTHING tell no finer difference.
+        if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
+            if found.rivals:
+                self._unclear = found if known is None else None
+                return
+            if known is not None:
+                self._moves.append((found.seconds - known.seconds, self._agreed))
+            self._seen, self._unclear = found, None
+        self._agreed = self._taken
+        self._awake = self._continuous
+
+    def find(self, collector: Collector, now_ns: int | None) -> None:
+        """Look for the delay after some time of motion, until it shows, for a collector to use.
+
+        Nothing is sampled before; at the end (None) what has come must do. One that has rivals is
+        not used.
+        """
+        if not collector.holding:
+            return
+        if now_ns is not None and 0 <= now_ns - self._looked_ns < 1e9 * LEAST_MOTION:
+            return
+        self._looked_ns = now_ns or 0
+        self._found = self._delay_of(*collector.known(now_ns))
+        if self.delay is not None:
+            collector.delay_ns = round(self.delay.seconds * 1e9)
+        collector.holding = self.delay is None and now_ns is not None
+
+    def _delay_of(self, joints: Series, streams: Sequence[Series]) -> Delay | None:
+        """Return how late poses are, by the stream that shows it best.
+
+        Rows (N, 7 or more) of each stream have NaN where no rotation is known.
+        """
+        found = []
+        for stamps, rows in streams:
+            oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
+            turns = se3.from_quat(rows[:, QUAT]) if oriented else None
+            positions, max_gap = rows[:, POSITION], self.settings.max_gap
+            delay = find_delay(self._chain, *joints, stamps, positions, turns, max_gap)
+            found += [] if delay is None else [delay]
+        return max(found, key=lambda delay: (not delay.rivals, delay.correlation), default=None)
+
+    def hints(self) -> list[Hint]:
+        """Return what looks wrong with the clocks."""
+        found = []
+        delay, known = self.delay, self.settings.delay
+        if self._moves:
+            found.append(moved(self._moves))
+        elif delay is not None and not self._continuous and self._spoils(delay.seconds):
+            found.append(disagreement(delay.seconds, known))  # in motion it is fitted
+        unclear = self._found if self._continuous else self._unclear
+        if unclear is not None and unclear.rivals and not known:
+            delays = (unclear.seconds, *unclear.rivals)
+            if self._continuous or all(map(self._spoils, delays)):
+                found.append(ambiguous(delays))
+        return found
+
+    def _spoils(self, delay: float) -> bool:
+        return not -EARLY <= delay - self.settings.delay <= self.settings.settle

@@ -1,26 +1,124 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From what messages say to pieces by stream, by the names in them: joints, frames, targets."""
+"""What is let in by the names in messages: joints, frames, targets; and the samples kept."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.sampling.messages import LARGEST, MessageError, Readings
-from calib_ros.sampling.names import OTHERS, FrameNames, JointNames
-from calib_ros.sampling.slices import JOINTS, POSES, Piece, StreamKey
-from calib_ros.sampling.sources import Source
+from calib_ros.kinematics.se3 import Index
+from calib_ros.sampling.messages import LARGEST, Readings, Source
+from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
+from calib_ros.settings import EXCEPTION
+from calib_ros.values import MOST_NAMES
+
+Layout: TypeAlias = tuple[Columns, Index]
+OTHERS = 'none of the joints in the message'
+
+
+class JointNames:
+    """Finds the joints of a chain in messages that may name others, and only part of them.
+
+    `names` are those that messages have for the joints of the chain, in its order.
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._layouts: dict[tuple[str, ...], Layout] = {}
+        self.foreign: tuple[str, ...] = ()
+        """Names that come while some of the chain's joints are never named."""
+
+    def layout(self, key: tuple[str, ...]) -> Layout:
+        """Return which joints of the chain messages name, and the columns of their values."""
+        if key not in self._layouts:
+            if len(self._layouts) == MOST_NAMES:
+                self._layouts.clear()
+            known = [(k, key.index(n)) for k, n in enumerate(self._names) if n in key]
+            index = np.array([i for _, i in known], dtype=np.intp)
+            self._layouts[key] = tuple(k for k, _ in known), index
+            named = {name for names in self._layouts for name in names}
+            missing = [name for name in self._names if name not in named]
+            self.foreign = tuple(sorted(named)) if missing else ()
+        return self._layouts[key]
+
+    def foreign_ones(self, missing: Sequence[int]) -> str:
+        """Return in words that other joints come than those of some numbers; empty if none do."""
+        if not (missing and self.foreign):
+            return ''
+        return (
+            f'waiting for joint states, set joint_names? Those that come name '
+            f'{", ".join(self.foreign)}, not {", ".join(self._names[k] for k in missing)}'
+        )
+
+
+class FrameNames:
+    """The frames in which each device has measured; there should be one of each."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Counter[str]] = {}
+        self.usual: dict[str, str] = {}
+        """The usual frames by device, where more than a few measurements have come."""
+
+    def fault(self, device: str, frame_id: str, wanted: str, count: int) -> str:
+        """Note the frame of some measurements; return why it is none to use, empty if it is.
+
+        Only the one `wanted` is, or the usual.
+        """
+        if wanted and frame_id != wanted:
+            return f'in frame "{frame_id}", not in frame_id "{wanted}"'
+        if not frame_id.isprintable():  # it shall be a cell of a table
+            return 'in a frame whose name cannot be printed'
+        if not self.note(device, frame_id, count):
+            return f'in one of more than {MOST_NAMES} frames'
+        usual = self.usual.get(device, frame_id)
+        return '' if frame_id == (wanted or usual) else strange(frame_id, usual)
+
+    def note(self, device: str, frame_id: str, count: int) -> bool:
+        """Note the frame of measurements; return False where it is one too many."""
+        known = self._known.setdefault(device, Counter())
+        if frame_id not in known and len(known) == MOST_NAMES:
+            return False
+        known[frame_id] += count
+        if known[frame_id] >= NO_ACCIDENT:
+            self.usual.setdefault(device, frame_id)
+        return True
+
+    def main(self, device: str) -> str | None:
+        """Return the usual frame of a device, or the most frequent one while few have come."""
+        known = self._known.get(device)
+        return self.usual.get(device) or (max(known, key=known.__getitem__) if known else None)
+
+    @property
+    def several(self) -> bool:
+        """Tell whether any device measured in several frames."""
+        return any(len(known) > 1 for known in self._known.values())
+
+    @property
+    def different(self) -> tuple[str, ...]:
+        """Return the different frames in which one device measured; empty when none did.
+
+        A few measurements in others do not count.
+        """
+        for known in self._known.values():
+            if known.total() - max(known.values()) > EXCEPTION * known.total():
+                return tuple(sorted(known))
+        return ()
+
+
+def strange(frame_id: str, usual: str) -> str:
+    """Return in words that a measurement is not in the frame in which others are."""
+    return f'in frame "{frame_id}", not in "{usual}" as others'
 
 
 class Part(NamedTuple):
     """What messages of one stream say, and their places (N,) among others; source None: joints."""
 
-    places: NDArray[np.intp]
+    places: Index
     source: Source | None
     readings: Readings
 
@@ -51,13 +149,11 @@ class Entry:
             self.refused[kind] = cause
 
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
-        """Yield joint values that can be used, those of the chain."""
         latest = -1
         for places, _, (stamps, (_, *names), numbers) in parts:
-            try:
-                columns, index = self._names.layout(tuple(names))
-            except MessageError as err:
-                self.miss(JOINTS, len(stamps), str(err))
+            columns, index = self._names.layout(tuple(names))
+            if not columns:
+                self.miss(JOINTS, len(stamps), OTHERS)
                 continue
             values = numbers[:, index]
             size = np.abs(values).max(axis=1)
@@ -84,7 +180,6 @@ class Entry:
                 self.unused['joints: not recording'] += len(stamps)
 
     def _measured(self, parts: Sequence[Part], recording: bool, wanted: str) -> Iterator[Piece]:
-        """Yield measurements that can be used."""
         for places, source, readings in self._by_frame(parts):
             assert source is not None
             count, frame_id = len(places), readings.strings[0]
@@ -92,7 +187,9 @@ class Entry:
             self.refused.pop(POSES, None)
             if not recording:
                 self.unused['measurements: not recording'] += count
-            elif self._is_in_frame(source.device, frame_id, wanted, count):
+            elif fault := self._frames.fault(source.device, frame_id, wanted, count):
+                self.dropped[f'{POSES}: {fault}'] += count
+            else:
                 width = readings.numbers.shape[1]
                 if width > 7:  # a covariance of zeros stands for none
                     none = ~readings.numbers[:, 7:].any(axis=1)
@@ -113,7 +210,7 @@ class Entry:
         frames: dict[str, set[str]] = {}
         for each in parts:
             assert each.source is not None
-            if self._frames.usual(each.source.device) is None:
+            if each.source.device not in self._frames.usual:
                 frames.setdefault(each.source.device, set()).add(each.readings.strings[0])
         if any(len(some) > 1 for some in frames.values()):
             parts = [
@@ -123,11 +220,68 @@ class Entry:
             ]
         return sorted(parts, key=lambda part: int(part.places[0]))
 
-    def _is_in_frame(self, device: str, frame_id: str, wanted: str, count: int) -> bool:
-        """Tell whether measurements are in the frame of their device; count them if not."""
-        try:
-            self._frames.check(device, frame_id, wanted, count)
-        except MessageError as err:
-            self.dropped[f'{POSES}: {err}'] += count
+
+class Kept:
+    """Samples in the order in which they were taken; in the frame `wanted`, if any is.
+
+    `changed` is called when samples were left out, with one that was taken back.
+    """
+
+    def __init__(
+        self,
+        frames: FrameNames,
+        wanted: str,
+        dropped: Counter[str],
+        changed: Callable[[Sample | None], None],
+    ) -> None:
+        self.wanted = wanted
+        self._frames, self._dropped, self._changed = frames, dropped, changed
+        self.samples: list[Sample] = []
+        self._once: set[tuple[str, str]] = set()
+
+    def usable(self) -> list[Sample]:
+        """Return the samples in the frame of their device, `frame_id` or the usual one.
+
+        Those of targets that were measured once are left out where others were more often: they
+        tell nothing about the arm, and hundreds of them would take minutes.
+        """
+        found = self.samples
+        if self.wanted or self._frames.several:
+            found = [each for each in found if self._frame_of(each) == each.frame_id]
+        counts = Counter((each.device, each.target) for each in found if not each.validation)
+        once = {key for key, count in counts.items() if count == 1}
+        if once != self._once:  # the list does not only grow
+            self._once = once
+            self._changed(None)
+        if not once or len(once) == len(counts):
+            return found
+        return [each for each in found if (each.device, each.target) not in once]
+
+    def _frame_of(self, sample: Sample) -> str:
+        """Return in which frame a sample should be; some do not tell in which they are."""
+        should = self.wanted or self._frames.main(sample.device)
+        return (sample.frame_id and should) or sample.frame_id
+
+    def leave_out_strange(self) -> None:
+        """Take back samples in strange frames, the first ones say, if there are only a few."""
+        for sample in tuple(self.samples):
+            if self.is_strange(sample):
+                self.samples.remove(sample)
+                self._changed(sample)
+
+    def is_strange(self, sample: Sample) -> bool:
+        """Tell whether a sample is one of a few in a frame of their own; count it if so."""
+        if self.wanted or not self._frames.several or self._frames.different:
             return False
-        return True
+        frame_id = self._frame_of(sample)
+        strays = sample.frame_id != frame_id
+        if strays:
+            self._dropped[f'measurements: {strange(sample.frame_id, frame_id)}'] += sample.count
+        return strays
+
+    @property
+    def different(self) -> str:
+        """Return in words that one device measured in different frames, if it matters."""
+        if self.wanted or not self._frames.different:
+            return ''
+        return f'poses came in different frames ({", ".join(self._frames.different)})'

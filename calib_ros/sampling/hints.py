@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What looks wrong in what is heard, what to do, and how far the samples are, in words."""
+"""What became of the messages, what looks wrong, and how far the samples are, in words."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,6 +18,47 @@ from calib_ros.sampling.live import START, Estimate, barely_moved
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.settings import EXCEPTION, Settings
+
+
+@dataclass(frozen=True)
+class Account:
+    """What became of the messages: how many came, how many samples, what was dropped and why."""
+
+    joint_states: int
+    poses: int
+    waiting: int
+    samples: int
+    held_out: int
+    configurations: int
+    unused: dict[str, int]
+    dropped: dict[str, int]
+    notes: dict[str, int]
+    foreign_names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return the account in words."""
+        text = f'{self.joint_states} joint states and {self.poses} measurements gave '
+        text += f'{self.samples} poses'
+        if self.held_out:
+            text += f' to fit and {self.held_out} held out'
+        if self.configurations < self.samples:
+            text += f', {self.configurations} of them different'
+        if self.waiting:
+            text += f', {self.waiting} measurements wait'
+        for label, counts in (
+            ('not used', self.unused),
+            ('dropped', self.dropped),
+            ('note', self.notes),
+        ):
+            if counts:
+                parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
+                text += f'; {label}: {parts}'
+        if self.foreign_names:
+            text += (
+                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints of '
+                'the chain by other names, set joint_names (--joint-names)'
+            )
+        return text
 
 
 class Hint(NamedTuple):
@@ -44,34 +86,34 @@ def restless(needed: float, still: float) -> Hint:
     )
 
 
-def sparse(between: int, measurements: int, max_gap: float) -> Hint | None:
+def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
     """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
     if between < NO_ACCIDENT or between <= EXCEPTION * measurements:
-        return None
+        return []
     rate = f'{2.0 / max_gap:g} Hz or more'
-    return Hint(
-        f'joint states are too rare: {rate} are needed',
+    words = (
         f'{between} of {measurements} measurements lie between joint states further apart than '
-        f'max_gap ({max_gap:g} s): {rate} are needed',
+        f'max_gap ({max_gap:g} s): {rate} are needed'
     )
+    return [Hint(f'joint states are too rare: {rate} are needed', words)]
 
 
 def apart(
     waiting: int, unmatched: int, measurements: int, ahead: float, lateness: float
-) -> Hint | None:
+) -> list[Hint]:
     """Tell that clocks disagree by more than can be looked for, if most measurements say so.
 
     Measurements wait for joint states, or have found none; they are `ahead` of those [s].
     """
     most = unmatched > max(measurements // 2, NO_ACCIDENT)
     if abs(ahead) <= lateness or not (most or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
-        return None
-    words = f'{abs(ahead):.0f} s {"after" if ahead > 0.0 else "before"}'
-    return Hint(
-        f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree',
-        f'the newest measurement is stamped {words} the newest joint state: make the clocks of '
-        'both agree (NTP, PTP), if both still come',
+        return []
+    words = (
+        f'the newest measurement is stamped {abs(ahead):.0f} s '
+        f'{"after" if ahead > 0.0 else "before"} the newest joint state: make the clocks of '
+        'both agree (NTP, PTP), if both still come'
     )
+    return [Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)]
 
 
 def disagreement(delay: float, known: float) -> Hint:

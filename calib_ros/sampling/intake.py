@@ -15,11 +15,12 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.cdr import alike, head
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
@@ -30,6 +31,7 @@ from calib_ros.sampling.messages import (
     TRANSFORMS,
     MessageError,
     Readings,
+    Source,
     frame_name,
     head_of,
     reading,
@@ -39,8 +41,7 @@ from calib_ros.sampling.messages import (
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
-from calib_ros.sampling.sources import Source
-from calib_ros.sampling.transforms import STATIC, Links, Pair
+from calib_ros.sampling.transforms import STATIC, Linked, Links, Pair
 from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000
@@ -50,22 +51,8 @@ Deserialise: TypeAlias = Callable[[Any, str], Any]
 """Makes a message of its bytes and type."""
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and what came on them, serialised or not, in the order in which it came."""
-Places: TypeAlias = NDArray[np.intp]
 Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
 """Place, stamp [ns] and numbers of one message."""
-
-
-class Linked(NamedTuple):
-    """Transforms between the same two frames, and the places of their messages.
-
-    Their numbers are read only where they are wanted; the first and the last stamp are known.
-    """
-
-    stream: Stream
-    places: Places
-    link: Pair
-    span: tuple[int, int]
-    read: Callable[[], Readings]
 
 
 @dataclass(frozen=True)
@@ -170,7 +157,7 @@ class Intake:
                 continue
             size = len(data) if isinstance(data, bytes) else 0
             groups.setdefault((stream.topic, size), []).append(place)
-        linked: list[Linked] = []
+        linked: dict[Links, list[Linked]] = {}
         single: list[int] = []
         for (_, size), group in groups.items():
             stream, places = batch[group[0]][0], np.array(group)
@@ -183,15 +170,28 @@ class Intake:
                 if stream.links is None:
                     self._add(stream.source, stream.type, where, some.of(0))
                     continue
-                linked += [
-                    Linked(stream, where, _pair(item.strings), some.span(k), partial(some.of, k))
+                linked.setdefault(stream.links, []).extend(
+                    Linked(
+                        where, stream.still, _pair(item.strings), some.span(k), partial(some.of, k)
+                    )
                     for k, item in enumerate(some.layout.items)
-                ]
+                )
             single += places[left].tolist()
-        self._add_links([*linked, *self._decode(sorted(single))])
+        for stream, where, found in self._decode(sorted(single)):
+            if stream.links is None:
+                self._add(stream.source, stream.type, where, found)
+            else:
+                span = int(found.stamps_ns[0]), int(found.stamps_ns[-1])
+                read = partial(Readings, *found)
+                one = Linked(where, stream.still, _pair(found.strings), span, read)
+                linked.setdefault(stream.links, []).append(one)
+        for links, come in linked.items():
+            measured, causes = links.take(come)
+            self.faults[POSES] += causes
+            for source, where, found in measured:
+                self._add(source, TRANSFORM, where, found)
 
-    def _add(self, source: Source | None, kind: str, places: Places, found: Readings) -> None:
-        """Add what can be used, and count the rest."""
+    def _add(self, source: Source | None, kind: str, places: Index, found: Readings) -> None:
         good, causes = usable(kind, found)
         self.faults[JOINTS if source is None else POSES] += causes
         if not good.all():
@@ -207,7 +207,7 @@ class Intake:
         message = partial(self._deserialise, data, stream.type)
         try:
             if stream.type == CAMERA_INFO:
-                pictures.learn(source.topic, message())
+                pictures.cameras[source.topic].learn(message())
                 return
             serialised = isinstance(data, bytes)
             stamp_ns, frame_id = head(data) if serialised else head_of(message())
@@ -219,18 +219,16 @@ class Intake:
         found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
         self._add(source, stream.type, np.array([place]), found)
 
-    def _decode(self, places: Sequence[int]) -> Iterator[Linked]:
-        """Add messages one after the other; yield those of links between frames."""
+    def _decode(self, places: Sequence[int]) -> Iterator[tuple[Stream, Index, Readings]]:
+        """Yield what messages say that are decoded one after the other, alike ones together."""
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
-        links: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
             stream, data = self._batch[place]
             try:
                 message = self._deserialise(data, stream.type)
                 if stream.links is None:
-                    into, found = alike, [reading(stream.type, message)]
+                    found = [reading(stream.type, message)]
                 else:
-                    into = links
                     found = [reading(TRANSFORM, e) for e in transforms_in(message, stream.type)]
                 rows = [(t, (place, s, np.array(n, dtype=np.float64))) for s, t, n in found]
             except MessageError as err:
@@ -241,55 +239,12 @@ class Intake:
                 self.problems.append(words)
                 continue
             for strings, row in rows:
-                into.setdefault((stream, strings, len(row[2])), []).append(row)
+                alike.setdefault((stream, strings, len(row[2])), []).append(row)
         for (stream, strings, _), some in alike.items():
-            self._add(stream.source, stream.type, *_stacked(some, strings))
-        for (stream, strings, _), some in links.items():
-            where, each = _stacked(some, strings)
-            span = int(each.stamps_ns[0]), int(each.stamps_ns[-1])
-            yield Linked(stream, where, _pair(strings), span, partial(Readings, *each))
-
-    def _add_links(self, come: Sequence[Linked]) -> None:
-        """Add what is measured by links between frames.
-
-        Frames that are named anywhere in the batch are known for all of it.
-        """
-        for stream, where, link, span, read in come:
-            assert stream.links is not None
-            if not stream.still:
-                stream.links.move(link, len(where), *span)
-                continue
-            found = read()  # what stands still may have no stamp
-            good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(where)))
-            for row in found.numbers[good]:
-                stream.links.fix(link, row)
-        for links in links_of(each.stream for each in come):
-            first = min(int(each.places[0]) for each in come if each.stream.links is links)
-            for source, found in links.released():
-                self._add(source, TRANSFORM, np.full(len(found.stamps_ns), first), found)
-        for stream, where, link, _, read in come:
-            assert stream.links is not None
-            if stream.still or not stream.links.wanted(link):
-                continue
-            found = read()
-            good, causes = usable(TRANSFORM, found)
-            sources = stream.links.measured_by(link)
-            self.faults[POSES] += Counter({c: n * len(sources) for c, n in causes.items()})
-            found = found.rows(good)
-            for source, each in stream.links.readings(link, found.stamps_ns, found.numbers):
-                self._add(source, TRANSFORM, where[good], each)
-        for links in links_of(stream for stream, _ in self._batch):
-            cause = 'buffer full before their frames were linked'
-            self.faults[POSES] += Counter({cause: links.let_go()})
+            where, stamps, numbers = zip(*some, strict=True)
+            stamps_ns = np.array(stamps, dtype=np.int64)
+            yield stream, np.array(where), Readings(stamps_ns, strings, np.array(numbers))
 
 
 def _pair(strings: Sequence[str]) -> Pair:
-    """Return the two frames of a link."""
     return frame_name(strings[0]), frame_name(strings[1])
-
-
-def _stacked(rows: Sequence[Row], strings: tuple[str, ...]) -> tuple[Places, Readings]:
-    """Return the places of single messages, and what they say."""
-    places, stamps, numbers = zip(*rows, strict=True)
-    stamps_ns = np.array(stamps, dtype=np.int64)
-    return np.array(places), Readings(stamps_ns, strings, np.array(numbers))

@@ -5,10 +5,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
 
 MOVED = 2.0 * Settings.still
@@ -16,12 +15,7 @@ MOVED = 2.0 * Settings.still
 
 
 def interpolated(
-    rows: Rows,
-    stamps: Stamps,
-    first: NDArray[np.intp],
-    last: NDArray[np.intp],
-    revolute: NDArray[np.bool_],
-    straight: bool,
+    rows: Rows, stamps: Stamps, first: Index, last: Index, revolute: Flags, straight: bool
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return values, velocities and accelerations (N, n) of the cubic through four samples.
 
@@ -71,24 +65,20 @@ def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return at, slope, bend
 
 
-def unwrapped(steps: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+def unwrapped(steps: FloatArray, revolute: Flags) -> FloatArray:
     """Return differences of joint values; a driver may count angles within one turn."""
     turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
     return np.asarray(steps - np.where(revolute, turn, 0.0))
 
 
-def continuous(values: FloatArray, revolute: NDArray[np.bool_]) -> FloatArray:
+def continuous(values: FloatArray, revolute: Flags) -> FloatArray:
     """Return joint values (M, n) in sequence without jumps of a turn."""
     steps = unwrapped(np.diff(values, axis=0), revolute)
     return np.asarray(values[:1] + np.cumsum(np.vstack([0.0 * values[:1], steps]), axis=0))
 
 
 def last_moves(
-    values: FloatArray,
-    first: NDArray[np.intp],
-    now: FloatArray,
-    came: FloatArray,
-    revolute: NDArray[np.bool_],
+    values: FloatArray, first: Index, now: FloatArray, came: FloatArray, revolute: Flags
 ) -> FloatArray:
     """Return the signs (N, n) of the last move of each joint before it stood as it does now.
 
@@ -104,9 +94,7 @@ def last_moves(
     return np.asarray(np.where(there >= 0, signs, came))
 
 
-def _last_outside(
-    values: FloatArray, last: NDArray[np.intp], low: FloatArray, high: FloatArray
-) -> NDArray[np.intp]:
+def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatArray) -> Index:
     """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high.
 
     It is -1 where there is none. By the extremes of blocks of 1, 2, 4, ... values: first over
@@ -122,7 +110,7 @@ def _last_outside(
     end = np.repeat(last + 1, shape[1])  # what comes before is still to be searched
     found, sizes = np.full(len(end), -1), np.zeros(len(end), dtype=np.intp)
 
-    def outside(level: int, block: NDArray[np.intp], here: NDArray[np.intp]) -> NDArray[np.bool_]:
+    def outside(level: int, block: Index, here: Index) -> Flags:
         where = (block, column[here])
         return np.asarray((lows[level][where] < low[here]) | (highs[level][where] > high[here]))
 

@@ -8,17 +8,15 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.rows import Stamps
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import StreamKey
+from calib_ros.sampling.slices import Piece, StreamKey
 from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 
@@ -31,24 +29,10 @@ VIBRATING = 'measurements: still vibrating, or a spike'
 RESTLESS = 'measurements: a stop that spreads more than the noise'
 
 
-class Matched(NamedTuple):
-    """Measurements of one stream, in the order of their stamps, and the motion at these.
-
-    Numbers (N,) are of their rounds or stops, values (N, ROW_WIDTH) are stamped late by a delay.
-    """
-
-    key: StreamKey
-    numbers: NDArray[np.intp]
-    stamps: Stamps
-    values: FloatArray
-    motion: Motion
-    delay_ns: int
-
-
 class Maker:
     """Makes samples, up to a capacity, and no two of one stream with the same stamp."""
 
-    def __init__(self, revolute: NDArray[np.bool_], capacity: int) -> None:
+    def __init__(self, revolute: Flags, capacity: int) -> None:
         self._revolute, self._capacity = revolute, capacity
         self._taken: dict[StreamKey, set[int]] = {}
         self.fresh: list[Sample] = []
@@ -57,40 +41,29 @@ class Maker:
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()
 
-    def of_each(self, found: Matched) -> Iterator[Numbered]:
-        """Yield a sample of each of some measurements."""
-        key, numbers, stamps, values, motion, delay_ns = found
-        oriented = ~np.isnan(values[:, QUAT.start])
-        rotations = np.tile(np.eye(3), (len(values), 1, 1))
-        rotations[oriented] = se3.from_quat(values[oriented, QUAT])
-        for k, stamp_ns in enumerate(stamps.tolist()):
-            yield from self._made(
-                int(numbers[k]),
-                key,
-                stamp_ns,
-                values[k : k + 1],
-                position=values[k, DISTANCE if key.distance else POSITION].copy(),
-                rotation=rotations[k] if oriented[k] else None,
-                joints=motion.joints[k].copy(),
-                approach=motion.approach[k].copy(),
-                velocity=motion.velocity[k].copy(),
-                acceleration=motion.acceleration[k].copy(),
-                delay=1e-9 * delay_ns,
-            )
-
-    def of_stops(self, found: Matched, sigma: float) -> Iterator[Numbered]:
+    def samples(
+        self,
+        found: Piece,
+        motion: Motion,
+        begins: Index,
+        approach: FloatArray,
+        delay: float,
+        sigma: float,
+    ) -> Iterator[Numbered]:
         """Yield a sample of the measurements of each stop, unless these spread too much.
 
-        They scatter by `sigma` [m].
+        Stops, or the measurements themselves while the arm moves, begin at `begins` (S,), where
+        the joints came by the signs `approach` (S, n). The places are their numbers. Measurements
+        are stamped late by a `delay` [s] and scatter by `sigma` [m].
         """
-        key, numbers, stamps, values, motion, delay_ns = found
-        begins = np.flatnonzero(np.diff(numbers, prepend=-1))
+        key, numbers, stamps, values = found
+        assert isinstance(key, StreamKey)
         counts = np.diff(begins, append=len(values))
         joints = motion.joints[begins]
         steps = unwrapped(motion.joints - np.repeat(joints, counts, axis=0), self._revolute)
         if key.images:
             joints = joints + mean_of_each(steps, begins, np.ones(len(steps), dtype=bool))
-            yield from self._of_images(found, begins, joints)
+            yield from self._of_images(found, begins, joints, approach, delay)
             return
         turned = ~np.isnan(values[:, QUAT]).any(axis=1)
         own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
@@ -99,40 +72,46 @@ class Maker:
         means = averages(values[:, DISTANCE if key.distance else POSITION], begins, sigmas)
         rotations = np.tile(np.eye(3), (len(values), 1, 1))
         rotations[turned] = se3.from_quat(values[turned, QUAT])
-        oriented = np.logical_and.reduceat(turned, begins)
-        # the chordal mean (Moakher 2002)
-        rotations = se3.nearest_rotation(mean_of_each(rotations, begins, means.used))
+        oriented = np.logical_and.reduceat(turned, begins).tolist()
+        if motion.velocity is None:  # the chordal mean (Moakher 2002)
+            rotations = se3.nearest_rotation(mean_of_each(rotations, begins, means.used))
         joints = joints + mean_of_each(steps, begins, means.used)
         since = (stamps - np.repeat(stamps[begins], counts)).astype(np.float64)
         times = stamps[begins] + np.rint(mean_of_each(since, begins, means.used)).astype(np.int64)
-        for k, (begin, count) in enumerate(zip(begins.tolist(), counts.tolist(), strict=True)):
-            number, used = int(numbers[begin]), means.used[begin : begin + count]
-            left_out = count - int(np.count_nonzero(used))
-            if left_out or not means.rests[k]:
+        spikes = np.add.reduceat(~means.used, begins, dtype=np.intp)
+        each = (begins, counts, numbers[begins], times, spikes, means.rests)
+        for k, row in enumerate(zip(*(part.tolist() for part in each), strict=True)):
+            begin, count, number, stamp_ns, left_out, rests = row
+            if left_out or not rests:
                 self._shaken = min(self._shaken, number)
-            if not means.rests[k]:
+            if not rests:
                 self.dropped[RESTLESS] += count
                 continue
+            rows = values[begin : begin + count]
             if left_out:
                 self.dropped[VIBRATING] += left_out
+                rows = rows[means.used[begin : begin + count]]
             yield from self._made(
                 number,
                 key,
-                int(times[k]),
-                values[begin : begin + count][used],
-                position=means.values[k].copy(),  # a view would keep all stops
-                rotation=rotations[k].copy() if oriented[k] else None,
-                joints=joints[k].copy(),
-                approach=motion.approach[begin].copy(),
-                delay=1e-9 * delay_ns,
+                stamp_ns,
+                rows,
+                position=means.values[k],
+                rotation=rotations[k] if oriented[k] else None,
+                joints=joints[k],
+                approach=approach[k],
+                velocity=None if motion.velocity is None else motion.velocity[k],
+                acceleration=None if motion.acceleration is None else motion.acceleration[k],
+                delay=delay,
                 spread=float(means.spreads[k]),
             )
 
     def _of_images(
-        self, found: Matched, begins: NDArray[np.intp], joints: FloatArray
+        self, found: Piece, begins: Index, joints: FloatArray, approach: FloatArray, delay: float
     ) -> Iterator[Numbered]:
         """Yield a sample of the images of each stop, of which one will be looked at."""
-        key, numbers, stamps, values, motion, delay_ns = found
+        key, numbers, stamps, values = found
+        assert isinstance(key, StreamKey)
         ends = np.append(begins[1:], len(values))
         for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
             middle = (begin + end) // 2
@@ -142,19 +121,21 @@ class Maker:
                 int(stamps[middle]),
                 values[middle : middle + 1],
                 position=np.full(3, np.nan),
-                joints=joints[k].copy(),
-                approach=motion.approach[begin].copy(),
-                delay=1e-9 * delay_ns,
+                joints=joints[k],
+                approach=approach[k],
+                delay=delay,
                 images=tuple(values[begin:end, 0].astype(int).tolist()),
             )
 
-    def in_socket(self, place: str, stamps: Stamps, motion: Motion) -> None:
-        """Make a sample of a ball that sits in a socket, at stamps (N,) while the arm stands."""
-        steps = unwrapped(motion.joints - motion.joints[0], self._revolute)
+    def in_socket(self, place: str, stamp_ns: int, joints: FloatArray, came: FloatArray) -> None:
+        """Make a sample of a ball in a socket, at joint values (N, n) while the arm stands.
+
+        The joints `came` (n,) there in these senses.
+        """
         sample = Sample(
-            stamp_ns=int(stamps[-1]),
-            joints=motion.joints[0] + steps.mean(axis=0),
-            approach=motion.approach[0].copy(),
+            stamp_ns=stamp_ns,
+            joints=joints[0] + unwrapped(joints - joints[0], self._revolute).mean(axis=0),
+            approach=came,
             device=place,
             socket=True,
         )

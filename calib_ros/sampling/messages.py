@@ -1,24 +1,28 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to numbers, by their attributes only: rclpy's and rosbags' messages alike.
+"""ROS messages to numbers, and the sources that they come from.
 
-What cannot be used is told by its cause, under which it is counted.
+Messages are read by their attributes only: rclpy's and rosbags' messages alike. What cannot be
+used is told by its cause, under which it is counted. A source says what comes on a topic, and
+between which frames.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
+import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import InputError
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import LARGEST as LARGEST, QUATERNION_TOLERANCE, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
@@ -102,7 +106,7 @@ def head_of(message: Any) -> tuple[int, str]:
     return head.stamp.sec * 1_000_000_000 + head.stamp.nanosec, head.frame_id
 
 
-def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]:
+def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
     """Return which readings (N,) can be used, and the causes why others cannot.
 
     The values of joints are not looked at: some may be those of another robot.
@@ -110,7 +114,7 @@ def usable(kind: str, found: Readings) -> tuple[NDArray[np.bool_], Counter[str]]
     numbers, causes = found.numbers, Counter[str]()
     good = np.ones(len(numbers), dtype=bool)
 
-    def refuse(wrong: np.bool_ | NDArray[np.bool_], cause: str) -> None:
+    def refuse(wrong: np.bool_ | Flags, cause: str) -> None:
         count = int((good & wrong).sum())
         if count:
             causes[cause] += count
@@ -171,3 +175,163 @@ def transforms_in(message: Any, kind: str) -> Sequence[Any]:
 def frame_name(name: str) -> str:
     """Return the name of a frame without the slash that older programs write before it."""
     return name.removeprefix('/')
+
+
+VALIDATION = 'validation_'
+"""Topics whose last name starts so hold measurements that judge the result, never fitted."""
+MARKERS = {
+    'status': 'std_msgs/msg/String',
+    'calibration': 'std_msgs/msg/String',
+    'dh_parameters': 'std_msgs/msg/Float64MultiArray',
+}
+"""Topics that together tell that what is above them is one of our nodes."""
+DISTANCE = 'distance'
+"""Device of distances that name none: their origin is not that of a tracker."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """One topic of measurements.
+
+    Attributes
+    ----------
+    topic : str
+    type : str
+        Message type, such as geometry_msgs/msg/PoseStamped; empty when any will do.
+    device, target : str
+        What measures, and what is measured. Each device has a base frame of its own, each target
+        a tool frame. A message that names its child frame names the target.
+    eye_in_hand : bool
+        The poses are those of a fixed target in a camera on the flange.
+    validation : bool
+        The measurements judge the result and are never fitted.
+    parent, child : str
+        On a topic of many transforms or bodies, such as /tf: the frames between which it is
+        measured.
+    board : str
+        YAML of the board that images show, which has its type and sizes.
+    info : str
+        Topic of the CameraInfo of images; default: camera_info beside them.
+    lens : str
+        Whether the intrinsics are `given` by it, or `fitted` from there on.
+
+    """
+
+    topic: str
+    type: str = ''
+    device: str = ''
+    target: str = ''
+    eye_in_hand: bool = False
+    validation: bool = False
+    parent: str = ''
+    child: str = ''
+    board: str = ''
+    info: str = ''
+    lens: str = 'given'
+
+    def __post_init__(self) -> None:
+        """Refuse what no bag or node could use."""
+        if self.type and self.type not in TYPES:
+            raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
+        frames = {self.parent, self.child} - {''}
+        if len(frames) != (2 if self.type in LINKS else 0):
+            raise ConfigError(
+                f'source "{self.topic}" needs parent=FRAME child=FRAME, between which it '
+                f'measures, if its type is {_or(LINKS)}, and only then'
+            )
+        if bool(self.board) != (self.type in PICTURES):
+            raise ConfigError(
+                f'source "{self.topic}" needs board=FILE, the board that it sees, if its type is '
+                f'{_or(PICTURES)}, and only then'
+            )
+        if self.lens not in LENSES:
+            raise UnknownNameError(f'lens of source "{self.topic}"', self.lens, LENSES)
+        for name in (self.device, self.target):
+            if '.' in name or ',' in name:
+                raise ConfigError(f'a device or target needs a name without . and , not "{name}"')
+
+    @property
+    def camera_info(self) -> str:
+        """Return the topic of the CameraInfo of images."""
+        beside = self.topic.removesuffix('/compressed').rpartition('/')
+        return self.info or f'{beside[0]}{beside[1]}camera_info'
+
+
+LENSES = ('given', 'fitted')
+TYPES = (*DECODERS, *LINKS, *PICTURES)
+"""Types of messages that hold measurements."""
+
+STANDARD = (
+    Source('measured_pose', 'geometry_msgs/msg/PoseStamped'),
+    Source('measured_pose_with_covariance', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
+    Source('measured_point', 'geometry_msgs/msg/PointStamped'),
+    Source('measured_transform', 'geometry_msgs/msg/TransformStamped'),
+    Source('measured_odometry', 'nav_msgs/msg/Odometry'),
+    Source('measured_distance', 'sensor_msgs/msg/Range', device=DISTANCE),
+    Source('validation_pose', 'geometry_msgs/msg/PoseStamped', validation=True),
+    Source('validation_point', 'geometry_msgs/msg/PointStamped', validation=True),
+)
+"""What the node listens to unless it is told otherwise."""
+
+
+def parse_source(text: str) -> Source:
+    """Read a source from "TOPIC key=value ...".
+
+    Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
+    child, and of images board, info and lens. A short type such as PoseStamped will do; a topic
+    named tf is of type TFMessage, and so is one with a parent or a child and no type; one with a
+    board is of images. What holds blanks stands in quotes.
+    """
+    try:
+        topic, *pairs = shlex.split(text) or ('',)
+    except ValueError as err:
+        raise ConfigError(f'source "{text}" cannot be read: {err}') from err
+    if not topic or '=' in topic:
+        raise ConfigError(f'source "{text}" must begin with its topic: "TOPIC key=value ..."')
+    values: dict[str, Any] = {'validation': topic.rpartition('/')[2].startswith(VALIDATION)}
+    for pair in pairs:
+        key, equals, value = pair.partition('=')
+        if not equals or key not in KEYS:
+            raise UnknownNameError(f'key of source "{text}"', key, KEYS)
+        if key in ('eye_in_hand', 'validation'):
+            if value not in ('true', 'false'):
+                raise ConfigError(f'{key} of source "{text}" must be true or false, not "{value}"')
+            values[key] = value == 'true'
+        elif key == 'type':
+            full = (known for known in TYPES if value in (known, short_type(known)))
+            values[key] = next(full, value)
+        else:
+            values[key] = frame_name(value) if key in ('parent', 'child') else value
+    if values.keys() & {'parent', 'child'} or topic.rpartition('/')[2] == 'tf':
+        values.setdefault('type', TRANSFORMS)
+    if 'board' in values:
+        values.setdefault('type', PICTURES[topic.endswith('/compressed')])
+    source = Source(topic, **values)
+    if source.type.endswith('/Range') and not source.device:
+        source = replace(source, device=DISTANCE)
+    return source
+
+
+KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
+
+
+def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
+    """Read several sources; a topic may be named once, or once for each pair of its frames."""
+    sources = tuple(parse_source(text) for text in texts)
+    names = [' '.join((each.topic, each.parent, each.child)).strip() for each in sources]
+    for source, name in zip(sources, names, strict=True):
+        if names.count(name) > 1:
+            raise ConfigError(f'source "{name}" is named twice')
+        if any(each.topic == source.topic and each.type != source.type for each in sources):
+            raise ConfigError(f'source "{source.topic}" is named with different types')
+    return sources
+
+
+def short_type(kind: str) -> str:
+    """Return the name of a message type without its package."""
+    return kind.rpartition('/')[2]
+
+
+def _or(kinds: Sequence[str]) -> str:
+    *first, last = map(short_type, kinds)
+    return f'{", ".join(first)} or {last}'

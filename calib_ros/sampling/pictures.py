@@ -48,12 +48,6 @@ class Camera(Protocol):
         """Return the corners in an Image or CompressedImage."""
 
 
-class _Kept(NamedTuple):
-    topic: str
-    size: int
-    message: Callable[[], Any]
-
-
 class Pictures:
     """Keeps images, and makes samples of those that are looked at.
 
@@ -72,7 +66,7 @@ class Pictures:
 
     def clear(self) -> None:
         """Forget all images and counts."""
-        self._kept: dict[int, _Kept] = {}
+        self._kept: dict[int, tuple[str, int, Callable[[], Any]]] = {}
         self._queue: deque[tuple[Sample, Future[Sample | Refusal] | None]] = deque()
         self.dropped: Counter[str] = Counter()
         """What became of images that are not used, by cause."""
@@ -82,15 +76,11 @@ class Pictures:
     def keep(self, topic: str, size: int, message: Callable[[], Any]) -> int:
         """Keep an image of some bytes; return its number. `message` decodes it."""
         self._last += 1
-        self._kept[self._last] = _Kept(topic, size, message)
-        while sum(each.size for each in self._kept.values()) > MOST_BYTES and len(self._kept) > 1:
+        self._kept[self._last] = topic, size, message
+        while sum(size for _, size, _ in self._kept.values()) > MOST_BYTES and len(self._kept) > 1:
             for number in [*self._kept][-2::-2]:  # the newest stays, and every stop has some
                 del self._kept[number]
         return self._last
-
-    def learn(self, topic: str, info: Any) -> None:
-        """Take the CameraInfo of the images on a topic."""
-        self.cameras[topic].learn(info)
 
     def keep_only(self, numbers: set[int]) -> None:
         """Let go of images that no stop can need any more."""
@@ -139,12 +129,14 @@ class Pictures:
             )
             return None
         nearest = min(kept, key=lambda k: abs(k - middle))
-        return self._pool.submit(self._look, self._kept[sample.images[nearest]], sample)
+        return self._pool.submit(self._look, sample, *self._kept[sample.images[nearest]])
 
-    def _look(self, kept: _Kept, sample: Sample) -> Sample | Refusal:
+    def _look(
+        self, sample: Sample, topic: str, size: int, message: Callable[[], Any]
+    ) -> Sample | Refusal:
         """Return the sample of an image; on a thread of its own."""
         try:
-            view = self.cameras[kept.topic].look(kept.message())
+            view = self.cameras[topic].look(message())
             return view if isinstance(view, Refusal) else self._posed(sample, view)
         except Exception as err:  # damaged bytes fail in many ways
             return Refusal('that cannot be decoded', f'it cannot be decoded: {err!r}')

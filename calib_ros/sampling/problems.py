@@ -16,8 +16,8 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.messages import parse_sources
 from calib_ros.sampling.sample import Frames, Sample, collect, lenses, named, socket_pairs
-from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 
@@ -81,10 +81,7 @@ class Measured(Shown):
 
 
 def problem_of(
-    chain: Chain,
-    samples: Sequence[Sample],
-    settings: Settings,
-    posed: bool = False,
+    chain: Chain, samples: Sequence[Sample], settings: Settings, posed: bool = False
 ) -> Problem | None:
     """Return samples as a problem; None when there is none to fit.
 
@@ -103,10 +100,7 @@ def problem_of(
 
 
 def in_frames_of(
-    calibration: Calibration,
-    since: Sequence[Sample],
-    usable: Sequence[Sample],
-    settings: Settings,
+    calibration: Calibration, since: Sequence[Sample], usable: Sequence[Sample], settings: Settings
 ) -> list[Observations]:
     """Return the poses measured since a calibration, those among all usable ones, in its frames.
 

@@ -10,15 +10,116 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from calib_ros.kinematics.chain import Chain
-from calib_ros.sampling.clocks import Clocks
 from calib_ros.sampling.collector import Collector
+from calib_ros.sampling.delay import Clocks
 from calib_ros.sampling.hints import Hint, apart
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice
-from calib_ros.sampling.strays import Gate
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, TOO_LATE, Piece, Slice
 from calib_ros.sampling.track import CAUSES
-from calib_ros.sampling.waiting import TOO_LATE
 from calib_ros.settings import Settings
+
+STRAY = 'stamp far from those before and after'
+
+
+class Gate:
+    """Tells stray stamps from a clock that was moved: two more than `far` [s] apart.
+
+    A message far from the last ones of all streams is held back. If its stream returns to where it
+    was, the stamp was a stray one, and it is dropped; if it stays away, the clock was moved, a bag
+    is played again or there was a pause, and all that was held back passes in its order.
+    """
+
+    def __init__(self, far: float) -> None:
+        self._far_ns = round(far * 1e9)
+        self._last: dict[str, int] = {}
+        self._held: list[tuple[str, int, Slice]] = []
+        self.dropped: Counter[str] = Counter()
+        """Messages with stray stamps."""
+
+    def held(self, kind: str) -> int:
+        """Return how many messages of a kind are held back."""
+        return sum(each[0] == kind for each in self._held)
+
+    def through(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
+        """Yield what may pass now, and whether the clock of the joints was moved before it.
+
+        What is held back comes with a later message, in the order in which it came.
+        """
+        begin, end = 0, len(given)
+        while begin < end:
+            left = given.between(begin, end)
+            count = self._plain(left)
+            if count:
+                yield left.between(0, count), False
+            else:
+                count = 1
+                found, moved = self._admitted(left.between(0, 1))
+                yield from ((each, moved) for each in found)
+            begin += count
+
+    def release(self) -> list[Slice]:
+        """Return what is held back: nothing more comes that could tell."""
+        found, self._held = self._held, []
+        return [item for _, _, item in found]
+
+    def _plain(self, given: Slice) -> int:
+        """Let the first messages pass up to one that is to be held back, or frees others."""
+        times, numbers = given.times, np.arange(len(given))
+        near = np.zeros(len(given), dtype=bool)  # to the last one of any kind
+        for kind, which in ((JOINTS, given.joints), (POSES, ~given.joints)):
+            before = np.maximum.accumulate(np.where(which, numbers, -1))
+            before = np.concatenate([[-1], before[:-1]])
+            known = np.where(before < 0, self._last.get(kind, 0), times[before])
+            told = (before >= 0) | (kind in self._last)
+            near |= told & (np.abs(times - known) <= self._far_ns)
+        for kind, time_ns, _ in self._held:
+            near &= given.joints != (kind == JOINTS)
+            near &= np.abs(times - time_ns) > self._far_ns
+        count = int(np.argmin(np.append(near, False)))
+        for kind in (JOINTS, POSES):
+            where = given.where(kind)
+            passed = int(np.searchsorted(where, count))
+            if passed:
+                self._last[kind] = int(times[where[passed - 1]])
+        return count
+
+    def _admitted(self, given: Slice) -> tuple[list[Slice], bool]:
+        """Take one message; return what passes, and whether the clock of the joints was moved."""
+        kind, time_ns = JOINTS if given.joints[0] else POSES, int(given.times[0])
+        if self._is_near(time_ns):
+            self._last[kind] = time_ns
+            found = [*self._now_near(), given]
+            self._last[kind] = time_ns
+            if strays := self.held(kind):
+                self.dropped[f'{kind}: {STRAY}'] += strays
+                self._held = [each for each in self._held if each[0] != kind]
+            return found, False
+        self._held.append((kind, time_ns, given))
+        if self.held(kind) < NO_ACCIDENT:
+            return [], False
+        moved = [time for other, time, _ in self._held if other == kind]
+        passing = [
+            other == kind or min(abs(time - each) for each in moved) <= self._far_ns
+            for other, time, _ in self._held
+        ]
+        freed = [each for each, free in zip(self._held, passing, strict=True) if free]
+        self._held = [each for each, free in zip(self._held, passing, strict=True) if not free]
+        self._last.update((other, time) for other, time, _ in freed)
+        return [item for *_, item in freed], any(other == JOINTS for other, *_ in freed)
+
+    def _is_near(self, time_ns: int) -> bool:
+        lasts = self._last.values()
+        return not lasts or any(abs(time_ns - last) <= self._far_ns for last in lasts)
+
+    def _now_near(self) -> list[Slice]:
+        """Let through what is held back and not far from others any more."""
+        found = []
+        for each in tuple(self._held):
+            if self._is_near(each[1]):
+                self._last[each[0]] = each[1]
+                self._held.remove(each)
+                found.append(each[2])
+        return found
 
 
 class Road:
@@ -44,11 +145,15 @@ class Road:
     def take(self, pieces: Sequence[Piece]) -> None:
         """Take messages. An error costs the slice that makes it, and none after it."""
         error: Exception | None = None
-        for given in self._slices(pieces):
-            try:
-                self._keep(given)
-            except Exception as err:
-                error = error or err
+        come = self.gate.through(Slice.of(pieces, self._delay_ns)) if pieces else ()
+        for passed, moved in come:
+            if moved and passed.times[0] < self.collector.track.horizon_ns:
+                self.collector.start_anew()
+            for given in self._up_to_work(passed):
+                try:
+                    self._keep(given)
+                except Exception as err:
+                    error = error or err
         if error is not None:
             raise error
 
@@ -70,7 +175,7 @@ class Road:
         """Hand over the samples made."""
         made, shaken = self.collector.maker.take()
         count = self._taken(made)
-        self.clocks.watch.wake(self.collector.maker.unrest, count - shaken, count)
+        self.clocks.wake(self.collector.maker.unrest, count - shaken, count)
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, of so many measurements."""
@@ -78,18 +183,9 @@ class Road:
         collector, lateness = self.collector, self.clocks.settings.lateness
         causes = (TOO_LATE, *(f'{POSES}: {cause}' for cause in CAUSES[1:3]))
         unmatched = sum(collector.dropped[cause] for cause in causes)
-        hint = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
-        found = [hint] if hint is not None and all(self._newest.values()) else []
+        found = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
+        found = found if all(self._newest.values()) else []
         return found + self.clocks.hints() + collector.hints(measurements)
-
-    def _slices(self, pieces: Sequence[Piece]) -> Iterator[Slice]:
-        """Yield messages up to one that gives something to do, when those before are kept."""
-        if not pieces:
-            return
-        for passed, moved in self.gate.through(Slice.of(pieces, self._delay_ns)):
-            if moved and passed.times[0] < self.collector.track.horizon_ns:
-                self.collector.start_anew()
-            yield from self._up_to_work(passed)
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0
@@ -108,11 +204,11 @@ class Road:
                 self._newest[kind] = int(newest[-1])
                 if back := int((times < newest).sum()):  # nothing is lost by it
                     self.notes[f'{kind} with a stamp older than the one before'] += back
-        self.clocks.watch.take(given.pieces)
+        self.clocks.take(given.pieces)
         rounds = self.collector.take(given)
         if rounds:
             self.clocks.find(self.collector, rounds[-1])
             self.collector.round(rounds)
         self.hand_over()
         if rounds:
-            self.clocks.watch.look(rounds[-1])
+            self.clocks.look(rounds[-1])

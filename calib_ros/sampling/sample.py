@@ -205,11 +205,9 @@ def collect(
     """
     known = list(samples)
     frames = Frames() if frames is None else frames
-
-    def observed(members: Sequence[int]) -> Observations:
-        return _observations([known[k] for k in members], posed)
-
-    return sets_of(known, observed, sigmas, frames, posed)
+    return sets_of(
+        known, lambda some: _observations([known[k] for k in some], posed), sigmas, frames, posed
+    )
 
 
 def sets_of(

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -19,13 +18,10 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
-from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.entry import Entry, Part
-from calib_ros.sampling.hints import Hint, frozen, progress
-from calib_ros.sampling.kept import Kept
+from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
+from calib_ros.sampling.hints import Account, Hint, frozen, progress
 from calib_ros.sampling.live import Estimate, LiveEstimate
-from calib_ros.sampling.names import FrameNames, JointNames
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.problems import (
     check_joint_names,
@@ -38,7 +34,6 @@ from calib_ros.sampling.problems import (
 from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
-from calib_ros.sampling.strays import STRAY
 from calib_ros.settings import Settings
 
 ONE_FRAME = (
@@ -101,9 +96,9 @@ class CalibrationSession:
 
     def take(self, parts: Sequence[Part]) -> None:
         """Take messages in the order of their places."""
-        settled = self._frames.settled
+        settled = len(self._frames.usual)
         pieces = self._entry.pieces(parts, self.recording, self.settings.frame_id)
-        if self._frames.settled != settled:
+        if len(self._frames.usual) != settled:
             self._kept.leave_out_strange()
         try:
             self._road.take(pieces)
@@ -119,11 +114,6 @@ class CalibrationSession:
         self._road.finish()
         self._settle(wait=True)
         self._kept.leave_out_strange()
-
-    @property
-    def received(self) -> Counter[str]:
-        """Return how many messages came so far, by kind."""
-        return self._entry.received
 
     @property
     def latest(self) -> tuple[int, Sequence[float]] | None:
@@ -205,12 +195,12 @@ class CalibrationSession:
         notes = self._road.notes + collector.notes
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
-        strays = Counter({f'{kind}: {STRAY}': n for kind, n in self._road.gate.dropped.items()})
-        dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + strays
+        gate = self._road.gate
+        dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + gate.dropped
         return Account(
-            self.received['joints'],
-            self.received[POSES],
-            collector.waiting.count + self._road.gate.held(POSES),
+            self._entry.received[JOINTS],
+            self._entry.received[POSES],
+            collector.waiting.count + gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
@@ -233,7 +223,7 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        return found + self._road.hints(self.received[POSES])
+        return found + self._road.hints(self._entry.received[POSES])
 
     @property
     def delay(self) -> Delay | None:
@@ -355,7 +345,7 @@ class CalibrationSession:
         fresh = [
             each
             for each in self.pictures.ready(wait)
-            if usual(each.device) is None or not self._kept.is_strange(each)
+            if each.device not in usual or not self._kept.is_strange(each)
         ]
         self._kept.samples += fresh
         for sample in fresh:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of what was measured while the arm stood.
+"""Stops of the arm: which become samples, which pass unseen, and the means measured at them.
 
 An arm vibrates after its joints have stopped. So the mean begins where the measurements have come
 as close to the later ones as their noise allows, and a stop whose measurements still spread more
@@ -11,13 +11,16 @@ the spread, but hardly in the differences.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.identification.levels import MOST_OUTLIERS
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.interpolation import unwrapped
+from calib_ros.sampling.slices import Rows, Stamps
+from calib_ros.settings import Settings
 
 MOST_SPREAD = 2.0
 """Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
@@ -37,13 +40,13 @@ class Means:
     [m]; where `rests` (S,) is False measurements spread more than their noise.
     """
 
-    used: NDArray[np.bool_]
-    rests: NDArray[np.bool_]
+    used: Flags
+    rests: Flags
     values: FloatArray
     spreads: FloatArray
 
 
-def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -> Means:
+def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
     """Average positions (N, 3) or distances (N, 1) [m] stop by stop, in the order of their stamps.
 
     The stops begin at `begins` (S,); `sigmas` (S,) [m] are those of one coordinate expected.
@@ -59,7 +62,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
         settled = used[part]
         settled[: _settled(values[part], reach)] = False
         middle = np.median(values[part][settled], axis=0)
-        spikes = _distance(values[part], middle) > SPIKE * reach
+        spikes = np.linalg.norm(values[part] - middle, axis=1) > SPIKE * reach
         rests[k] = (spikes & settled).sum() <= MOST_OUTLIERS * settled.sum()  # else two places
         settled &= ~spikes
     means = mean_of_each(values, begins, used)
@@ -68,9 +71,7 @@ def averages(values: FloatArray, begins: NDArray[np.intp], sigmas: FloatArray) -
     return Means(used, rests & (spreads <= limits), means, spreads)
 
 
-def mean_of_each(
-    rows: FloatArray, begins: NDArray[np.intp], used: NDArray[np.bool_]
-) -> FloatArray:
+def mean_of_each(rows: FloatArray, begins: Index, used: Flags) -> FloatArray:
     """Return the means (S, ...) of the rows (N, ...) in use of each stop, zero where none is."""
     shape = (-1,) + (1,) * (rows.ndim - 1)
     counts = np.maximum(np.add.reduceat(used, begins, dtype=np.intp), 1)
@@ -86,12 +87,149 @@ def _noise(values: FloatArray) -> float:
 def _settled(values: FloatArray, reach: float) -> int:
     """Return how many measurements come before all of them stay near the later half."""
     half = len(values) // 2
-    far = _distance(values[:half], np.median(values[half:], axis=0)) > NEAR * reach
+    far = np.linalg.norm(values[:half] - np.median(values[half:], axis=0), axis=1) > NEAR * reach
     # A spike among settled ones is no vibration: two of three in a row must be far.
     pairs = far & (np.append(far[1:], False) | np.append(far[2:], [False, False]))
     last = np.flatnonzero(pairs)
     return int(last[-1]) + 2 if last.size else 0
 
 
-def _distance(values: FloatArray, point: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.norm(values - point, axis=1))
+SAMPLED = 'of a stop that has its pose already'
+
+
+@dataclass
+class Plan:
+    """What becomes of measurements up to stamps, each from the end of the one before.
+
+    Those up to each of the `ends` are not used for a reason, or it is empty and they are, from
+    where their stop begins.
+    """
+
+    done_ns: int  # up to which measurements have been dealt with
+    sampled_ns: int  # a stop that stands at this moment has been sampled
+    ends: list[int] = field(default_factory=list)
+    why: list[str] = field(default_factory=list)
+    begins: list[int] = field(default_factory=list)
+
+    def add(self, until: int, why: str, begin: int = 0) -> None:
+        """Deal with what was measured up to a stamp."""
+        if until > self.done_ns:
+            self.done_ns = until
+            self.ends.append(until)
+            self.why.append(why)
+            self.begins.append(begin)
+
+    def sampled(self, until: int) -> None:
+        """Drop the rest of a stop."""
+        self.add(until, SAMPLED)
+        self.sampled_ns = max(self.sampled_ns, self.done_ns)
+
+    def sample(self, begin: int, end: int) -> None:
+        """Make a sample of a stop."""
+        self.add(end, '', begin)
+        self.sampled_ns = end
+
+    @property
+    def stops(self) -> list[int]:
+        """Return the numbers of the stops of which samples are made."""
+        return [k for k, why in enumerate(self.why) if not why]
+
+    def of_stands(
+        self, stands: Stamps, until: int, newest: int | None, settings: Settings
+    ) -> Plan:
+        """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there."""
+        shortest, longest = (
+            round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)
+        )
+        for begin, end in stands.tolist():
+            goes_on = newest is not None and end >= newest
+            if newest is None:
+                end = min(end, until)
+            begin = max(begin, self.done_ns)
+            if begin > until or end <= self.done_ns:
+                continue
+            self.add(begin, 'the arm was moving')
+            if begin <= self.sampled_ns:
+                self.sampled(min(end, until))
+                continue
+            if settings.mode == 'triggered':
+                self.add(min(end, until), 'nobody asked for them')
+                continue
+            last = min(end, begin + longest)
+            if last > until or (goes_on and last == end):
+                return self  # it is waited for
+            if last - begin < shortest:
+                self.add(last, 'the stop was too short')
+                continue
+            self.sample(begin, last)
+            self.sampled(min(end, until))
+        self.add(until, 'the arm was moving')
+        return self
+
+
+class Known:
+    """Where and when stops were sampled: the clock may jump back, and they come again."""
+
+    def __init__(self, revolute: Flags, capacity: int) -> None:
+        self._revolute = revolute
+        self._stops = Rows(1 + len(revolute), capacity)  # how long, and where
+        self._last_ns = 0  # none ends later
+
+    def meets(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
+        """Tell whether a stop at joint values (n,) was sampled before; remember it if not."""
+        if begin <= self._last_ns:
+            begins, lengths = self._stops.stamps, self._stops.values[:, 0]
+            meets = (begins <= end) & (begins + lengths.astype(np.int64) >= begin)
+            steps = unwrapped(self._stops.values[meets, 1:] - where, self._revolute)
+            if (np.abs(steps).max(axis=1) <= near).any():
+                return True
+        if not self._stops.full:
+            self._stops.extend(np.array([begin]), np.array([[end - begin, *where]]))
+            self._last_ns = max(self._last_ns, end)
+        return False
+
+    def forget(self, stamp_ns: int) -> None:
+        """Forget the stop that stands at a stamp of the joints."""
+        since = stamp_ns - self._stops.stamps
+        self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
+
+
+class Rests:
+    """How many stops were `sampled`, and the noise of the joints where they rested unseen.
+
+    They pass unseen where their values are noisier than `still`. Up to a `capacity` are counted.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.sampled = 0
+        self._capacity = capacity
+        self._unseen: list[float] = []
+        self._resting = False
+
+    def note(self, noise: float | None) -> None:
+        """Note the noise of joints that rest though no stop is found, None while they do not."""
+        before, self._resting = self._resting, noise is not None
+        if noise is not None and not before and len(self._unseen) < self._capacity:
+            self._unseen.append(noise)
+
+    def needed(self, still: float) -> float | None:
+        """Return what `still` must be at least where more rests passed unseen than not."""
+        if len(self._unseen) <= self.sampled:
+            return None
+        needed = SPIKE * float(np.median(self._unseen))
+        return needed if needed > still else None
+
+
+def seen_stops(
+    stands: Stamps, rounds: Sequence[int], settled_ns: int, late_ns: int, shortest_ns: int
+) -> list[bool]:
+    """Tell of each round whether a stop shows in what the one before has not dealt with.
+
+    Stands (K, 2) of the joints, and stamps of the rounds, of which each deals with what is older
+    than it by `late_ns`.
+    """
+    times = np.array(rounds)[:, np.newaxis]
+    settled = np.concatenate([[[settled_ns]], times[:-1] - late_ns])
+    lengths = np.minimum(stands[:, 1], times) - stands[:, 0]
+    found = ((lengths >= shortest_ns) & (stands[:, 1] > settled)).any(axis=1)
+    return [bool(each) for each in found]

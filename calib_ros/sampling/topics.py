@@ -12,11 +12,12 @@ from typing import TypeAlias
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
-from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS
-from calib_ros.sampling.rows import Stamps
-from calib_ros.sampling.sources import (
+from calib_ros.sampling.messages import (
+    CAMERA_INFO,
+    DECODERS,
+    JOINT_STATE,
+    LINKS,
     MARKERS,
     TYPES,
     Source,
@@ -24,6 +25,7 @@ from calib_ros.sampling.sources import (
     parse_sources,
     short_type,
 )
+from calib_ros.sampling.slices import Series
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
 from calib_ros.values import SAME
@@ -113,15 +115,13 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 
 
 def check_joints(
-    messages: Iterator[tuple[Stream, bytes]],
-    joint_names: Sequence[str],
-    deserialise: Deserialise,
+    messages: Iterator[tuple[Stream, bytes]], joint_names: Sequence[str], deserialise: Deserialise
 ) -> None:
     """Refuse joint states of a recording of which several topics name the same joints.
 
     The InputError has the topics, and how far their values are apart.
     """
-    heard: dict[str, dict[str, tuple[Stamps, FloatArray]]] = defaultdict(dict)
+    heard: dict[str, dict[str, Series]] = defaultdict(dict)
     for (topic, name), parts in _joint_values(messages, deserialise).items():
         if name in joint_names:
             stamps = np.concatenate([each for each, _ in parts])
@@ -144,8 +144,7 @@ def check_joints(
 
 def _joint_values(
     messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise
-) -> dict[tuple[str, str], list[tuple[Stamps, FloatArray]]]:
-    """Return stamps and values by topic and joint."""
+) -> dict[tuple[str, str], list[Series]]:
     found = defaultdict(list)
     for batch, _ in batches(messages):
         for topic in dict.fromkeys(stream.topic for stream, _ in batch):
@@ -157,11 +156,7 @@ def _joint_values(
 
 
 def _apart(
-    a: str,
-    b: str,
-    first: Mapping[str, tuple[Stamps, FloatArray]],
-    second: Mapping[str, tuple[Stamps, FloatArray]],
-    names: Sequence[str],
+    a: str, b: str, first: Mapping[str, Series], second: Mapping[str, Series], names: Sequence[str]
 ) -> str:
     """Return in words by how much the joint values on two topics differ at the same time."""
     largest: tuple[float, str] | None = None

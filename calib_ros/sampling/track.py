@@ -10,40 +10,85 @@ interpolated on its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.identification.levels import TELLING
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
-from calib_ros.sampling.intervals import intersection, standing, unheard, union
-from calib_ros.sampling.rows import Rows, Stamps
+from calib_ros.sampling.slices import Rows, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
+
+LOOKS_BACK = 4
+"""Samples within the window with which the present one is compared."""
+
+
+def standing(
+    stamps: Stamps, values: FloatArray, still: float, window_ns: int, max_gap_ns: int
+) -> Stamps:
+    """Return (K, 2) from when to when the joints of one publisher stood."""
+    if len(stamps) == 0:
+        return np.zeros((0, 2), dtype=np.int64)
+    index = np.arange(len(stamps))
+    gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
+    begin = index[gap][np.cumsum(gap) - 1]  # where the samples without a gap begin
+    quiet = np.ones(len(stamps), dtype=bool)
+    joints = values.T.copy()  # numpy is slow over a short last axis
+    back = begin
+    for lag in range(1, LOOKS_BACK + 1):
+        back = np.searchsorted(stamps, stamps - window_ns * lag // LOOKS_BACK)
+        back = np.maximum(np.minimum(back, index - 1), begin)
+        quiet &= np.abs(joints - np.take(joints, back, axis=1)).max(axis=0) <= still
+    starts = np.flatnonzero(quiet & ~np.concatenate([[False], quiet[:-1]]) | (quiet & gap))
+    ends = np.flatnonzero(quiet & ~(np.concatenate([quiet[1:], [False]])))
+    ends = np.union1d(ends, np.flatnonzero(quiet & np.concatenate([gap[1:], [False]])))
+    found = np.stack([stamps[back[starts]], stamps[ends]], axis=1)
+    found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch parts two stands
+    return np.asarray(found[found[:, 0] < found[:, 1]], dtype=np.int64)
+
+
+def unheard(stamps: Stamps, max_gap_ns: int) -> Stamps:
+    """Return (K, 2) when a publisher was not heard; what it shows before and after overlaps."""
+    limits = np.iinfo(np.int64)
+    gaps = np.flatnonzero(np.diff(stamps) > max_gap_ns)
+    begins = np.concatenate([[limits.min], stamps[gaps] - 1, stamps[-1:] - 1])
+    ends = np.concatenate([stamps[:1] + 1, stamps[gaps + 1] + 1, [limits.max]])
+    return np.stack([begins, ends], axis=1)
+
+
+def union(several: Sequence[Stamps]) -> Stamps:
+    """Return (K, 2) the intervals of sorted lists, those that overlap as one."""
+    if len(several) == 1:
+        return several[0]
+    found = np.concatenate(several)
+    found = found[np.argsort(found[:, 0], kind='stable')]
+    ends = np.maximum.accumulate(found[:, 1])
+    apart = found[1:, 0] >= ends[:-1]
+    firsts = np.concatenate([np.ones(len(found[:1]), dtype=bool), apart])
+    lasts = np.concatenate([apart, np.ones(len(found[:1]), dtype=bool)])
+    return np.stack([found[firsts, 0], ends[lasts]], axis=1)
+
+
+def intersection(first: Stamps, second: Stamps) -> Stamps:
+    """Return (K, 2) what two sorted lists of intervals have in common."""
+    starts = np.maximum(first[:, np.newaxis, 0], second[np.newaxis, :, 0])
+    ends = np.minimum(first[:, np.newaxis, 1], second[np.newaxis, :, 1])
+    chosen = starts < ends
+    return np.stack([starts[chosen], ends[chosen]], axis=1)
+
 
 APART = 'joint states too far apart'
 CAUSES = ('', 'no joint state before', 'no joint state after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """Joint values (N, n), their velocities and accelerations at N stamps.
-
-    `approach` (N, n) holds the signs of the last moves; `cause` (N,) is an index of CAUSES, and
-    where it is not zero the values count for nothing.
-    """
+class Motion(NamedTuple):
+    """Joint values (N, n), their velocities and accelerations unless the arm stands."""
 
     joints: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    approach: FloatArray
-    cause: NDArray[np.intp]
-
-    def rows(self, which: NDArray[np.bool_]) -> Motion:
-        """Return the motion at some of the stamps."""
-        return Motion(*(getattr(self, item.name)[which] for item in fields(self)))
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
 
 
 class Track:
@@ -109,37 +154,32 @@ class Track:
         return sum(rows.sort() for rows in self._parts.values())
 
     def at(self, stamps: Stamps, standing: bool = False) -> Motion:
-        """Return the motion at stamps (N,), after `sort`.
+        """Return the motion at stamps (N,) at which it is known (`causes`), after `sort`.
 
         While the arm stands joint values are interpolated linearly: a cubic beside the end of a
         stop would hold a part of the move.
         """
-        shape = (len(stamps), len(self._revolute))
-        joints, velocity, acceleration, approach = (np.zeros(shape) for _ in range(4))
-        for columns, rows in self._by_size():
-            index = list(columns)
-            revolute = self._revolute[index]
-            why, first, last = self._brackets(rows.stamps, stamps)
-            found = interpolated(rows, stamps, first, last, revolute, standing)
-            came = last_moves(rows.values, first, found[0], self._came[index], revolute)
-            good = np.ix_(why == 0, index)
-            for whole, part in zip(
-                (joints, velocity, acceleration, approach), (*found, came), strict=True
-            ):
-                whole[good] = part[why == 0]
-        return Motion(joints, velocity, acceleration, approach, self.causes(stamps))
-
-    def where(self, stamps: Stamps) -> FloatArray:
-        """Return joint values (N, n) while the arm stands, after `sort`, without the approach."""
-        joints = np.zeros((len(stamps), len(self._revolute)))
+        found = np.zeros((3, len(stamps), len(self._revolute)))
         for columns, rows in self._by_size():
             index = list(columns)
             why, first, last = self._brackets(rows.stamps, stamps)
-            found, *_ = interpolated(rows, stamps, first, last, self._revolute[index], True)
-            joints[np.ix_(why == 0, index)] = found[why == 0]
-        return joints
+            part = interpolated(rows, stamps, first, last, self._revolute[index], standing)
+            for whole, each in zip(found, part, strict=True):
+                whole[np.ix_(why == 0, index)] = each[why == 0]
+        return Motion(found[0]) if standing else Motion(*found)
 
-    def causes(self, stamps: Stamps) -> NDArray[np.intp]:
+    def approach(self, stamps: Stamps, joints: FloatArray) -> FloatArray:
+        """Return the signs (N, n) of the last moves before joint values (N, n) at stamps (N,)."""
+        found = np.zeros(joints.shape)
+        for columns, rows in self._by_size():
+            index = list(columns)
+            why, first, _ = self._brackets(rows.stamps, stamps)
+            revolute, came = self._revolute[index], self._came[index]
+            signs = last_moves(rows.values, first, joints[:, index], came, revolute)
+            found[np.ix_(why == 0, index)] = signs[why == 0]
+        return found
+
+    def causes(self, stamps: Stamps) -> Index:
         """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
         cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
         for columns, rows in self._by_size():
@@ -153,9 +193,7 @@ class Track:
         """Return the parts; a joint that several name is taken from the last that has it."""
         return sorted(self._parts.items(), key=lambda item: len(item[0]))
 
-    def _brackets(
-        self, known: Stamps, stamps: Stamps
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    def _brackets(self, known: Stamps, stamps: Stamps) -> tuple[Index, Index, Index]:
         """Return causes (N,) and the samples before and after each stamp."""
         nowhere = np.zeros(len(stamps), dtype=np.intp)
         if len(known) == 0:
@@ -250,17 +288,10 @@ class Track:
         middle = [int(rows.stamps[rows.count // 2]) for rows in self._parts.values() if rows.full]
         return self.release(max(middle, default=0))
 
-    def clear(self) -> None:
-        """Forget all samples."""
-        self._parts.clear()
-        self._came[:] = 0.0
-        self.horizon_ns = 0
-
-    def samples(self) -> tuple[Stamps, FloatArray]:
+    def samples(self) -> Series:
         """Return stamps (M,) and joint values (M, n) where the main publisher was heard."""
         if self.missing:
             return np.zeros(0, dtype=np.int64), np.zeros((0, len(self._revolute)))
         main = max(self._parts.items(), key=lambda item: len(item[0]))[1]
-        motion = self.at(main.stamps)
-        good = motion.cause == 0
-        return main.stamps[good], motion.joints[good]
+        stamps = main.stamps[self.causes(main.stamps) == 0]
+        return stamps, self.at(stamps).joints

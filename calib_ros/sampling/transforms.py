@@ -11,8 +11,8 @@ by which it would be measured with itself.
 from __future__ import annotations
 
 import shlex
-from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -20,11 +20,9 @@ import numpy as np
 
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import Layout
-from calib_ros.sampling.messages import TRANSFORMS, Readings
-from calib_ros.sampling.rows import Stamps
-from calib_ros.sampling.sources import Source, short_type
+from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, Source, short_type, usable
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
 from calib_ros.values import SAME
@@ -34,6 +32,23 @@ Pair: TypeAlias = tuple[str, str]
 
 STATIC = '_static'
 """What the name of the topic of links that stand still ends with."""
+
+
+class Linked(NamedTuple):
+    """Transforms between the same two frames, of messages at some `places` (N,) in the batch.
+
+    Their numbers are read only where they are wanted; the first and the last stamp are known.
+    """
+
+    places: Index
+    still: bool
+    link: Pair
+    span: tuple[int, int]
+    read: Callable[[], Readings]
+
+
+Measured: TypeAlias = tuple[Source, Index, Readings]
+"""What one source measured, and the places of the messages in the batch."""
 
 
 class Route(NamedTuple):
@@ -74,99 +89,75 @@ class Links:
         self._moving: dict[Pair, Seen] = {}
         self._changed: set[Pair] = set()
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
-        self._parents: dict[str, list[Pair]] = {}  # the links to each frame, as routes up to date
+        self._parents = defaultdict[str, list[Pair]](list)  # links to frames, as the routes are
         self._known = False  # whether the routes are up to date
         self._wanted: set[Pair] = set()
         self._open = True  # whether frames of a source are not linked yet
         self.layouts: dict[int, list[Layout]] = {}
         """How its messages are laid out, by their length."""
-        self._held: deque[tuple[Pair, Stamps, FloatArray]] = deque()
-        self._count = 0
+        self._held: deque[tuple[Pair, Readings]] = deque()
         self._let_go: Counter[Pair] = Counter()
 
-    def fix(self, link: Pair, numbers: FloatArray) -> None:
-        """Learn a link that stands still: position and quaternion (7)."""
-        matrix = se3.transform(se3.from_quat(numbers[3:]), numbers[:3])
-        before = self._fixed.get(link)
-        if before is None:
-            self._fixed[link] = matrix
-            self._known = False
-        elif not np.allclose(before, matrix, rtol=0.0, atol=SAME):
-            self._changed.add(link)
+    def take(self, come: Sequence[Linked]) -> tuple[list[Measured], Counter[str]]:
+        """Return what sources make of transforms, and why some cannot be used.
+
+        Frames that are named anywhere among them are known for all of them. Where the frames
+        between are not known yet, measurements wait for them.
+        """
+        for each in come:
+            self._fix(each) if each.still else self._move(each)
+        open_before = {source for source, route in self._routes.items() if route == ''}
+        self._update()
+        first, faults = min(int(each.places[0]) for each in come), Counter[str]()
+        found = [
+            (source, np.full(len(waited.stamps_ns), first), self._reading(source, route, waited))
+            for link, waited in self._held
+            for source, route in self._of(link)
+            if source in open_before
+        ]
+        for each in come:
+            if each.still or not (self._open or each.link in self._wanted):
+                continue
+            read = each.read()
+            good, causes = usable(TRANSFORM, read)
+            read, measured = read.rows(good), self._of(each.link)
+            faults += Counter({cause: n * len(measured) for cause, n in causes.items()})
+            self._held.append((each.link, read))
+            found += [(s, each.places[good], self._reading(s, r, read)) for s, r in measured]
+        if not self._open:
+            gone = sum(n * len(self._of(link)) for link, n in self._let_go.items())
+            faults += Counter({'buffer full before their frames were linked': gone})
+            self._let_go.clear()
+            self._held.clear()
+        while sum(len(waiting.stamps_ns) for _, waiting in self._held) > Settings.pose_buffer:
+            oldest, lost = self._held.popleft()
+            self._let_go[oldest] += len(lost.stamps_ns)
+        return found, faults
+
+    def _fix(self, come: Linked) -> None:
+        """Learn a link that stands still; what does may have no stamp."""
+        found = come.read()
+        good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(come.places)))
+        for numbers in found.numbers[good]:
+            matrix = se3.transform(se3.from_quat(numbers[3:]), numbers[:3])
+            before = self._fixed.setdefault(come.link, matrix)
+            if not np.allclose(before, matrix, rtol=0.0, atol=SAME):
+                self._changed.add(come.link)
             self._known = False
 
-    def move(self, link: Pair, count: int, first_ns: int, last_ns: int) -> None:
-        """Learn that a moving link has come."""
-        seen = self._moving.get(link)
-        if seen is None:
+    def _move(self, come: Linked) -> None:
+        link, (first_ns, last_ns) = come.link, come.span
+        if link not in self._moving:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()
                 for each in [*self._moving][: MOST_ENTRIES // 2]:
                     if each not in self._wanted:
                         del self._moving[each]
-            self._moving[link] = Seen(count, first_ns, last_ns)
+            self._moving[link] = Seen(0, first_ns, last_ns)
             self._known = False
-            return
-        seen.count += count
+        seen = self._moving[link]
+        seen.count += len(come.places)
         seen.first_ns, seen.last_ns = min(seen.first_ns, first_ns), max(seen.last_ns, last_ns)
-
-    def wanted(self, link: Pair) -> bool:
-        """Tell whether the numbers of a link are of use, now or perhaps later."""
-        self._update()
-        return self._open or link in self._wanted
-
-    def measured_by(self, link: Pair) -> list[Source]:
-        """Return the sources that a link measures."""
-        self._update()
-        return [source for source, _ in self._of(link)]
-
-    def readings(
-        self, link: Pair, stamps: Stamps, numbers: FloatArray
-    ) -> list[tuple[Source, Readings]]:
-        """Return what sources make of a moving link: numbers (N, 7) at stamps (N,).
-
-        Where the frames between are not known yet, it waits for them.
-        """
-        self._update()
-        if self._open:
-            self._held.append((link, stamps, numbers))
-            self._count += len(stamps)
-            while self._count > Settings.pose_buffer:
-                oldest, gone, _ = self._held.popleft()
-                self._count -= len(gone)
-                self._let_go[oldest] += len(gone)
-        return [
-            (source, self._reading(source, route, stamps, numbers))
-            for source, route in self._of(link)
-        ]
-
-    def released(self) -> list[tuple[Source, Readings]]:
-        """Return what sources make of what has waited, as far as frames are known by now."""
-        before = dict(self._routes)
-        self._update()
-        fresh = {
-            source: route
-            for source, route in self._routes.items()
-            if before[source] == '' and isinstance(route, Route)
-        }
-        found = [
-            (source, self._reading(source, route, stamps, numbers))
-            for link, stamps, numbers in (self._held if fresh else ())
-            for source, route in fresh.items()
-            if route.link == link
-        ]
-        if not self._open:
-            self._held.clear()
-            self._count = 0
-        return found
-
-    def let_go(self) -> int:
-        """Return how many measurements could not wait for their frames, once these are known."""
-        if self._open or not self._let_go:
-            return 0
-        count = sum(n * len(self.measured_by(link)) for link, n in self._let_go.items())
-        self._let_go.clear()
-        return count
 
     def problems(self) -> list[str]:
         """Return in words why sources measure nothing, with what to use instead."""
@@ -193,7 +184,9 @@ class Links:
             (parent, child)
             for parent, child in self._moving
             if child not in parents
-            and not any(pair in self._moving for each in above[parent] for pair in self._to(each))
+            and not any(
+                pair in self._moving for each in above[parent] for pair in self._parents[each]
+            )
         }
         order = sorted(self._moving, key=lambda link: (link not in alone, link))
         listed = [
@@ -212,16 +205,16 @@ class Links:
 
     # Details
 
-    def _of(self, link: Pair) -> Iterator[tuple[Source, Route]]:
-        for source, route in self._routes.items():
-            if isinstance(route, Route) and route.link == link:
-                yield source, route
+    def _of(self, link: Pair) -> list[tuple[Source, Route]]:
+        """Return the sources that a link measures."""
+        routes = self._routes.items()
+        return [(s, r) for s, r in routes if isinstance(r, Route) and r.link == link]
 
     def _update(self) -> None:
         if not self._known:
-            self._parents = {}
+            self._parents.clear()
             for link in sorted({*self._fixed, *self._moving}):
-                self._parents.setdefault(link[1], []).append(link)
+                self._parents[link[1]].append(link)
             self._routes = {source: self._route(source) for source in self.sources}
             routes = self._routes.values()
             self._wanted = {route.link for route in routes if isinstance(route, Route)}
@@ -265,14 +258,14 @@ class Links:
         common = next((frame for frame in first if frame in second), None)
         if common is None:
             return ambiguous or also
-        down = [(self._to(frame)[0], False) for frame in first[: first.index(common)]]
-        up = [(self._to(frame)[0], True) for frame in second[: second.index(common)]]
+        down = [(self._parents[frame][0], False) for frame in first[: first.index(common)]]
+        up = [(self._parents[frame][0], True) for frame in second[: second.index(common)]]
         return [*up, *reversed(down)]
 
     def _above(self, frame: str) -> tuple[list[str], str]:
         """Return a frame and those above it; and what is wrong with the last one, if anything."""
         frames = [frame]
-        while links := self._to(frames[-1]):
+        while links := self._parents[frames[-1]]:
             if len(links) > 1:
                 parents = ' and '.join(parent for parent, _ in links)
                 return frames, (
@@ -284,21 +277,16 @@ class Links:
             frames.append(links[0][0])
         return frames, ''
 
-    def _to(self, frame: str) -> list[Pair]:
-        """Return the links from parents of a frame."""
-        return self._parents.get(frame, [])
-
     def _composed(self, path: Sequence[tuple[Pair, bool]]) -> FloatArray:
         matrix = np.eye(4)
         for link, inverse in path:
             matrix = matrix @ (se3.invert(self._fixed[link]) if inverse else self._fixed[link])
         return matrix
 
-    def _reading(
-        self, source: Source, route: Route, stamps: Stamps, numbers: FloatArray
-    ) -> Readings:
+    def _reading(self, source: Source, route: Route, found: Readings) -> Readings:
+        numbers = found.numbers
         if route.inverse or route.link != (source.parent, source.child):
             links = se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
-            found = route.before @ (se3.invert(links) if route.inverse else links) @ route.after
-            numbers = np.hstack([found[:, :3, 3], se3.to_quat(found[:, :3, :3])])
-        return Readings(stamps, (source.parent, source.child), numbers)
+            poses = route.before @ (se3.invert(links) if route.inverse else links) @ route.after
+            numbers = np.hstack([poses[:, :3, 3], se3.to_quat(poses[:, :3, :3])])
+        return Readings(found.stamps_ns, (source.parent, source.child), numbers)

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from calib_ros.apply.chart import drift, run_length
+from calib_ros.apply.confidence import drift, run_length
 from calib_ros.errors import InputError
 
 

@@ -23,9 +23,9 @@ from calib_ros.apply.compensation import Compensator, compensate, in_words
 from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import faulty, random_frame
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.kinematics import effects, following
+from calib_ros.kinematics import effects, inverse
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.following import mobility
+from calib_ros.kinematics.inverse import mobility
 
 SIX = ['puma560', 'staubli_tx90l', 'ur10e']
 REDUNDANT = ['kuka_iiwa14', 'ur10e_on_linear_axis']
@@ -278,7 +278,7 @@ def test_what_is_reached_near_a_singularity_is_never_worse_than_nothing(name):
 
 
 def test_a_sample_that_does_not_converge_is_refused(monkeypatch):
-    monkeypatch.setattr(following, 'ROUNDS', 1)
+    monkeypatch.setattr(inverse, 'ROUNDS', 1)
     tolerant = Compensator(UR, UR_TRUE, largest_position_error=1.0, largest_orientation_error=1.0)
     result = compensate(tolerant, regular(UR, 3))
     assert not result.converged.any()

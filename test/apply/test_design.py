@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from designs import POSTURE, SIGMAS, arm, design_of, log_det, predicted_square, some
 
-from calib_ros.apply import choice, planning, simulation
-from calib_ros.apply.choice import choose
+from calib_ros.apply import planning, simulation
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
     Candidates,
@@ -19,6 +18,7 @@ from calib_ros.apply.design import (
     information_of,
     predicted,
 )
+from calib_ros.apply.planning import choose
 from calib_ros.errors import InputError
 from calib_ros.identification.identifiability import observability
 from calib_ros.identification.identification import Problem, identify
@@ -179,7 +179,8 @@ def test_worth_by_updates_equals_that_computed_anew(oriented):
     chosen = list(range(12))
     so_far = space.known + information_of(space.rows[chosen])
     by_det, by_task = (
-        choice._Worth(space, criterion, task).of(so_far, space.rows) for criterion in ('d', 'task')
+        planning._Worth(space, criterion, task).of(so_far, space.rows)
+        for criterion in ('d', 'task')
     )
     for k in (3, 20, 29):  # one of them a second time
         more = np.concatenate([q[chosen], q[k : k + 1]])
@@ -195,7 +196,7 @@ def test_indices_are_those_of_the_report(criterion):
     q = some(design.chain, 30)
     space = Candidates(design, q)
     so_far = space.known + information_of(space.rows[:12])
-    worth = choice._Worth(space, criterion).of(so_far, space.rows)
+    worth = planning._Worth(space, criterion).of(so_far, space.rows)
     rows = design.rows(np.concatenate([q[:12], q[20:21]])).reshape(-1, len(design.names))
     factor = np.linalg.qr(rows, mode='r')
     assert worth[20] == pytest.approx(getattr(observability(factor, 13), criterion), rel=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from surveyed import DOWN, TASK, calibrated, identified
 
 from calib_ros.apply import workspace
-from calib_ros.apply.placement import place, task_of
+from calib_ros.apply.workspace import place, task_of
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.kinematics.se3 import exp_rotation, transform

@@ -10,10 +10,10 @@ from hypothesis import given, settings, strategies as st
 from robots import DATA, needs_data
 from scipy.spatial.distance import pdist
 
-from calib_ros.apply import choice, planning, simulation
+from calib_ros.apply import planning, simulation
 from calib_ros.apply.candidates import visit_order
-from calib_ros.apply.choice import choose
 from calib_ros.apply.design import Design, accuracy, predicted
+from calib_ros.apply.planning import choose
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identifiability import observability
@@ -42,13 +42,13 @@ def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     chosen = choose(design, q, 4)
     share = np.exp((log_det(design, q[chosen]) - best) / size)
     assert 0.95 < share < 1.0 + 1e-6
-    assert choice.efficiency(design, q, chosen, None) <= share + 1e-6
+    assert planning.efficiency(design, q, chosen, None) <= share + 1e-6
 
     best = min(predicted_square(design, q[each], task) for each in choices)
     chosen = choose(design, q, 4, 'task', task)
     share = best / predicted_square(design, q[chosen], task)
     assert 0.8 < share < 1.0 + 1e-6
-    assert choice.efficiency(design, q, chosen, task) <= share + 1e-6
+    assert planning.efficiency(design, q, chosen, task) <= share + 1e-6
 
 
 @pytest.mark.parametrize('criterion', ['o3', 'o5'])
@@ -161,7 +161,7 @@ def test_over_the_whole_range_no_25_poses_are_worth_50_random_ones():
     design = design_of(arm())
     q, unseen = some(design.chain, 300), some(design.chain, 100, 2)
     chosen = choose(design, q, 25, 'task', unseen)
-    share = choice.efficiency(design, q, chosen, unseen)
+    share = planning.efficiency(design, q, chosen, unseen)
     least = accuracy(design, q[chosen], unseen)[-1] * np.sqrt(share)
     random = [accuracy(design, some(design.chain, 50, k), unseen)[-1] for k in range(25)]
     assert np.mean(random) < least

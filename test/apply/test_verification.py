@@ -7,11 +7,10 @@ import pytest
 from scipy import stats
 
 from calib_ros.apply import simulation, verification
-from calib_ros.apply.candidates import Visibility
+from calib_ros.apply.candidates import Visibility, iso_9283_poses
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.design import Design
-from calib_ros.apply.iso9283 import iso_9283_poses
 from calib_ros.apply.verification import Attained, in_words, verify
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED

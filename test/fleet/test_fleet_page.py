@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import plants
 
-from calib_ros.apply.chart import drift
+from calib_ros.apply.confidence import drift
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Measured, Robot
 from calib_ros.fleet.standing import Standing, counts

@@ -35,9 +35,9 @@ def ended_by(monkeypatch):
 
     Signals stay with the tests.
     """
-    from calib_ros.ros import node, running
+    from calib_ros.ros import boundary, node
 
-    monkeypatch.setattr(running, '_handle_signals', lambda handler: None)
+    monkeypatch.setattr(boundary, '_handle_signals', lambda handler: None)
 
     def run(*parameters):
         return node.main(['--ros-args', *(w for given in parameters for w in ('-p', given))])

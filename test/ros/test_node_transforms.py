@@ -26,9 +26,8 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros.inputs import Hearing, deserialised
 from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, parse_sources
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 
 STORE = get_typestore(Stores.ROS2_JAZZY)

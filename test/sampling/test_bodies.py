@@ -14,8 +14,7 @@ from test_transforms import TIMES, frame, link, tf
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import se3
-from calib_ros.sampling.messages import JOINT_STATE
-from calib_ros.sampling.sources import parse_source
+from calib_ros.sampling.messages import JOINT_STATE, parse_source
 
 storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 MOCAP = 'mocap4r2_msgs/msg/RigidBodies'

@@ -14,9 +14,8 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.entry import Part
-from calib_ros.sampling.messages import Readings
+from calib_ros.sampling.messages import Readings, Source
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
 UR5E = load_chain('ur5e')

@@ -10,9 +10,8 @@ from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.intake import Stream, feed
-from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.messages import JOINT_STATE, Source
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
 ARM = load_chain('ur10e')
@@ -97,7 +96,7 @@ def outcome(session):
 def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     rng = np.random.default_rng(seed)
     if seed == 4:  # the first stream that comes when none is in use takes the only place
-        monkeypatch.setattr('calib_ros.sampling.waiting.MOST_NAMES', 1)
+        monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 1)
     first, second = shift(rng), shift(rng)
     # The clock jumps back when the recording begins again.
     messages = first + (second if seed % 2 else [])
@@ -120,7 +119,7 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
 
 
 def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.waiting.MOST_NAMES', 1)
+    monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 1)
     quat = [0.0, 0.0, 0.0, 1.0]
     messages = [pose(START, [np.nan, 0.0, 0.0], quat)]
     for k in range(1, 5):

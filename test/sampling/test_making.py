@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.kinematics import se3
-from calib_ros.sampling.making import ROW_WIDTH, Maker, Matched
+from calib_ros.sampling.making import ROW_WIDTH, Maker
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice, StreamKey
 from calib_ros.sampling.track import Motion
 
@@ -21,11 +21,12 @@ def samples(rotations, rng, spikes=(), stops=1):
     values[list(spikes), :3] += 0.1
     values[:, 3:7] = np.tile(se3.to_quat(rotations), (stops, 1))
     still = np.zeros((stops * count, 1))
-    motion = Motion(still, still, still, still, np.zeros(stops * count, dtype=np.intp))
     stamps = 1 + np.arange(stops * count)
     numbers = np.repeat(np.arange(stops), count)
     made = Maker(np.array([True]), 100)
-    made.add(list(made.of_stops(Matched(POSE, numbers, stamps, values, motion, 0), NOISE)))
+    found = Piece(POSE, numbers, stamps, values)
+    begins = count * np.arange(stops)
+    made.add(list(made.samples(found, Motion(still), begins, still[begins], 0.0, NOISE)))
     return made.take()[0]
 
 

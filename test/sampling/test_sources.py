@@ -3,8 +3,15 @@
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.messages import DECODERS, TRANSFORMS
-from calib_ros.sampling.sources import DISTANCE, STANDARD, Source, parse_source, parse_sources
+from calib_ros.sampling.messages import (
+    DECODERS,
+    DISTANCE,
+    STANDARD,
+    TRANSFORMS,
+    Source,
+    parse_source,
+    parse_sources,
+)
 
 
 def test_a_topic_alone_is_a_source():

@@ -5,10 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from calib_ros.sampling.slices import Piece, Slice, StreamKey
-from calib_ros.sampling.stands import SAMPLED, Known, Plan, Rests, seen_stops
-from calib_ros.sampling.stops import SPIKE
-from calib_ros.sampling.waiting import Waiting
+from calib_ros.sampling.slices import Piece, Slice, StreamKey, Waiting
+from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Plan, Rests, seen_stops
 from calib_ros.settings import Settings
 
 S = 10**9
@@ -72,24 +70,25 @@ def test_what_was_dealt_with_is_not_dealt_with_again():
 
 def test_a_stop_seen_before_is_known_where_and_when_it_was():
     known = Known(np.array([True, False]), 9)
-    where, near = np.array([[3.0, 0.2]]), 1e-3
-    assert known.meets([(10, 20)], where, near) == [False]
-    assert known.meets([(20, 30)], where, near) == [True]  # they touch
-    assert known.meets([(5, 10)], where, near) == [True]
-    assert known.meets([(12, 14)], where - [2.0 * np.pi, 0.0], near) == [True]
-    assert known.meets([(12, 14)], where + 0.9 * near, near) == [True]
-    assert known.meets([(12, 14)], where + 1.1 * near, near) == [False]
-    assert known.meets([(12, 14)], where - [0.0, 2.0 * np.pi], near) == [False]
-    assert known.meets([(1, 9), (21, 22)], np.repeat(where, 2, axis=0), near) == [False, False]
+    where, near = np.array([3.0, 0.2]), 1e-3
+    assert not known.meets(10, 20, where, near)
+    assert known.meets(20, 30, where, near)  # they touch
+    assert known.meets(5, 10, where, near)
+    assert known.meets(12, 14, where - [2.0 * np.pi, 0.0], near)
+    assert known.meets(12, 14, where + 0.9 * near, near)
+    assert not known.meets(12, 14, where + 1.1 * near, near)
+    assert not known.meets(12, 14, where - [0.0, 2.0 * np.pi], near)
+    assert not known.meets(1, 9, where, near)
+    assert not known.meets(21, 22, where, near)
 
 
 @pytest.mark.parametrize(('stamp', 'met'), [(9, True), (10, False), (20, False), (21, True)])
 def test_only_the_stop_that_stands_at_a_stamp_is_forgotten(stamp, met):
     known = Known(np.array([True]), 9)
-    where = np.zeros((1, 1))
-    known.meets([(10, 20)], where, 1e-3)
+    where = np.zeros(1)
+    known.meets(10, 20, where, 1e-3)
     known.forget(stamp)
-    assert known.meets([(10, 20)], where, 1e-3) == [met]
+    assert known.meets(10, 20, where, 1e-3) == met
 
 
 def test_rests_unseen_count_once_each_up_to_a_capacity():

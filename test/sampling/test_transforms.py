@@ -24,10 +24,9 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.cdr import alike
 from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, parse_sources
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.sources import parse_sources
-from calib_ros.sampling.transforms import Links
+from calib_ros.sampling.transforms import Linked, Links
 from calib_ros.settings import Settings
 
 storages = pytest.mark.parametrize('storage', sorted(STORAGES))
@@ -329,7 +328,7 @@ def test_frames_without_end_are_not_remembered(rng):
     assert session.account().samples == 5
     links = Links('/tf')
     for k in range(5000):
-        links.move(('tracker', f'marker {k}'), 1, k, k)
+        links.take([Linked(np.zeros(1, int), False, ('tracker', f'marker {k}'), (k, k), None)])
     assert 'and 980 more' in str(links)
 
 

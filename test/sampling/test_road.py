@@ -20,9 +20,9 @@ from streams import (
 )
 
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.sampling.road import STRAY, Gate
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
-from calib_ros.sampling.strays import Gate
 from calib_ros.settings import Settings
 
 ARM = load_chain('ur5e')
@@ -68,7 +68,7 @@ def test_a_stray_stamp_of_each_is_dropped(off):
     stray = [(JOINTS, 105.0 + off), (POSES, 105.0 + off)]
     passed, gate = through([*sane[:100], *stray, *sane[100:]])
     assert passed == sane
-    assert gate.dropped == {JOINTS: 1, POSES: 1}
+    assert gate.dropped == {f'{kind}: {STRAY}': 1 for kind in (JOINTS, POSES)}
 
 
 @pytest.mark.parametrize('off', [-1e7, -30.0, 30.0, 1e7])
