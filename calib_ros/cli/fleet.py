@@ -14,15 +14,13 @@ from calib_ros.atomic import write_file
 from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.files.history import History
-from calib_ros.files.rows import Row
+from calib_ros.files.history import History, Row
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.fleet.page import write_report
     from calib_ros.fleet.plant import read_plant
     from calib_ros.fleet.run import Cluster, run
-    from calib_ros.fleet.standing import counts, metrics, standings
+    from calib_ros.fleet.standing import counts, metrics, standings, write_report
 
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')

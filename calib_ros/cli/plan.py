@@ -19,12 +19,12 @@ from calib_ros.atomic import write_together
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.waypoints import joints_csv, read_joints
+from calib_ros.files.programs import joints_csv, read_joints
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told
-from calib_ros.report.maps import plan_report
+from calib_ros.report.applied import plan_report
 
 TESTS = (
     'P1 to P5 of ISO 9283 in a cube of {:.3f} m, one orientation: go to them in turn, 30 times, '

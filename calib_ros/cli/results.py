@@ -16,8 +16,7 @@ from calib_ros.identification.identification import Identification
 from calib_ros.progress import share_of
 from calib_ros.report import words
 from calib_ros.report.advice import BRINGS
-from calib_ros.report.markdown import markdown
-from calib_ros.report.page import Origin
+from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import NOT_YET, identification_report, reasons_of, within_tolerance
 from calib_ros.settings import Settings

@@ -12,15 +12,15 @@ from calib_ros.cli import given, options as common
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.rows import verified
-from calib_ros.files.waypoints import read_joints
+from calib_ros.files.history import verified
+from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import calibration_file
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
+from calib_ros.report.applied import STANDINGS, verification_report
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import STANDINGS, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')

@@ -30,7 +30,7 @@ from calib_ros.escapes import to_cell
 from calib_ros.files.columns import check_quaternions
 from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import joint_columns
-from calib_ros.files.waypoints import POSE
+from calib_ros.files.programs import POSE
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint

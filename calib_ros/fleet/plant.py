@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
-from calib_ros.files.rows import parse_serial, settings_hash
+from calib_ros.files.history import parse_serial, settings_hash
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import EXCEPTION, Settings
@@ -86,24 +86,17 @@ def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Rob
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: robots must be a list, each with serial, chain and measured')
     chains: dict[str, Chain] = {}
-    robots = [
-        _robot(row, groups, folder, f'{where}: robot {number}', chains)
-        for number, row in enumerate(rows, 1)
-    ]
-    seen: set[str] = set()
-    for robot in robots:
-        if robot.serial in seen:
+    robots: dict[str, Robot] = {}
+    for number, row in enumerate(rows, 1):
+        robot = _robot(row, groups, folder, f'{where}: robot {number}', chains)
+        if robot.serial in robots:
             raise ConfigError(f'{where}: there are two robots with the serial {robot.serial}')
-        seen.add(robot.serial)
-    return tuple(robots)
+        robots[robot.serial] = robot
+    return tuple(robots.values())
 
 
 def _robot(
-    row: object,
-    groups: Mapping[str, Any],
-    folder: Path,
-    where: str,
-    chains: dict[str, Chain],
+    row: object, groups: Mapping[str, Any], folder: Path, where: str, chains: dict[str, Chain]
 ) -> Robot:
     own = parse_mapping(row, KEYS['a robot'], where)
     serial = parse_serial(own.get('serial'), f'{where}: serial')

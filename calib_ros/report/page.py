@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A report as one HTML file that needs nothing else: no network, no files beside it.
+"""A report as HTML, as PDF and in Markdown: each one file that needs nothing else, no network.
 
 jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
-None where they are not installed. All text of others is escaped by the template.
+None where they are not installed. All text of others is escaped.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import calib_ros
-from calib_ros.escapes import one_line
+from calib_ros.escapes import in_markdown, one_line
 from calib_ros.report.advice import Advice
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
@@ -198,6 +198,58 @@ def _shown(value: object) -> object:
     if isinstance(value, str) and not hasattr(value, '__html__'):
         return '\n'.join(map(one_line, value.split('\n')))
     return value
+
+
+def markdown(report: Report, samples: Mapping[str, Any]) -> str:
+    """Return the words and tables of a report, to be kept with a calibration.
+
+    `samples` is what became of the input.
+    """
+    verdict = report.verdict
+    lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.robot)}', '']
+    lines += [f'**{in_markdown(verdict.heading)}**', '']
+    lines += _paragraphs(verdict.gain, *verdict.text)
+    for reason in report.advice:
+        lines += _section(reason.heading, reason.meaning, f'What was found: {reason.refusal}')
+        lines += _listed(reason.steps)
+    for each in (report.accuracy, *report.sections):
+        if each is None:
+            continue
+        text = each.text if each.rows or each.figure is None else ()
+        if text or each.said:
+            lines += _section(each.title, *text, *each.said)
+        if each.rows:
+            head, rest = '|' + '---|' * len(each.head), map(_row, each.rows)
+            lines += [_row(each.head), head, *rest, '']
+    told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
+    told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
+    for title, points in (
+        ('What to do next', report.steps),
+        ('Please note', report.remarks),
+        ('Identity', [f'{name}: {value}' for name, value in told]),
+    ):
+        lines += [*_section(title), *_listed(points)] if points else []
+    return '\n'.join(lines)
+
+
+def _section(title: str, *text: str) -> list[str]:
+    return [f'## {in_markdown(title)}', '', *_paragraphs(*text)]
+
+
+def _paragraphs(*text: str) -> list[str]:
+    return [line for each in text if each for line in (in_markdown(each), '')]
+
+
+def _listed(points: Iterable[str]) -> list[str]:
+    return [*(f'- {in_markdown(each)}' for each in points), '']
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f'| {" | ".join(each if _is_number(each) else in_markdown(each) for each in cells)} |'
+
+
+def _is_number(cell: str) -> bool:
+    return cell.lstrip('+-').replace('.', '', 1).isdecimal()
 
 
 def input_of(path: Path) -> tuple[Input, ...]:

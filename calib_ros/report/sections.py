@@ -11,7 +11,7 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
-from calib_ros.files.rows import is_time
+from calib_ros.files.history import is_time
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain

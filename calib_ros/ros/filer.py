@@ -7,9 +7,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from calib_ros.errors import CalibrationError, ConfigError
-from calib_ros.files.history import History
-from calib_ros.files.rows import (
+from calib_ros.files.history import (
     Filing,
+    History,
     Row,
     identified,
     judged,

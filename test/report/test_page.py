@@ -25,12 +25,11 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report import advice, explorer
-from calib_ros.report.maps import workspace_report
+from calib_ros.report.applied import verification_report, workspace_report
 from calib_ros.report.page import Input, Origin, Report, Verdict, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
-from calib_ros.report.verified import verification_report
 
 EMPTY = Report('kind', 'robot', Verdict('info', 'heading'), identity=(('a', 'b'),))
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
