@@ -204,11 +204,11 @@ def _done(
 ) -> Iterator[tuple[Task, Outcome]]:
     """Yield tasks with what became of them, as they are done.
 
-    Up to eight make a piece: much to dask's 4 ms for it, little to lose.
+    Up to four make a piece: much to dask's 4 ms for it, little to lose.
     """
     from distributed import as_completed
 
-    size = max(1, min(8, len(tasks) // (4 * max(1, len(client.nthreads())))))
+    size = max(1, min(4, len(tasks) // (4 * max(1, len(client.nthreads())))))
     running: dict[str, Sequence[Task]] = {}
 
     def submitted(pieces: Sequence[Sequence[Task]]) -> list[Any]:

@@ -15,7 +15,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import numbers, unit_of
-from calib_ros.report.poses import FITTED, JUDGED, REPEATED, Poses
+from calib_ros.report.poses import FITTED, JUDGED, REPEATED, WHEN, Poses
 
 SINGLE = 20_000
 """Poses that are shown one by one; of more so many, evenly spread, give the quantiles."""
@@ -38,6 +38,15 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
     kinds += [[axis, f'position error along {axis} [mm]'] for axis in 'xyz']
     kinds += [['angle', 'orientation error [mrad]']] if poses.oriented else []
     before = 1e3 * np.linalg.norm(poses.before[poses.judged], axis=1)
+    arrays = {
+        'joints': shown.joints,
+        'position': shown.position,
+        'before': 1e3 * shown.before,
+        'after': 1e3 * shown.after,
+        'turned_before': _values(shown, 'angle', 'before'),
+        'turned_after': _values(shown, 'angle', 'after'),
+        'size': shown.size,
+    }
     return {
         'joints': [one_line(name) for name in chain.joint_names],
         'show': [list(unit_of(joint)) for joint in chain.joints],
@@ -58,27 +67,19 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'images': [poses.source(row) if poses.corner[row] else '' for row in rows.tolist()]
         if poses.images
         else [],
-        'stamps': base64.b64encode(shown.stamps_ns.astype('<i8').tobytes()).decode(),
+        'stamps': _packed(shown.stamps_ns, '<i8'),
         'roles': list(ROLES.values()),
         'role': [list(ROLES).index(role) for role in shown.role.tolist()],
         'outlier': shown.outlier.astype(int).tolist(),
         'set': shown.set.tolist(),
-        'arrays': {
-            'joints': _packed(shown.joints),
-            'position': _packed(shown.position),
-            'before': _packed(1e3 * shown.before),
-            'after': _packed(1e3 * shown.after),
-            'turned_before': _packed(_values(shown, 'angle', 'before')),
-            'turned_after': _packed(_values(shown, 'angle', 'after')),
-            'size': _packed(shown.size),
-        },
+        'arrays': {name: _packed(values, '<f4') for name, values in arrays.items()},
         'bins': _bins(chain, poses, [kind for kind, _ in kinds]) if many else None,
         'cells': _cells(poses) if many else None,
     }
 
 
-def _packed(values: FloatArray) -> str:
-    return base64.b64encode(values.astype('<f4').tobytes()).decode()
+def _packed(values: NDArray[Any], kind: str) -> str:
+    return base64.b64encode(values.astype(kind).tobytes()).decode()
 
 
 def _worst(poses: Poses) -> NDArray[np.intp]:
@@ -107,9 +108,7 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     for k, joint in enumerate(chain.joints):
         axes[f'joint{k}'] = unit_of(joint)[0] * poses.joints[good, k]
     chosen = poses.select(good)
-    errors = {
-        kind: {when: _values(chosen, kind, when) for when in ('before', 'after')} for kind in kinds
-    }
+    errors = {kind: {when: _values(chosen, kind, when) for when in WHEN} for kind in kinds}
     found: dict[str, Any] = {}
     for key, values in axes.items():
         edges = np.linspace(values.min(), values.max(), BANDS + 1)
@@ -151,7 +150,7 @@ def _cells(poses: Poses) -> dict[str, Any]:
         return np.stack(sums, axis=1) / count[:, np.newaxis]
 
     found: dict[str, Any] = {'count': count.tolist(), 'position': numbers(mean(good.position), 4)}
-    for when in ('before', 'after'):
+    for when in WHEN:
         errors = 1e3 * getattr(good, when)
         squares = mean((errors**2).sum(axis=1))[:, 0]
         found[f'rms_{when}'] = numbers(np.sqrt(squares), 4)
