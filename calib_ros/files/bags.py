@@ -14,16 +14,18 @@ from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files.cameras import cameras_of
-from calib_ros.files.salvage import (
+from calib_ros.files.stored import (
+    LARGEST_MESSAGE,
     NOT_CLOSED,
     Salvage,
     check,
+    largest,
     named,
+    read,
     recorded,
     salvage,
     unpacked_files,
 )
-from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.account import Account
