@@ -144,7 +144,6 @@ def short_name(name: str) -> str:
 
 
 def _put_back(earlier: Mapping[Path, Path]) -> None:
-    """Make of files what they were earlier, or nothing where there was nothing."""
     for path, before in earlier.items():
         try:
             if before.exists():
@@ -161,7 +160,6 @@ def _exists(path: Path) -> InputError:
 
 
 def _rename_new(partial: Path, path: Path) -> None:
-    """Rename a file to a name that nothing has."""
     try:
         os.link(partial, path)
     except FileExistsError:
@@ -228,7 +226,6 @@ def _clean_up(place: Path, new: Path, old: Path) -> None:
 
 
 def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: bool) -> None:
-    """Refuse a place at which no folder can or must be put."""
     if not os.path.lexists(place):
         return
     if own is None:

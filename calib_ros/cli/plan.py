@@ -114,7 +114,6 @@ def _measurement(
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse options of `plan` that make no sense."""
     for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
         if options.iso9283 and getattr(options, name) is not None:
             raise InputError(f'--{name} is of no use with --iso9283')
@@ -128,5 +127,4 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _page_beside(path: Path) -> Path:
-    """Return where the report of a plan is."""
     return path.with_name(f'{path.stem}.report.html')

@@ -68,7 +68,6 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
 
 
 def _show(survey: Survey, screen: Screen) -> None:
-    """Print six rows."""
     rows = [('position error', f'at {len(survey.joints)} random poses of the joint range')]
     for label, errors in survey.parts.items():
         s = Spread.of(1e3 * errors)

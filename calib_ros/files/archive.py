@@ -286,7 +286,6 @@ class Archive:
         return self.folder / f'{self._robot}_{digits[:8]}T{digits[8:]}Z{ending}'
 
     def _dated(self) -> list[tuple[str, str, Path]]:
-        """Return the digits of the times of this robot's files, their endings and paths."""
         name = re.compile(rf'{re.escape(self._robot)}_([0-9]{{8}})T([0-9]{{12}})Z(.*)')
         found = ((name.fullmatch(path.name), path) for path in self.folder.glob('*'))
         return [(match[1] + match[2], match[3], path) for match, path in found if match]

@@ -114,7 +114,6 @@ class Board:
 
 
 def _grid(columns: int, rows: int) -> NDArray[np.intp]:
-    """Return the places (columns * rows, 2) on a board, row by row."""
     return np.column_stack([each.ravel() for each in np.meshgrid(range(columns), range(rows))])
 
 

@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -52,21 +54,10 @@ class Columns:
         found = self._numbers(names)
         if found is not None:
             return found
-        parsed = np.full((len(self.lines), len(names)), np.nan)
-        first: tuple[int, int, str] | None = None
-        for k, name in enumerate(names):
-            texts = self.texts(name)
-            for row, text in enumerate(texts[: first[0]] if first else texts):
-                try:
-                    parsed[row, k] = float(text) if text else np.nan
-                except ValueError:
-                    parsed[row, k] = np.inf
-                if text and not np.isfinite(parsed[row, k]):
-                    first = (row, k, text)
-                    break
-        if first is not None:
-            row, k, text = first
-            raise self._no_number(row, (called or names)[k], text)
+        cells = [self.texts(name) for name in names]
+        parsed = np.array([list(map(_finite, column)) for column in cells]).T
+        for row, k in np.argwhere(np.isinf(parsed))[:1].tolist():
+            raise self._no_number(row, (called or names)[k], cells[k][row])
         return parsed
 
     def block(
@@ -96,12 +87,9 @@ class Columns:
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Return the integers (N,) of a column, for empty cells those given if any are."""
         texts = self.texts(name)
-        try:
-            found = np.array([int(text) for text in texts], dtype=np.int64)
-            if list(map(str, found.tolist())) == texts:
-                return found
-        except (ValueError, OverflowError):
-            pass
+        if re.fullmatch('(-?[0-9]{1,19},)*', ','.join([*texts, ''])):
+            with suppress(OverflowError):  # of which cell, is told below
+                return np.array(list(map(int, texts)), dtype=np.int64)
         numbers = [
             int(blank[row])
             if blank is not None and not text
@@ -193,6 +181,15 @@ def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColu
     cells = zip_longest(header, *(row for _, row in rows), fillvalue='')
     words = {name: column for name, *column in cells}
     return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)
+
+
+def _finite(text: str) -> float:
+    """Return the number in a cell, NaN for a blank one, infinity for anything else."""
+    try:
+        number = float(text or 'nan')
+    except ValueError:
+        return math.inf
+    return number if not text or math.isfinite(number) else math.inf
 
 
 def numbered(texts: Sequence[str]) -> Codes:

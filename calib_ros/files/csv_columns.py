@@ -70,18 +70,9 @@ class TextColumns(Columns):
         cells = np.frombuffer(self._data, dtype=np.uint8)[place]
         cells[beyond] = 0
         words = np.ascontiguousarray(cells).view(f'S{longest}').ravel()
-        numbers = np.full(len(words), -1, dtype=np.intp)
-        known: list[str] = []
-        first = 0
-        while len(known) < MOST_NAMES:
-            word = words[first]
-            numbers[words == word] = len(known)
-            known.append(bytes(word).decode())
-            rest = numbers[first:] < 0
-            if not rest.any():
-                return numbers, known
-            first += int(np.argmax(rest))
-        return numbered(self.texts(name))
+        runs = np.flatnonzero(np.append(True, words[1:] != words[:-1]))
+        numbers, known = numbered([word.decode() for word in words[runs].tolist()])
+        return np.repeat(numbers, np.diff(np.append(runs, len(words)))), known
 
     def _numbers(self, names: Sequence[str]) -> FloatArray | None:
         columns = [self.header.index(name) for name in names]
@@ -108,7 +99,6 @@ class TextColumns(Columns):
         return found
 
     def _filled(self) -> bytes:
-        """Return the rows with NaN in empty cells."""
         sep = self._separator.encode()
         data = b'\n' + self._data[int(self._ends[0]) + 1 :]
         for _ in range(2):  # neighbours share a separator
@@ -116,7 +106,6 @@ class TextColumns(Columns):
         return data.replace(b'\n' + sep, b'\nnan' + sep).replace(sep + b'\n', sep + b'nan\n')
 
     def _places(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return where the cells of a column begin and end."""
         k, width = self.header.index(name), len(self.header)
         return self._ends[k:-1:width] + np.int32(1), self._ends[k + 1 :: width]
 

@@ -127,7 +127,6 @@ def converted(chain: Chain, convention: Convention) -> Chain:
 
 
 def _tail(a: float, alpha: float, beta: float) -> FloatArray:
-    """Return Tx(a) Rx(alpha) Ry(beta)."""
     turn = se3.exp_rotation(np.array([alpha, 0.0, 0.0])) @ se3.exp_rotation(
         np.array([0.0, beta, 0.0])
     )
@@ -222,7 +221,6 @@ def urdf_foot(chain: Chain) -> str:
 
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
-    """Return the table of a chain with a line that says what it is."""
     rows = [
         (to_cell(each.name), each.type, each.sign, *(getattr(each, kind) for kind in DH_KINDS))
         for each in chain.joints
@@ -231,7 +229,6 @@ def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
 
 
 def _read_csv(text: str, form: Chain) -> Chain:
-    """Return a chain with the rows of a table, in the frames of another one."""
     joints = []
     for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
         kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'

@@ -342,7 +342,6 @@ def is_local(files: Any) -> bool:
 
 @cache
 def _schema() -> Any:
-    """Return the columns: the key, and the fields of a row."""
     import pyarrow as pa
 
     kinds = {
@@ -358,7 +357,6 @@ def _schema() -> Any:
 
 
 def _table_of(row: Row) -> Any:
-    """Return a row as a table; matrices row by row."""
     import pyarrow as pa
 
     values = ((each.name, getattr(row, each.name)) for each in fields(row))

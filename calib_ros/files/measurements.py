@@ -322,7 +322,6 @@ def choices(
 
 
 def _stamps(columns: Columns) -> NDArray[np.int64]:
-    """Return the stamps (N,) [ns]: a row without one is measured at its line, in seconds."""
     lines = columns.lines.astype(np.int64) * 1_000_000_000
     if 'stamp_ns' not in columns.header or columns.blank('stamp_ns').all():
         return lines

@@ -105,7 +105,6 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
 
 
 def _after(text: str, lines: int) -> int:
-    """Return where a text goes on after so many lines."""
     at = 0
     for _ in range(lines):
         at = text.find('\n', at) + 1
@@ -171,7 +170,6 @@ def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
 
 
 def _cell(value: object) -> str:
-    """Return a cell of a workbook as text; numbers are exact."""
     if value is None:
         return ''
     if isinstance(value, bool):
@@ -181,7 +179,6 @@ def _cell(value: object) -> str:
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
-    """Return the separator by which most lines have the same number of cells, more than one."""
     lines = [line for line in text[: _after(text, HEAD)].split('\n') if line.strip()]
     lines = lines[-30:]  # under most of what stands above the header
     if not lines:
@@ -203,7 +200,6 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
 
 
 def _decimal(rows: Sequence[Row], separator: str, notes: list[str]) -> str:
-    """Return the decimal sign of the numbers."""
     if separator == ',':
         return '.'
     if any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells):
@@ -260,7 +256,6 @@ def _first(
     decimal: str,
     notes: list[str],
 ) -> int:
-    """Return which row is the first of numbers, after the header and lines of units."""
     limit = HEAD if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]

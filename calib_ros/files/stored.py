@@ -113,7 +113,6 @@ def _with_log(file: Path, target: Path) -> None:
 
 
 def _unpack_file(file: Path, target: Path) -> None:
-    """Unpack a file, as far as it is whole."""
     room = mcap.Room(file.stat().st_size)
     try:
         with target.open('wb') as out, mcap.open_zstd(file) as packed:

@@ -113,7 +113,6 @@ def read_table(
 
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
-    """Yield which columns are not read that someone may have wanted to be."""
     if f'q{joints + 1}' in found.header:
         yield f'{found.path}: the column q{joints + 1} is left out: the arm has {joints} joints'
     if {*TURNS} <= {*found.header} and QUATERNION[0] not in found.header:
@@ -141,7 +140,6 @@ def _table(
     warnings: tuple[str, ...],
     by_line: bool = False,
 ) -> Table:
-    """Return the table of the rows of some sessions."""
     made = made.kept()
     made.check_frames()
     if made.test.all():
@@ -242,7 +240,6 @@ def _of_journal(
 
 
 def _samples(made: Measurements) -> Iterator[Sample]:
-    """Yield the rows one by one."""
     for k, kind in enumerate(made.kind.tolist()):
         texts: dict[str, Any] = {
             name: getattr(made, name)[1][getattr(made, name)[0][k]]
@@ -335,7 +332,6 @@ def _cut_off(path: Path, line: int) -> str:
 
 
 def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Columns:
-    """Return the rows of the sessions that are asked for, session by session."""
     path = found.path
     if not len(found.lines):
         measurements(found, joints)  # a column that is missing says more

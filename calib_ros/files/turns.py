@@ -18,24 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.files import layouts
 from calib_ros.files.columns import MadeColumns, check_quaternions
-from calib_ros.files.layouts import (
-    COVARIANCE,
-    IN_TURN,
-    POSITION,
-    QUATERNION,
-    SIGMAS,
-    TURNS,
-    UPPER,
-    Layout,
-)
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.se3 import FloatArray
 
 
-def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
+def finished(made: MadeColumns, layout: layouts.Layout) -> MadeColumns:
     """Return the columns with quaternions for rotations, covariances for standard deviations."""
     path, values, words = made.path, dict(made.values), dict(made.words)
     time = values.pop('time', None)
@@ -45,14 +36,14 @@ def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
             raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
         words['stamp_ns'] = [str(round(each * 1e9)) for each in time.tolist()]
     rotation, axes = _rotations(values, layout, made)
-    sigmas = [values.pop(name, None) for name in SIGMAS]
-    for name in (*TURNS, *IN_TURN):
+    sigmas = [values.pop(name, None) for name in layouts.SIGMAS]
+    for name in (*layouts.TURNS, *layouts.IN_TURN):
         values.pop(name, None)
     covariance = _covariance(sigmas, axes, path)
     if layout.inverse:
-        if rotation is None or not set(POSITION) <= set(values):
+        if rotation is None or not set(layouts.POSITION) <= set(values):
             raise ConfigError('--inverse needs poses with their rotations')
-        given = np.column_stack([values[name] for name in POSITION])
+        given = np.column_stack([values[name] for name in layouts.POSITION])
         count = len(made.lines)
         turned = Observations(
             np.arange(count),
@@ -62,25 +53,25 @@ def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
             np.ones(count, bool),
             covariance,
         ).inverted()
-        values |= dict(zip(POSITION, turned.positions.T, strict=True))
+        values |= dict(zip(layouts.POSITION, turned.positions.T, strict=True))
         rotation, covariance = turned.rotations, turned.covariance
     if rotation is not None:
-        values |= dict(zip(QUATERNION, se3.to_quat(rotation).T, strict=True))
+        values |= dict(zip(layouts.QUATERNION, se3.to_quat(rotation).T, strict=True))
     if covariance is not None:
-        rows, columns = np.transpose(UPPER)
-        values |= dict(zip(COVARIANCE, covariance[:, rows, columns].T, strict=True))
+        rows, columns = np.transpose(layouts.UPPER)
+        values |= dict(zip(layouts.COVARIANCE, covariance[:, rows, columns].T, strict=True))
     return replace(made, values=values, words=words)
 
 
 def _rotations(
-    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
+    values: dict[str, FloatArray], layout: layouts.Layout, made: MadeColumns
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns that standard deviations are
     about; None where there are none.
     """
-    if set(QUATERNION) & set(values):
+    if set(layouts.QUATERNION) & set(values):
         return _from_quaternions(values, layout, made)
-    three = [name for name in (TURNS, IN_TURN) if set(name) & set(values)]
+    three = [name for name in (layouts.TURNS, layouts.IN_TURN) if set(name) & set(values)]
     if not three:
         for name in ('euler', 'rotation_vector', 'quaternion'):
             if getattr(layout, name):
@@ -114,7 +105,7 @@ def _rotations(
             'zyx, ...) or --rotation-vector'
         )
     letters = layout.euler
-    if names == TURNS:
+    if names == layouts.TURNS:
         if len(set(letters.upper())) < 3:
             raise ConfigError(
                 f'with --euler {letters} an axis comes twice: give r1, r2, r3 in its order'
@@ -127,21 +118,20 @@ def _rotations(
         unit = 'XYZ'.index(letters[k].upper())
         axes[:, :, k] = turned[:, :, unit]
         turned = turned @ se3.exp_rotation(np.eye(3)[unit] * angles[:, k, np.newaxis])
-    if names == TURNS:  # columns in the order of rx, ry, rz
+    if names == layouts.TURNS:  # columns in the order of rx, ry, rz
         axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
     return turned, axes
 
 
 def _from_quaternions(
-    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
+    values: dict[str, FloatArray], layout: layouts.Layout, made: MadeColumns
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rotations, and the device's axes."""
-    missing = [name for name in QUATERNION if name not in values]
+    missing = [name for name in layouts.QUATERNION if name not in values]
     if missing:
         raise ConfigError(
             f'{made.path}: a quaternion has four columns, missing {", ".join(missing)}'
         )
-    quat = np.column_stack([values[name] for name in QUATERNION])
+    quat = np.column_stack([values[name] for name in layouts.QUATERNION])
     if layout.quaternion == 'wxyz':
         quat = quat[:, [1, 2, 3, 0]]
     _require_whole(quat, made, 'qx, qy, qz, qw')

@@ -161,7 +161,6 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
 
 
 def _settings(given: Mapping[str, Any], where: str) -> Settings:
-    """Return settings by their names, the others by default."""
     values = {
         name: parse_like(getattr(Settings, name), value, f'{where}: {name}')
         for name, value in given.items()

@@ -202,7 +202,6 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
 
 
 def _link(out: Path, standing: Standing) -> str:
-    """Return the address of a robot's own report; empty if there is none."""
     if standing.last is None:
         return ''
     path = page_path(out, standing.last)

@@ -17,19 +17,11 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report import figures
+from calib_ros.report import figures, sections
 from calib_ros.report.advice import SPREAD
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
-from calib_ros.report.sections import (
-    ISO_9283,
-    accuracy_section,
-    coverage,
-    distribution,
-    gain,
-    identity_of,
-)
 
 MOVED = (
     'Check that the measuring device, the target and the robot stand as they did for the '
@@ -89,14 +81,13 @@ def workspace_report(
             head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
-        identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
+        identity=sections.identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
         origin=origin,
     )
 
 
 def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
-    """Return where most is removed, and where what remains is known least."""
     titles = (
         'Where the most is removed by the calibration',
         'Where that is most uncertain',
@@ -122,7 +113,6 @@ def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
 
 
 def _placed(placed: Placements) -> Section:
-    """Return the placements of a task in space."""
     reached = ~np.isnan(placed.errors)
     best = placed.positions[placed.best]
     where = ', '.join(f'{value:.3f}' for value in best)
@@ -161,9 +151,9 @@ def plan_report(
 
     `found` is None for the test poses of ISO 9283.
     """
-    sections = [
+    shown = [
         _visit(chain, joints),
-        coverage(chain, joints, 'How far each joint will move'),
+        sections.coverage(chain, joints, 'How far each joint will move'),
         _listed(chain, joints),
     ]
     verdict = Verdict('info', 'Poses to go', (f'{len(joints)} poses.',))
@@ -174,7 +164,7 @@ def plan_report(
     if found is not None:
         curve = figures.predictions(found.accuracy, found.at_random, wanted_mm)
         about = 'From measurement noise alone; errors of the model come on top.'
-        sections.insert(0, Section('promise', 'What the poses promise', (about,), curve))
+        shown.insert(0, Section('promise', 'What the poses promise', (about,), curve))
         known = bool(np.isfinite(found.accuracy[-1]))
         if known:
             predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
@@ -192,14 +182,13 @@ def plan_report(
         verdict=verdict,
         remarks=tuple(x for x in words.splitlines() if not x.startswith((' ', 'predicted'))),
         steps=steps,
-        identity=identity_of(chain, origin),
-        sections=tuple(sections),
+        identity=sections.identity_of(chain, origin),
+        sections=tuple(shown),
         origin=origin,
     )
 
 
 def _visit(chain: Chain, joints: FloatArray) -> Section:
-    """Return the way of the target through poses (K, n)."""
     order = list(range(1, len(joints) + 1))
     path = figures.in_space(
         in_base(chain, joints)[:, :3, 3],
@@ -215,7 +204,6 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
 
 
 def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
-    """Return the joint values of poses (K, n)."""
     show = [figures.unit_of(joint) for joint in chain.joints]
     more = f' The first {most} are shown.' if len(joints) > most else ''
     return Section(
@@ -245,31 +233,32 @@ def verification_report(
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
-        verdict=replace(state, text=tuple(text), gain=gain(found.comparison, intervals=False)),
-        accuracy=accuracy_section(
+        verdict=replace(
+            state, text=tuple(text), gain=sections.gain(found.comparison, intervals=False)
+        ),
+        accuracy=sections.accuracy_section(
             'Accuracy before and after the correction',
-            (ISO_9283,),
+            (sections.ISO_9283,),
             found.comparison,
             poses.things,
             intervals=False,
         ),
-        picture=distribution(poses),
+        picture=sections.distribution(poses),
         steps=steps,
         remarks=(*warnings, *remarks(found)),
-        identity=identity_of(
+        identity=sections.identity_of(
             chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)
         ),
         explorer=explorer(chain, poses),
         sections=(
             *((_by_configuration(found),) if found.each else ()),
-            coverage(chain, poses.joints, 'How far each joint was moved'),
+            sections.coverage(chain, poses.joints, 'How far each joint was moved'),
         ),
         origin=origin,
     )
 
 
 def _by_configuration(found: Verification) -> Section:
-    """Return accuracy and repeatability of a few configurations, one by one."""
     about = 'AP: position accuracy, of the mean of all cycles. RP: repeatability, mean + 3 sigma.'
     return Section(
         'configurations',

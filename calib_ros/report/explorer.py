@@ -91,7 +91,6 @@ def _worst(poses: Poses) -> NDArray[np.intp]:
 
 
 def _values(poses: Poses, kind: str, when: str) -> FloatArray:
-    """Return an error (N,) [mm or mrad] by the name of a kind."""
     if kind == 'angle':
         return 1e3 * np.asarray(np.linalg.norm(getattr(poses, f'turned_{when}'), axis=1))
     errors = 1e3 * getattr(poses, when)

@@ -137,7 +137,6 @@ def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> 
 
 
 def _figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size [inches]."""
     figure = Figure(figsize=(width, height), layout='constrained')
     FigureCanvasAgg(figure)
     return figure

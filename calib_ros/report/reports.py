@@ -19,21 +19,11 @@ from calib_ros.identification.reasons import Rule
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
-from calib_ros.report import figures, words
+from calib_ros.report import figures, sections, words
 from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
 from calib_ros.report.poses import Poses
-from calib_ros.report.sections import (
-    INTERVAL,
-    ISO_9283,
-    accuracy_section,
-    coverage,
-    distribution,
-    gain,
-    identity_of,
-    limits_of,
-)
 from calib_ros.shown import some
 
 NOT_YET = (
@@ -58,28 +48,28 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
-    limits = limits_of(judged, 1, CONFIDENT)
+    limits = sections.limits_of(judged, 1, CONFIDENT)
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
         verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
-        accuracy=accuracy_section(
+        accuracy=sections.accuracy_section(
             'Accuracy before and after' if result.accepted else 'Accuracy of what was tried',
             (
                 *(() if result.validation else (UNPROVEN,)),
-                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
+                f'"Before" is {words.BEFORE}, so the sections.gain is that of the arm alone.',
                 'RMS (root mean square) is the usual size of the error over poses like these.',
-                ISO_9283,
+                sections.ISO_9283,
             ),
             judged,
             poses.things,
             judged.figures_of_all[1] if judged.outliers else None,
         ),
-        picture=distribution(poses),
+        picture=sections.distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
-        identity=identity_of(
+        identity=sections.identity_of(
             result.chain,
             origin,
             poses,
@@ -106,7 +96,7 @@ def _verdict(
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
     heading = 'Accepted' + (f', {within}' if within else '')
-    return Verdict('open' if 'not' in within else 'good', heading, text, gain(judged))
+    return Verdict('open' if 'not' in within else 'good', heading, text, sections.gain(judged))
 
 
 def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
@@ -114,7 +104,7 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
-    lower, upper = limits_of(judged, 1, CONFIDENT)
+    lower, upper = sections.limits_of(judged, 1, CONFIDENT)
     if upper <= tolerance:
         return f'and {wanted}'
     if lower > tolerance:
@@ -130,7 +120,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     """
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = limits_of(judged, 0, INTERVAL)
+        lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
     return advice(result.refusals, noise)
@@ -149,7 +139,6 @@ def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
 
 
 def _left(result: Identification) -> Iterator[str]:
-    """Yield in figures that a correction brought nothing."""
     if result.validation is not None and any(each.rule is Rule.GAIN for each in result.refusals):
         before, after = result.validation.figures
         yield (
@@ -164,7 +153,6 @@ def _steps(
     limits: tuple[float, float],
     tolerance: float | None,
 ) -> tuple[str, ...]:
-    """Return what to do with a result."""
     if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
         return ()
     if not result.accepted:
@@ -199,7 +187,6 @@ def _steps(
 
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterator[Section]:
-    """Return the sections below the poses."""
     yield Section(
         'noise',
         'What is left against the noise of the device',
@@ -221,7 +208,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
     yield _parameters(result)
     yield _correlations(result)
     yield _determined(result)
-    yield coverage(result.chain, poses.joints, 'How far each joint was moved')
+    yield sections.coverage(result.chain, poses.joints, 'How far each joint was moved')
     if result.verdicts:
         yield _effects(result)
     yield from _drives(result, poses)
@@ -230,7 +217,6 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
 
 
 def _effects(result: Identification) -> Section:
-    """Return what each effect beyond geometry brings, in the order in which they were added."""
     used = {True: 'yes', False: 'no'}
     return Section(
         'effects',
@@ -250,7 +236,6 @@ def _effects(result: Identification) -> Section:
 
 
 def _drives(result: Identification, poses: Poses) -> Iterator[Section]:
-    """Return what the drives of the joints add to their values."""
     figure = figures.drives(result.chain, poses.joints)
     if figure is not None:
         yield Section(
@@ -266,7 +251,6 @@ def _drives(result: Identification, poses: Poses) -> Iterator[Section]:
 
 
 def _outliers(poses: Poses, most: int = 50) -> Section:
-    """Return the outliers of the fit, the largest first, by line or stamp."""
     rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
     rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
@@ -287,7 +271,6 @@ def _outliers(poses: Poses, most: int = 50) -> Section:
 
 
 def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
-    """Return the offsets of the geometry with their intervals, lengths and angles apart."""
     effects = {name for name, _ in result.chain.effects}
     own = [
         p
@@ -345,7 +328,6 @@ def _parameters(result: Identification) -> Section:
 
 
 def _determined(result: Identification) -> Section:
-    """Return how well the arm is known, and what no measurement at these poses can tell."""
     sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
     text = (
         f'Expected error of positions predicted over the whole joint range: '
@@ -366,7 +348,6 @@ def _determined(result: Identification) -> Section:
 
 
 def _correlations(result: Identification) -> Section:
-    """Return which parameters were found together rather than each."""
     strong = [f'{a} and {b} ({value:+.2f})' for a, b, value in result.correlated()]
     beyond = dict(result.chain.effects)
     shown = [k for k, name in enumerate(result.names) if name not in beyond]
@@ -387,7 +368,6 @@ def _correlations(result: Identification) -> Section:
 
 
 def _map(result: Identification) -> Section:
-    """Return the error map over the workspace."""
     found = survey(Calibration.of(result), SURVEYED, np.random.default_rng(0))
     return Section(
         'map',

@@ -49,7 +49,6 @@ def gain(which: Comparison, intervals: bool = True) -> str:
 
 
 def _between(limits: tuple[float, float]) -> str:
-    """Return limits [m] in mm; nothing where they are not known."""
     return f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if np.isfinite(limits[1]) else ''
 
 
@@ -120,7 +119,6 @@ def identity_of(
 
 
 def _measured(poses: Poses | None) -> str:
-    """Return when it was measured, where the stamps tell."""
     if poses is None or not len(poses) or poses.lines or not is_time(poses.stamps_ns[0]):
         return ''
     first, last = (

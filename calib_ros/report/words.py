@@ -101,7 +101,6 @@ def _counted(outliers: Sequence[Outlier]) -> str:
 
 
 def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
-    """Return the numbers and stamps [s] of outliers, the largest first."""
     largest = sorted(outliers, key=lambda each: -each.size)
     words = [
         f'pose {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
@@ -234,7 +233,6 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
 
 def _lower(square: FloatArray) -> list[list[float]]:
-    """Return the lower triangle (P, P) of a symmetric matrix row by row, in ten digits."""
     return [[float(f'{x:.9e}') for x in row[: k + 1]] for k, row in enumerate(square.tolist())]
 
 
