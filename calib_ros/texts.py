@@ -16,13 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import (
-    LONGEST_NAME,
-    MOST_ENTRIES,
-    CalibrationError,
-    ConfigError,
-    InputError,
-)
+from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, CalibrationError, ConfigError, InputError
 
 LARGEST_TEXT = 10 * MOST_ENTRIES**2
 """Bytes of a chain file, calibration, URDF or YAML program: ten lists as long as can be."""

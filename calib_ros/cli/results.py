@@ -120,11 +120,7 @@ def document(found: Identified, tolerance: float | None) -> dict[str, Any]:
 
 
 def result_files(
-    found: Identified,
-    screen: Screen,
-    out: Path,
-    tolerance: float | None = None,
-    pdf: bool = False,
+    found: Identified, screen: Screen, out: Path, tolerance: float | None = None, pdf: bool = False
 ) -> dict[str, str | bytes]:
     """Return the files of a result by name; a chain only if it is accepted.
 

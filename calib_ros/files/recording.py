@@ -35,10 +35,7 @@ class Recording:
 
     @classmethod
     def of_dwells(
-        cls,
-        joint_names: tuple[str, ...],
-        observations: Observations,
-        held_out: NDArray[np.bool_],
+        cls, joint_names: tuple[str, ...], observations: Observations, held_out: NDArray[np.bool_]
     ) -> Recording:
         """Turn a table into a recording: the arm stands for 0.4 s at every row, once a second."""
         begin = (1 + np.arange(len(observations))[:, np.newaxis]) * 1_000_000_000

@@ -221,10 +221,7 @@ def _cells(path: Path, text: str, separator: str) -> list[Row]:
 
 
 def _header(
-    path: Path,
-    rows: Sequence[Row],
-    names: Sequence[str],
-    known: Sequence[str],
+    path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]
 ) -> tuple[int, tuple[str, ...]]:
     """Return where the header is among the rows, and its names; -1 where there is none."""
     wanted = {name for name in names if not name.startswith('#')}
@@ -249,12 +246,7 @@ def _header(
 
 
 def _first(
-    path: Path,
-    rows: Sequence[Row],
-    at: int,
-    used: Sequence[int],
-    decimal: str,
-    notes: list[str],
+    path: Path, rows: Sequence[Row], at: int, used: Sequence[int], decimal: str, notes: list[str]
 ) -> int:
     limit = HEAD if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):

@@ -26,14 +26,7 @@ from calib_ros.escapes import to_cell
 from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import (
-    COVARIANCE,
-    POSITION,
-    QUATERNION,
-    TURNS,
-    UPPER,
-    joint_columns,
-)
+from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
 from calib_ros.files.measurements import (
     DISTANCE,
     PLANE,

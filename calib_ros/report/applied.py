@@ -88,10 +88,7 @@ def workspace_report(
 
 
 def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
-    titles = (
-        'Where the most is removed by the calibration',
-        'Where that is most uncertain',
-    )
+    titles = ('Where the most is removed by the calibration', 'Where that is most uncertain')
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
         shown = sectors if len(sectors) <= most else (*sectors[:most], sectors[-1])

@@ -35,10 +35,7 @@ def before_after_png(result: Identification) -> bytes:
     )
     figure = _figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    for name, errors, colour in (
-        ('before', before, BEFORE),
-        ('after', after, AFTER),
-    ):
+    for name, errors, colour in (('before', before, BEFORE), ('after', after, AFTER)):
         rms = np.sqrt(np.mean(errors**2))
         left.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
         left.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')

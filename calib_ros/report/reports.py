@@ -83,9 +83,7 @@ def identification_report(
 
 
 def _verdict(
-    result: Identification,
-    reasons: Sequence[Advice],
-    tolerance: float | None,
+    result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> Verdict:
     if not result.accepted:
         return _refused(result, reasons)
@@ -156,10 +154,7 @@ def _steps(
     if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
         return ()
     if not result.accepted:
-        return (
-            'Follow the steps above, those of the first reason first.',
-            reasons[0].again,
-        )
+        return ('Follow the steps above, those of the first reason first.', reasons[0].again)
     found = []
     if tolerance is not None and limits[0] > tolerance:
         if not result.chain.effects:

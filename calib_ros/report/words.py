@@ -277,10 +277,7 @@ def scatter_in_words(noise: Noise) -> str:
     )
 
 
-NEIGHBOURS = {
-    'successive': 'measured in succession',
-    'near': 'near each other in joint space',
-}
+NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other in joint space'}
 
 
 def neighbours_in_words(noise: Noise) -> str:
