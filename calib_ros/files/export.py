@@ -44,6 +44,8 @@ FILES = (
 )
 CORRECTED_URDF = '_corrected.urdf'
 """End of the name of a corrected URDF beside these files."""
+TAIL = ('a', 'alpha', 'beta')
+"""What ends the row of a joint in the one convention, and begins that of the next in the other."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)
 
 
@@ -110,27 +112,22 @@ def converted(chain: Chain, convention: Convention) -> Chain:
     """Return the same arm by another convention; what is cut off goes into base and tool."""
     if chain.convention == convention:
         return chain
-    tails = [(joint.a, joint.alpha, joint.beta) for joint in chain.joints]
-    base, tool = chain.frame('base'), chain.frame('tool')
+    tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
+    none, base, tool = dict.fromkeys(TAIL, 0.0), chain.frame('base'), chain.frame('tool')
     if convention == 'modified':
-        tool = replace(tool, matrix=_tail(*tails[-1]) @ tool.matrix)
-        tails = [(0.0, 0.0, 0.0), *tails[:-1]]
+        tool = replace(tool, matrix=_tail(**tails[-1]) @ tool.matrix)
+        tails = [none, *tails[:-1]]
     else:
-        base = replace(base, matrix=base.matrix @ _tail(*tails[0]))
-        tails = [*tails[1:], (0.0, 0.0, 0.0)]
-    joints = tuple(
-        replace(joint, a=a, alpha=alpha, beta=beta)
-        for joint, (a, alpha, beta) in zip(chain.joints, tails, strict=True)
-    )
+        base = replace(base, matrix=base.matrix @ _tail(**tails[0]))
+        tails = [*tails[1:], none]
+    joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))
     frames: dict[str, Any] = {'base': base, 'tool': tool, 'frames': ()}
     return replace(chain, convention=convention, joints=joints, parallel=None, **frames)
 
 
 def _tail(a: float, alpha: float, beta: float) -> FloatArray:
-    turn = se3.exp_rotation(np.array([alpha, 0.0, 0.0])) @ se3.exp_rotation(
-        np.array([0.0, beta, 0.0])
-    )
-    return se3.transform(turn, np.array([a, 0.0, 0.0]))
+    about_x, about_y = se3.exp_rotation(np.array([[alpha, 0.0, 0.0], [0.0, beta, 0.0]]))
+    return se3.transform(about_x @ about_y, np.array([a, 0.0, 0.0]))
 
 
 def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
@@ -142,10 +139,8 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
     names = (*chain.joint_names, 'flange')
     poses = {name: xyz_rpy(place) for name, place in zip(names, origins(form), strict=True)}
-    document: dict[str, Any] = {
-        'kinematics': poses,
-        'signs': {joint.name: joint.sign for joint in form.joints},
-    }
+    signs = {joint.name: joint.sign for joint in form.joints}
+    document: dict[str, Any] = {'kinematics': poses, 'signs': signs}
     digest = hashlib.sha256(dump_yaml(document).encode()).hexdigest()
     document['hash'] = f'sha256_{digest}'
     if origin:
@@ -181,7 +176,7 @@ def walked(
     places: Sequence[FloatArray], q: FloatArray, slides: Sequence[bool] | None = None
 ) -> FloatArray:
     """Return the poses (N, 4, 4) behind frames that turn about their z, or slide along it."""
-    pose = np.tile(np.eye(4), (len(q), 1, 1))
+    pose = np.eye(4)
     for k, place in enumerate(places):
         moved = np.tile(np.eye(4), (len(q), 1, 1))
         if slides is not None and slides[k]:
@@ -258,14 +253,8 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
 
     `zero` stands for the joints' offsets. Base and tool are fitted as well.
     """
-    start = replace(
-        nominal,
-        parallel=(),
-        base=chain.frame('base'),
-        tool=chain.frame('tool'),
-        frames=(),
-        effects=(),
-    )
+    base, tool = chain.frame('base'), chain.frame('tool')
+    start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
     driven = {joint.driven for joint in start.joints}
     names = [
         name

@@ -132,7 +132,7 @@ def vendor_files(
         if vendor.end is None and arm.convention == 'standard':
             # The last frame of the file is on the last axis: what follows belongs to the tool.
             before, last = nominal.joints[-1], arm.joints[-1]
-            last = replace(last, a=before.a, alpha=before.alpha, beta=before.beta)
+            last = replace(last, **{name: getattr(before, name) for name in export.TAIL})
             arm = replace(arm, joints=(*arm.joints[:-1], last))
         layouts = [_layout(vendor, each, urdf, links or {}) for each in (nominal, arm)]
         if layouts[0] is None or layouts[1] is None or not vendor.has_layout(layouts[0][0]):

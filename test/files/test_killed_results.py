@@ -118,7 +118,7 @@ def identified(monkeypatch):
 
     monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
     monkeypatch.setattr(results, 'identification_report', lambda *of: of[1])
-    monkeypatch.setattr(given, 'render', lambda result: f'page of {result.names}')
+    monkeypatch.setattr(given.page, 'render', lambda result: f'page of {result.names}')
     monkeypatch.setattr(results, 'markdown', lambda result, samples: f'{samples} {result.names}')
     monkeypatch.setattr(
         calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
