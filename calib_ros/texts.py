@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text files, tables and YAML, within limits.
+"""Text files, tables and YAML, within limits, and texts of others as no more than text.
 
 A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
 with any number of digits. The stream of its events is looked at before anything is made of it.
+A joint, a frame or a robot may be called `<script>`, `| x |` or `=cmd|...`: in a report that is
+markup, in a spreadsheet a formula.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -29,6 +32,10 @@ DEEPEST = 20
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
 """Values in a YAML document with its aliases written out; 20 characters count as one."""
+MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
+"""What Markdown takes for more than text; underscores only where they may begin emphasis."""
+FORMULA = re.compile(r"'*[=+\-@\t\r]")
+"""How a cell begins that a spreadsheet computes, whatever apostrophes are before it."""
 
 
 def read_text(
@@ -208,3 +215,24 @@ class _Weigher:
             if nodes > MOST_NODES:
                 raise self._error(f'{self._where} has more than {MOST_NODES} values')
         return nodes, height
+
+
+def one_line(text: str) -> str:
+    """Return a text without line breaks and characters that cannot be seen."""
+    return ' '.join(''.join(c if c.isprintable() else ' ' for c in text).split())
+
+
+def in_markdown(value: object) -> str:
+    """Return a value as text within a line of Markdown, free of HTML."""
+    text = MARKUP.sub(r'\\\g<0>', one_line(str(value)))
+    return text.replace('&', '&amp;').replace('<', '&lt;')
+
+
+def to_cell(text: str) -> str:
+    """Return a text as a cell of a table, which is no formula."""
+    return f"'{text}" if FORMULA.match(text) else text
+
+
+def from_cell(cell: str) -> str:
+    """Return the text of a cell by `to_cell`."""
+    return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
-from calib_ros.escapes import to_cell
 from calib_ros.files.columns import check_quaternions
 from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import joint_columns
@@ -38,7 +37,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
-from calib_ros.texts import csv_text, parse_yaml, read_text
+from calib_ros.texts import csv_text, parse_yaml, read_text, to_cell
 from calib_ros.values import parse_mapping, parse_number
 
 TYPES = ('charuco', 'markers')

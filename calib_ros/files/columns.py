@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
-from calib_ros.escapes import from_cell
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
+from calib_ros.texts import from_cell
 from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, parse_number
 
 Row = tuple[int, Sequence[str]]

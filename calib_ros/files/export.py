@@ -28,14 +28,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import CalibrationError
-from calib_ros.escapes import from_cell, to_cell
 from calib_ros.identification.start import likened
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import csv_text, dump_yaml
+from calib_ros.texts import csv_text, dump_yaml, from_cell, to_cell
 from calib_ros.values import SAME
 
 FILES = (

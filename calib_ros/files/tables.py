@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.escapes import to_cell
 from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
@@ -44,7 +43,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.problems import Measured
 from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
 
 Sets = tuple[Observations, ...]

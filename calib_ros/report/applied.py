@@ -19,9 +19,8 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
 from calib_ros.report.advice import SPREAD
-from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.poses import Poses
+from calib_ros.report.poses import Poses, explorer, numbers, unit_of
 
 MOVED = (
     'Check that the measuring device, the target and the robot stand as they did for the '
@@ -113,7 +112,7 @@ def _placed(placed: Placements) -> Section:
     reached = ~np.isnan(placed.errors)
     best = placed.positions[placed.best]
     where = ', '.join(f'{value:.3f}' for value in best)
-    values = figures.numbers(1e3 * placed.errors[reached])
+    values = numbers(1e3 * placed.errors[reached])
     colours = {'size': 4, 'color': values, **figures.scale_of('expected error [mm]')}
     cloud = figures.in_space(
         placed.positions[reached], 'expected error [mm]', marker=colours, showlegend=False
@@ -201,7 +200,7 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
 
 
 def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
-    show = [figures.unit_of(joint) for joint in chain.joints]
+    show = [unit_of(joint) for joint in chain.joints]
     more = f' The first {most} are shown.' if len(joints) > most else ''
     return Section(
         'poses',

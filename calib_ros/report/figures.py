@@ -11,13 +11,13 @@ import numpy as np
 from scipy import special
 
 from calib_ros.apply.workspace import Survey, rms_map
-from calib_ros.escapes import one_line
 from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report.poses import Poses
+from calib_ros.report.poses import Poses, numbers, unit_of
+from calib_ros.texts import one_line
 
 Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
@@ -29,13 +29,6 @@ REVERSED = {'autorange': 'reversed', 'automargin': True}
 """A vertical axis with the first row on top."""
 ROUND = ('eccentricity', 'gear')
 """Groups of effects that go round with a joint."""
-
-
-def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
-    """Return an array as lists with so many significant digits; None for NaN."""
-    flat = [None if x != x else float(f'{x:.{digits}g}') for x in values.ravel().tolist()]
-    shaped: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
-    return shaped
 
 
 def label(name: str) -> str:
@@ -151,11 +144,6 @@ def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
     small = {'tickfont': {'size': 10}, 'automargin': True}
     layout = {'xaxis': small, 'yaxis': REVERSED | small, 'margin': _margin(130, 20, 90)}
     return {'data': [mesh], 'layout': layout}
-
-
-def unit_of(joint: Joint) -> tuple[float, str, int]:
-    """Return how joint values are shown: factor, unit and decimals."""
-    return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
 
 
 def coverage(

@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 
 from calib_ros.apply.placement import Placements
 from calib_ros.apply.workspace import Survey, rms_map
-from calib_ros.escapes import one_line
 from calib_ros.identification.identification import Identification
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE
+from calib_ros.texts import one_line
 
 INCH, MARGIN = 0.0254, 0.01
 """In metres: an inch, and what is left free around a board."""

@@ -21,9 +21,8 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
 from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
-from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.poses import Poses
+from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
 
 NOT_YET = (

@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, strategies as st
 from measured import measured
 
-from calib_ros.escapes import from_cell, in_markdown, one_line, to_cell
 from calib_ros.files.archive import Journal
 from calib_ros.files.export import exports
 from calib_ros.files.tables import read_journal
@@ -26,6 +25,7 @@ from calib_ros.report.plots import before_after_png
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.sampling.sample import Sample
+from calib_ros.texts import from_cell, in_markdown, one_line, to_cell
 
 HOSTILE = (
     *("=cmd|' /C calc'!A0", '+1', '-1+1', '@SUM(1)', '\t=1', '\r=1', "'=1", "''@x", 'a,=1\n=2'),

@@ -24,11 +24,11 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
-from calib_ros.report import advice, explorer
+from calib_ros.report import advice
 from calib_ros.report.applied import verification_report, workspace_report
 from calib_ros.report.page import Input, Origin, Report, Verdict, render
 from calib_ros.report.plots import drawing
-from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
+from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
 
 EMPTY = Report('kind', 'robot', Verdict('info', 'heading'), identity=(('a', 'b'),))
@@ -275,8 +275,8 @@ def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     problem, result = solved
     poses = poses_of(problem, result)
-    monkeypatch.setattr(explorer, 'SINGLE', 30)
-    shown = explorer.explorer(result.chain, poses)
+    monkeypatch.setattr('calib_ros.report.poses.SINGLE', 30)
+    shown = explorer(result.chain, poses)
     good = ~poses.outlier
     assert sum(shown['cells']['count']) == good.sum()
     squares = np.square(shown['cells']['rms_after']) * shown['cells']['count']
@@ -298,12 +298,12 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
     many = replace(
         many, stamps_ns=np.arange(count), after=many.after + rng.normal(0, 1e-5, (count, 3))
     )
-    shown = explorer.explorer(result.chain, many)
-    assert len(shown['role']) <= 2 * explorer.WORST
+    shown = explorer(result.chain, many)
+    assert len(shown['role']) <= 2 * WORST
     report = replace(report_of(*solved), explorer=shown)
     assert len(render(report).encode()) < 8e6
-    most = one.select(rng.integers(0, len(one), explorer.SINGLE))
-    report = replace(report, explorer=explorer.explorer(result.chain, most))
+    most = one.select(rng.integers(0, len(one), SINGLE))
+    report = replace(report, explorer=explorer(result.chain, most))
     assert len(render(report).encode()) < 8e6
 
 
