@@ -12,14 +12,14 @@ import numpy as np
 from calib_ros.apply.placement import Placements
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.verification import Verification, remarks
-from calib_ros.apply.workspace import Spread, Survey, in_base, regions
+from calib_ros.apply.workspace import Sector, Spread, Survey, in_base, regions
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
 from calib_ros.report.advice import SPREAD
-from calib_ros.report.page import Origin, Report, Section, Verdict
+from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer, numbers, unit_of
 
 MOVED = (
@@ -96,16 +96,13 @@ def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
             title,
             (f'The {most} regions of the largest errors, and that of the least.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
-            rows=tuple(
-                (
-                    each.words,
-                    str(each.poses),
-                    f'{1e3 * each.rms:.4f}',
-                    *(f'{low:.2f} to {high:.2f}' for low, high in (each.radius, each.height)),
-                )
-                for each in shown
-            ),
+            rows=tuple(map(_region, shown)),
         )
+
+
+def _region(found: Sector) -> tuple[str, ...]:
+    spans = (f'{low:.2f} to {high:.2f}' for low, high in (found.radius, found.height))
+    return (found.words, str(found.poses), f'{1e3 * found.rms:.4f}', *spans)
 
 
 def _placed(placed: Placements) -> Section:
@@ -118,13 +115,11 @@ def _placed(placed: Placements) -> Section:
         placed.positions[reached], 'expected error [mm]', marker=colours, showlegend=False
     )
     mark = {'size': 8, 'color': '#b3261e', 'symbol': 'diamond'}
-    return Section(
+    place = figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
+    return section(
         'placements',
         'Where to put the task',
-        (),
-        figures.space(
-            cloud, figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
-        ),
+        figure=figures.space(cloud, place),
         height=560,
         said=(
             f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
@@ -234,7 +229,6 @@ def verification_report(
         ),
         accuracy=sections.accuracy_section(
             'Accuracy before and after the correction',
-            (sections.ISO_9283,),
             found.comparison,
             poses.things,
             intervals=False,
@@ -255,11 +249,10 @@ def verification_report(
 
 
 def _by_configuration(found: Verification) -> Section:
-    about = 'AP: position accuracy, of the mean of all cycles. RP: repeatability, mean + 3 sigma.'
-    return Section(
+    return section(
         'configurations',
         'Pose by pose (ISO 9283)',
-        (about,),
+        'AP: position accuracy, of the mean of all cycles. RP: repeatability, mean + 3 sigma.',
         head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
         rows=tuple(
             (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in values))

@@ -62,6 +62,11 @@ class Section:
     said: tuple[str, ...] = ()
 
 
+def section(name: str, title: str, *text: str, **more: Any) -> Section:
+    """Return a section with those paragraphs of text that are not empty."""
+    return Section(name, title, tuple(filter(None, text)), **more)
+
+
 @dataclass(frozen=True)
 class Input:
     """A file that was read."""
