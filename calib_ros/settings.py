@@ -168,8 +168,7 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            lower = item.metadata['lower']
-            value = getattr(self, item.name)
+            value, lower = getattr(self, item.name), item.metadata['lower']
             if isinstance(item.default, tuple):
                 _check_list(item.name, value)
             if lower is not None and not math.isfinite(value):
@@ -187,9 +186,7 @@ class Settings:
 
 def _check_list(name: str, entries: Sequence[str]) -> None:
     """Refuse lists that are too long to be meant: what is done with them may take for ever."""
-    for count, what in (
-        (len(entries), 'entries'),
-        *((len(e), 'characters in an entry') for e in entries),
-    ):
+    longest = max(map(len, entries), default=0)
+    for count, what in ((len(entries), 'entries'), (longest, 'characters in an entry')):
         if count > MOST_ENTRIES:
             raise ConfigError(f'{name} has {count} {what}, at most {MOST_ENTRIES} are taken')

@@ -99,7 +99,7 @@ def dump_json(value: Any, indent: str = '') -> str:
     if isinstance(value, Mapping):
         lines = [f'{json.dumps(name)}: {line}' for name, line in zip(value, lines, strict=True)]
         first, last = '{}'
-    return ''.join([first, ','.join(f'\n{indent}  {line}' for line in lines), f'\n{indent}{last}'])
+    return f'{first}\n{indent}  ' + f',\n{indent}  '.join(lines) + f'\n{indent}{last}'
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:

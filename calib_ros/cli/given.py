@@ -86,8 +86,7 @@ def origin_of(
     """Return whence a result comes: the options, and the files that were read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    names = ('operator', 'serial', 'device')
-    told = {name: getattr(options, name, '') for name in names}
+    told = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
     return page.Origin(page.inputs_of(known), settings=settings, **told)
 
 
@@ -98,14 +97,13 @@ def page_of(
 
     That is said once. `pdf` asks for report.pdf as well.
     """
-    found: dict[str, str | bytes | None] = {name: page.render(report)}
-    if found[name] is None:
-        screen.warn(page.MISSING, 'note')
-    if pdf:
-        found['report.pdf'] = page.on_paper(report)
-        if found['report.pdf'] is None:
-            screen.warn(page.MISSING_PDF, 'note')
-    return {each: content for each, content in found.items() if content is not None}
+    made: list[tuple[str, str | bytes | None, str]]
+    made = [(name, page.render(report), page.MISSING)]
+    made += [('report.pdf', page.on_paper(report), page.MISSING_PDF)] if pdf else []
+    for _, content, missing in made:
+        if content is None:
+            screen.warn(missing, 'note')
+    return {each: content for each, content, _ in made if content is not None}
 
 
 def replayed(

@@ -54,20 +54,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             joints, words, plan = _measurement(options, design, visibility, rng, work)
     screen.say(words)
     if chain.tool is None:
-        x, y, z = ASSUMED_TOOL
-        screen.say(
-            f'the tool is unknown: the target is assumed at {x:g} {y:g} {z:g} m from the flange'
-        )
+        place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
+        screen.say(f'the tool is unknown: the target is assumed at {place} m from the flange')
     if options.out is not None:
         page = _page_beside(options.out)
-        report = plan_report(
-            design.chain,
-            joints,
-            words,
-            given.origin_of(options, (options.candidates, options.task, options.taken)),
-            plan,
-            options.accuracy,
-        )
+        origin = given.origin_of(options, (options.candidates, options.task, options.taken))
+        report = plan_report(design.chain, joints, words, origin, plan, options.accuracy)
         pages = given.page_of(report, screen, page.name)
         beside = {options.out.with_name(name): text for name, text in pages.items()}
         write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
@@ -88,10 +80,8 @@ def _measurement(
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
         design = design.after(read_joints(options.taken, design.chain))
-    if options.task is None:
-        task = design.chain.random_joints(300, rng)
-    else:
-        task = read_joints(options.task, design.chain)
+    chain = design.chain
+    task = read_joints(options.task, chain) if options.task else chain.random_joints(300, rng)
     if options.candidates is None:
         candidates = draw_candidates(design, options.draw, rng, visibility)
     else:
@@ -102,8 +92,7 @@ def _measurement(
     choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
     needed = chosen = None
     if options.accuracy is not None:
-        wanted = 1e-3 * options.accuracy
-        fewest = planning.fewest(design, candidates, task, wanted, **choice)
+        fewest = planning.fewest(design, candidates, task, 1e-3 * options.accuracy, **choice)
         needed = len(fewest)
         chosen = fewest if options.poses in (None, needed) else None
     count = options.poses or needed or 25
