@@ -11,8 +11,8 @@ share. Errors are measured minus predicted, of the judged poses by a fit that di
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -108,12 +108,9 @@ class Poses:
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
         """Return some of the poses by a mask or by indices."""
-        arrays = {
-            name: getattr(self, name)[rows]
-            for name in self.__dataclass_fields__
-            if name not in ('tools', 'lines', 'images')
-        }
-        return Poses(**arrays, tools=self.tools, lines=self.lines, images=self.images)
+        of_all = ('tools', 'lines', 'images')
+        names = (each.name for each in fields(self) if each.name not in of_all)
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def table(self, told: Told = nobody) -> str:
         """Return a CSV: a row for each pose, in metres and radians."""
@@ -138,52 +135,51 @@ class Poses:
         return '\n'.join(parts) + '\n'
 
 
-def _parts(
+def _poses(
     chain: Chain,
     sigmas: tuple[float, float],
-    sets: Sequence[Observations],
-    comparison: Comparison,
-    role: NDArray[np.str_],
-    sizes: FloatArray,
-) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield the arrays of each set, with its residuals as `compare` has them."""
-    first = 0
-    for each in sets:
-        rows = slice(first, first + len(each))
-        base = chain.frame(each.base).matrix
-        turn = base[:3, :3]
-        reached = chain.forward(each.joints, each.approach, each.base, each.tool)
-        along = np.eye(3) if each.distances is not None else turn
-        before, after = comparison.before, comparison.after
-        sigma = np.tile(sigmas, (len(each), 1))
-        if each.covariance is not None:
-            variances = np.diagonal(each.covariances(sigmas), axis1=1, axis2=2)
-            sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
-        yield {
-            'joints': each.joints,
-            'stamps_ns': each.stamps_ns,
-            'position': (reached[:, :3, 3] - base[:3, 3]) @ turn,
-            'before': before.position[rows] @ along,
-            'after': after.position[rows] @ along,
-            'turned_before': before.orientation[rows] @ turn,
-            'turned_after': after.orientation[rows] @ turn,
-            'sigma': sigma,
-            'role': role[rows],
-            'outlier': ~comparison.judged[rows],
-            'size': sizes[rows],
-            'corner': np.full(len(each), each.pixels is not None),
-            'tools': chain.frame(each.tool).matrix[np.newaxis],
-        }
-        first += len(each)
-
-
-def _joined(
-    parts: Sequence[dict[str, NDArray[Any]]], lines: bool, images: Mapping[int, str]
+    of: Sequence[tuple[Sequence[Observations], Comparison, NDArray[np.str_], FloatArray]],
+    lines: bool,
+    images: Mapping[int, str],
 ) -> Poses:
-    """Return all parts in the order of their stamps."""
+    """Return poses in the order of their stamps.
+
+    They are those of sets, of each of which the comparison has the residuals, with the roles (N,)
+    and sizes (N,).
+    """
+    parts: list[dict[str, NDArray[Any]]] = []
+    for sets, comparison, role, sizes in of:
+        first, before, after = 0, comparison.before, comparison.after
+        for each in sets:
+            rows = slice(first, first + len(each))
+            first = rows.stop
+            base = chain.frame(each.base).matrix
+            turn = base[:3, :3]
+            reached = chain.forward(each.joints, each.approach, each.base, each.tool)
+            along = np.eye(3) if each.distances is not None else turn
+            sigma = np.tile(sigmas, (len(each), 1))
+            if each.covariance is not None:
+                variances = np.diagonal(each.covariances(sigmas), axis1=1, axis2=2)
+                sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
+            part = {
+                'joints': each.joints,
+                'stamps_ns': each.stamps_ns,
+                'position': (reached[:, :3, 3] - base[:3, 3]) @ turn,
+                'before': before.position[rows] @ along,
+                'after': after.position[rows] @ along,
+                'turned_before': before.orientation[rows] @ turn,
+                'turned_after': after.orientation[rows] @ turn,
+                'sigma': sigma,
+                'role': role[rows],
+                'outlier': ~comparison.judged[rows],
+                'size': sizes[rows],
+                'corner': np.full(len(each), each.pixels is not None),
+                'set': np.full(len(each), len(parts)),
+                'tools': chain.frame(each.tool).matrix[np.newaxis],
+            }
+            parts.append(part)
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tools = arrays.pop('tools')
-    arrays['set'] = np.repeat(np.arange(len(parts)), [len(part['joints']) for part in parts])
     order = np.argsort(arrays['stamps_ns'], kind='stable')
     ordered = {name: array[order] for name, array in arrays.items()}
     return Poses(**ordered, tools=tools, lines=lines, images=images)
@@ -196,19 +192,17 @@ def poses_of(
     images: Mapping[int, str] = NAMELESS,
 ) -> Poses:
     """Return all poses of an identification, those to judge on by what did not know them."""
-    known = (result.chain, (problem.sigma_position, problem.sigma_orientation))
     sizes = np.concatenate(result.distances)
-    fitted, judged = result.fitted, result.validation
+    judged = result.validation
     if judged is None or judged.repeated is not None:
-        role = np.full(len(sizes), FITTED)
-        parts = [*_parts(*known, problem.sets, fitted, role, sizes)]
+        of = [(problem.sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
     else:  # each was left out once
-        parts = [*_parts(*known, problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
+        of = [(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
     if judged is not None and judged.repeated is not None:
-        unknown = np.full(len(judged.judged), np.nan)
         role = np.where(judged.repeated, REPEATED, JUDGED)
-        parts += _parts(*known, problem.judging, judged, role, unknown)
-    return _joined(parts, lines, images)
+        of.append((problem.judging, judged, role, np.full(len(role), np.nan)))
+    sigmas = (problem.sigma_position, problem.sigma_orientation)
+    return _poses(result.chain, sigmas, of, lines, images)
 
 
 def poses_to_verify(
@@ -216,9 +210,9 @@ def poses_to_verify(
 ) -> Poses:
     """Return the poses of new measurements, which all judge."""
     count = len(comparison.judged)
-    role, sizes = np.full(count, JUDGED), np.full(count, np.nan)
+    of = [(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
-    return _joined([*_parts(chain, sigmas, sets, comparison, role, sizes)], lines, NAMELESS)
+    return _poses(chain, sigmas, of, lines, NAMELESS)
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
