@@ -75,9 +75,12 @@ class Foreign:
         made = MadeColumns(path, lines, values, table.words())
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
-        made, left_out = _measured_only(made)
-        if left_out:
-            notes.append(left_out)
+        measured = [made.values[name] for name in MEASURED if name in made.values]
+        good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
+        if not good.all():
+            lines = made.lines[~good].tolist()
+            notes.append(f'nothing was measured in {lines_in_words(lines)}: left out')
+            made = made.select(good)
         return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 
 
@@ -255,13 +258,3 @@ def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
     there = slice(max(0, shift), count - max(0, -shift))
     moved = {name: made.values[name][there] for name in made.values if JOINT.fullmatch(name)}
     return replace(here, values={**here.values, **moved})
-
-
-def _measured_only(made: MadeColumns) -> tuple[MadeColumns, str]:
-    """Return the rows in which anything was measured, and what is left out, in words."""
-    measured = [made.values[name] for name in MEASURED if name in made.values]
-    good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
-    if good.all():
-        return made, ''
-    lines = lines_in_words(made.lines[~good].tolist())
-    return made.select(good), f'nothing was measured in {lines}: left out'

@@ -239,14 +239,18 @@ class History:
 
     def file(self, row: Row) -> bool:
         """Add a row; return False where it was there already."""
+        import pyarrow as pa
         import pyarrow.parquet as parquet
 
         path = self._path(row.serial, row.key)
         if self._files.exists(path):
             return False
+        values = ((each.name, getattr(row, each.name)) for each in fields(row))
+        record = {name: x.ravel() if isinstance(x, np.ndarray) else x for name, x in values}
+        table = pa.Table.from_pylist([record | {'key': row.key}], schema=_schema())
         buffer = io.BytesIO()
         small = {'use_dictionary': False, 'write_statistics': False}  # most of a file of one row
-        parquet.write_table(_table_of(row), buffer, compression='zstd', **small)
+        parquet.write_table(table, buffer, compression='zstd', **small)
         self._write(path, buffer.getvalue())
         return True
 
@@ -354,14 +358,6 @@ def _schema() -> Any:
     }
     columns = [(each.name, kinds[str(each.type)]) for each in fields(Row)]
     return pa.schema([('key', pa.string()), *columns])
-
-
-def _table_of(row: Row) -> Any:
-    import pyarrow as pa
-
-    values = ((each.name, getattr(row, each.name)) for each in fields(row))
-    record = {name: x.ravel() if isinstance(x, np.ndarray) else x for name, x in values}
-    return pa.Table.from_pylist([record | {'key': row.key}], schema=_schema())
 
 
 def _conformed(table: Any, key: str) -> Any:

@@ -123,7 +123,15 @@ def table_of(
     warnings: tuple[str, ...] = (),
 ) -> Table:
     """Return the table of columns; the arguments are those of `read_table`."""
-    made = measurements(_of_sessions(found, joints, sessions), joints)
+    if not len(found.lines):
+        measurements(found, joints)  # a column that is missing says more
+        raise InputError(f'{found.path} has no rows')
+    if 'session' not in found.header and sessions:
+        names = ', '.join(sessions)
+        raise InputError(f'{found.path} has no column "session" to choose "{names}" from')
+    rows = _rows_of(found.path, found.labels('session'), sessions)
+    chosen = found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
+    made = measurements(chosen, joints)
     return _table(made, sigmas, eye_in_hand, warnings, 'stamp_ns' not in found.header)
 
 
@@ -337,17 +345,6 @@ def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
 
 def _cut_off(path: Path, line: int) -> str:
     return f'{path}: line {line} was cut off and is left out'
-
-
-def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Columns:
-    path = found.path
-    if not len(found.lines):
-        measurements(found, joints)  # a column that is missing says more
-        raise InputError(f'{path} has no rows')
-    if 'session' not in found.header and sessions:
-        raise InputError(f'{path} has no column "session" to choose "{", ".join(sessions)}" from')
-    rows = _rows_of(path, found.labels('session'), sessions)
-    return found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:

@@ -109,6 +109,12 @@ def _robot(
     chosen: dict[str, Any] = {}
     for each in (shared, own):
         chosen |= parse_mapping(each.get('settings') or {}, KEYS['settings'], f'{where}: settings')
+    for name, value in chosen.items():
+        chosen[name] = parse_like(getattr(Settings, name), value, f'{where}: {name}')
+    try:
+        settings = Settings(**chosen)
+    except ConfigError as err:
+        raise ConfigError(f'{where}: {err}') from err
     tolerance = given.get('tolerance')
     if tolerance is not None:
         tolerance = parse_number(tolerance, f'{where}: tolerance')
@@ -121,7 +127,7 @@ def _robot(
         serial,
         _chain(given.get('chain'), folder, where, chains),
         _measured(own.get('measured'), folder, where),
-        _settings(chosen, where),
+        settings,
         tolerance,
         loss,
         _moment(own.get('since'), f'{where}: since'),
@@ -158,17 +164,6 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
             raise ConfigError(f'{where}: session must be text, not {session!r}')
         found.append(Measured(files if '://' in files else str(folder / files), session))
     return tuple(found)
-
-
-def _settings(given: Mapping[str, Any], where: str) -> Settings:
-    values = {
-        name: parse_like(getattr(Settings, name), value, f'{where}: {name}')
-        for name, value in given.items()
-    }
-    try:
-        return Settings(**values)
-    except ConfigError as err:
-        raise ConfigError(f'{where}: {err}') from err
 
 
 def _moment(value: object, where: str) -> datetime | None:

@@ -80,14 +80,19 @@ BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
 }
 """What each cause brings by itself; the first cause that is there counts."""
 
-NOISY = 10.0
-"""Ratio of what is left to the stated noise that an arm's own errors rarely reach."""
+COARSE = (
+    'The measurements scatter {:.0f} times as much as stated for the device: before you measure '
+    'more, check that the target sits firmly, that the arm stood still, that clocks agree, and '
+    'the units.'
+)
+"""What to check first where the measurements are far too coarse."""
 
 
 def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
     """Return the refusals in plain words, those of one rule together, and last what follows.
 
-    `left` is the ratio of what is left after the correction to the stated noise.
+    `left` is the ratio of what is left after the correction to the stated noise; an arm's own
+    errors rarely make it 10.
     """
     found: dict[Rule, list[str]] = {}
     for each in reasons:
@@ -100,20 +105,11 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
             following.setdefault(cause, []).extend(texts)
             continue
         one = replace(rules()[rule], refusal='; '.join(texts))
-        if left >= NOISY and rule in {Rule.GAIN, Rule.REGION}:
+        if left >= 10.0 and rule in {Rule.GAIN, Rule.REGION}:
             steps = (each for each in one.steps if 'stood still' not in each)
-            one = replace(one, steps=(_coarse(left), *steps))
+            one = replace(one, steps=(COARSE.format(left), *steps))
         told.append(one)
     for cause, texts in following.items():
         meaning = f'Mend that first: "{rules()[cause].heading}".'
         told.append(Advice('What probably follows from it', meaning, (), '; '.join(texts)))
     return tuple(told)
-
-
-def _coarse(left: float) -> str:
-    """Return what to check before more is measured, where the measurements are far too coarse."""
-    return (
-        f'The measurements scatter {left:.0f} times as much as stated for the device: before you '
-        'measure more, check that the target sits firmly, that the arm stood still, that clocks '
-        'agree, and the units.'
-    )

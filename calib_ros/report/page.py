@@ -260,18 +260,15 @@ def _is_number(cell: str) -> bool:
 def input_of(path: Path) -> tuple[Input, ...]:
     """Return a file, or those of a folder such as a bag, with size and hash."""
     files = sorted(each for each in path.rglob('*') if each.is_file()) if path.is_dir() else [path]
-    return tuple(
-        Input(str(each.relative_to(path.parent)), each.stat().st_size, _sha256(each))
-        for each in files
-    )
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open('rb') as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    found = []
+    for each in files:
+        digest = hashlib.sha256()
+        with each.open('rb') as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        name, size = str(each.relative_to(path.parent)), each.stat().st_size
+        found.append(Input(name, size, digest.hexdigest()))
+    return tuple(found)
 
 
 def inputs_of(paths: Sequence[Path | None]) -> tuple[Input, ...]:

@@ -54,16 +54,6 @@ def before_after_png(result: Identification) -> bytes:
     return _png(figure)
 
 
-def draw_histogram(axes: Axes, errors_mm: FloatArray, label: str) -> None:
-    """Draw how often an error comes, with its 50th and 95th percentile."""
-    axes.hist(errors_mm, bins=60, color=AFTER, alpha=0.7)
-    for share, style in ((0.5, '-'), (0.95, '--')):
-        value = float(np.quantile(errors_mm, share))
-        axes.axvline(value, color='black', linestyle=style, label=f'{share:.0%}: {value:.3f} mm')
-    axes.set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
-    axes.legend(frameon=False)
-
-
 def workspace_png(survey: Survey) -> bytes:
     """Return the figure of a survey: what the calibration removes and, if known, what remains."""
     rows = list(survey.parts.items())[:2]
@@ -73,7 +63,13 @@ def workspace_png(survey: Survey) -> bytes:
     figure = _figure(13.0, 4.0 * len(rows))
     grid = figure.subplots(len(rows), 3, squeeze=False)
     for axes, (label, errors) in zip(grid, rows, strict=True):
-        draw_histogram(axes[0], 1e3 * errors, label)
+        axes[0].hist(1e3 * errors, bins=60, color=AFTER, alpha=0.7)
+        for share, style in ((0.5, '-'), (0.95, '--')):
+            value = 1e3 * float(np.quantile(errors, share))
+            name = f'{share:.0%}: {value:.3f} mm'
+            axes[0].axvline(value, color='black', linestyle=style, label=name)
+        axes[0].set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
+        axes[0].legend(frameon=False)
         axes[1].set_title('all directions')
         axes[2].set_title(f'height {low:.2f} to {high:.2f} m')
         for place, pair, part, labels in (
