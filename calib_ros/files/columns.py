@@ -40,7 +40,7 @@ class Columns:
         """Return the place of a cell in words."""
         return f'{self.path}, line {self.lines[row]}: {name}'
 
-    def _no_number(self, row: int, name: str, text: str) -> InputError:
+    def _no_number(self, row: int, name: str, text: str = '') -> InputError:
         return InputError(
             f'{self.where(row, name)} must be a finite number, not {text!r}: mend that row, or '
             'leave it out'
@@ -52,13 +52,9 @@ class Columns:
         Many columns at once take hardly longer than one. Errors name them as they are `called`.
         """
         found = self._numbers(names)
-        if found is not None:
-            return found
-        cells = [self.texts(name) for name in names]
-        parsed = np.array([list(map(_finite, column)) for column in cells]).T
-        for row, k in np.argwhere(np.isinf(parsed))[:1].tolist():
-            raise self._no_number(row, (called or names)[k], cells[k][row])
-        return parsed
+        for row, k in np.argwhere(np.isinf(found))[:1].tolist():
+            raise self._no_number(row, (called or names)[k], self.texts(names[k])[row])
+        return found
 
     def block(
         self,
@@ -77,7 +73,7 @@ class Columns:
             nothing = np.isnan(found)
             lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
-                raise self._no_number(row, names[int(nothing[row].argmax())], '')
+                raise self._no_number(row, names[int(nothing[row].argmax())])
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
@@ -108,7 +104,7 @@ class Columns:
 
     def blank(self, name: str) -> NDArray[np.bool_]:
         """Return (N,) which cells of a column are empty."""
-        raise NotImplementedError
+        return np.array([not text for text in self.texts(name)], dtype=bool)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -122,9 +118,12 @@ class Columns:
         """Return the number of each row's text, and the texts."""
         return numbered(self.texts(name))
 
-    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
-        """Return the numbers of columns, None where a cell may be none."""
-        raise NotImplementedError
+    def _numbers(self, names: Sequence[str]) -> FloatArray:
+        """Return the numbers (N, len(names)), infinite for what is none."""
+        found = np.zeros((len(self.lines), len(names)))
+        for k, name in enumerate(names):
+            found[:, k] = list(map(_number, self.texts(name)))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,10 +149,8 @@ class MadeColumns(Columns):
         )
 
     def blank(self, name: str) -> NDArray[np.bool_]:
-        """Return (N,) where a column holds nothing."""
-        if name in self.words:
-            return np.array([not word for word in self.words[name]], dtype=bool)
-        return np.isnan(self.values[name])
+        """Return (N,) which cells of a column are empty."""
+        return np.isnan(self.values[name]) if name in self.values else super().blank(name)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -161,19 +158,10 @@ class MadeColumns(Columns):
             return list(self.words[name])
         return ['' if value != value else repr(value) for value in self.values[name].tolist()]
 
-    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
-        found = np.zeros((len(self.lines), len(names)))
-        for k, name in enumerate(names):
-            words = self.words.get(name)
-            try:
-                found[:, k] = (
-                    self.values[name] if words is None else [float(w or 'nan') for w in words]
-                )
-            except ValueError:
-                return None
-            if not (np.isfinite(found[:, k]) | self.blank(name)).all():
-                return None
-        return found
+    def _numbers(self, names: Sequence[str]) -> FloatArray:
+        if set(names) <= set(self.values):
+            return np.array([self.values[name] for name in names]).T
+        return super()._numbers(names)
 
 
 def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColumns:
@@ -183,7 +171,7 @@ def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColu
     return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)
 
 
-def _finite(text: str) -> float:
+def _number(text: str) -> float:
     """Return the number in a cell, NaN for a blank one, infinity for anything else."""
     try:
         number = float(text or 'nan')

@@ -74,7 +74,7 @@ class TextColumns(Columns):
         numbers, known = numbered([word.decode() for word in words[runs].tolist()])
         return np.repeat(numbers, np.diff(np.append(runs, len(words)))), known
 
-    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+    def _numbers(self, names: Sequence[str]) -> FloatArray:
         columns = [self.header.index(name) for name in names]
         blank = (np.diff(self._ends) == 1).reshape(-1, len(self.header))[:, columns]
         lacking = np.asarray(blank.any(axis=0))
@@ -88,10 +88,10 @@ class TextColumns(Columns):
         try:  # latin1 knows every byte, whatever the other columns hold
             read = np.loadtxt(rows, float, None, sep, usecols=use, ndmin=2, encoding='latin1')
         except (ValueError, OverflowError):
-            return None
+            return super()._numbers(names)
         finite = np.isfinite(read)
-        if not (finite.all() or (finite | blank[:, some]).all()):
-            return None
+        if not finite.all():
+            read[~finite & ~blank[:, some]] = np.inf
         if len(some) == len(names):
             return read
         found = np.full(blank.shape, np.nan)
