@@ -87,7 +87,7 @@ def origin_of(
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     told = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
-    return page.Origin(page.inputs_of(known), settings=settings, **told)
+    return page.Origin(page.inputs_of(known), settings=settings, command=options.typed, **told)
 
 
 def page_of(

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import shlex
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -72,6 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         options = _options(given)
+        options.typed = shlex.join(('calib_ros', *given))
         module, function = options.home.split('.')
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
         status: int = run(options, Screen(options.quiet))

@@ -18,6 +18,7 @@ from typing import Any, Literal, TypeAlias
 
 import calib_ros
 from calib_ros.report.advice import Advice
+from calib_ros.shown import some
 from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
@@ -80,7 +81,7 @@ class Input:
 class Origin:
     """Whence a result comes: what only the one who started it knows; empty where not told.
 
-    With the configuration in `settings` the same is done again.
+    With the configuration in `settings` the same is done again, by the `command` if it was one.
     """
 
     inputs: tuple[Input, ...] = ()
@@ -88,6 +89,7 @@ class Origin:
     serial: str = ''
     device: str = ''
     settings: str = ''
+    command: str = ''
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values, without the settings, which have a file of their own."""
@@ -111,6 +113,11 @@ class Report:
     sections: tuple[Section, ...] = ()
     origin: Origin = Origin()
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
+
+    @property
+    def of(self) -> str:
+        """Return the names of what was read."""
+        return ', '.join(some([*dict.fromkeys(x.name.split('/')[0] for x in self.origin.inputs)]))
 
     @property
     def shown(self) -> tuple[Section, ...]:

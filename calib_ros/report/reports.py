@@ -20,7 +20,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
+from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, Situation, advice
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
@@ -32,6 +32,8 @@ NOT_YET = (
 UNPROVEN = (
     'These poses were all used to compute the correction: a small error "after" proves nothing.'
 )
+CAUSES = {Rule.MISTAKE, Rule.MOVED, Rule.ENCODER}
+"""What names its cause, so that it is said first."""
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -117,7 +119,10 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
-    return advice(result.refusals, noise)
+    poses = len(np.unique(result.fitted.after.configurations))
+    return advice(
+        result.refusals, Situation(poses, noise, result.noise.given.get('sigma_position'))
+    )
 
 
 def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
@@ -127,17 +132,18 @@ def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
         return Verdict('info', heading, (GOOD_ARM.meaning, tried, *_left(result)))
     whys = '. '.join(each.heading for each in reasons if each.steps)
-    found = [f'What was found: {x}.' for x in result.refusals if x.rule is Rule.MISTAKE]
+    found = [f'What was found: {x}.' for x in result.refusals if x.rule in CAUSES]
     heading = 'Not accepted: the robot stays as it was'
     return Verdict('bad', heading, (f'Why: {whys}.', *found, tried, *_left(result)))
 
 
 def _left(result: Identification) -> Iterator[str]:
-    if result.validation is not None and any(each.rule is Rule.GAIN for each in result.refusals):
+    rules = {each.rule for each in result.refusals}
+    if result.validation is not None and Rule.GAIN in rules and Rule.MISTAKE not in rules:
         before, after = result.validation.figures
         yield (
-            f'The RMS error was {before.rms_mm:.3f} mm; with the best correction found it '
-            f'would be {after.rms_mm:.3f} mm.'
+            f'On poses not used to compute it, the RMS error is {before.rms_mm:.3f} mm without '
+            f'the correction and {after.rms_mm:.3f} mm with it.'
         )
 
 
@@ -150,7 +156,8 @@ def _steps(
     if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
         return ()
     if not result.accepted:
-        return ('Follow the steps above, those of the first reason first.', reasons[0].again)
+        first = 'Follow the steps above, those of the first reason first.'
+        return (*((first,) if len(reasons) > 1 else ()), reasons[0].again)
     found = []
     if tolerance is not None and limits[0] > tolerance:
         if not result.chain.effects:

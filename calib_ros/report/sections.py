@@ -28,7 +28,7 @@ ISO_9283 = (
     'repeatability is part of the figure.'
 )
 LABELS = (
-    *('RMS [mm]', '95 % interval', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
+    *('RMS [mm]', '95 % interval of it', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
     *('RMS [mrad]', 'RMS [px]'),
 )
 """Rows of the table of accuracy below its head and count."""
@@ -130,7 +130,8 @@ def distribution(poses: Poses) -> Section:
     return section(
         'cumulated',
         f'How many {poses.things} are within an error',
-        'Outliers are left out. The further left a curve, the better.',
+        ('' if chosen.all() else 'Outliers are left out. ')
+        + 'The further left a curve, the better.',
         figure=figures.cumulated(before, after, poses.things),
         height=400,
     )

@@ -256,8 +256,8 @@ def scatter_in_words(noise: Noise) -> str:
         return f'{text}: nothing but that noise (chi-squared test).'
     if noise.position < 1.0:
         return f'{text}: the device is better than stated.'
-    text += ': the device is worse than stated, or the model lacks an effect.'
-    return f'{text} The intervals allow for it.'
+    text += ': the device is worse than stated, or the arm has errors that this model lacks.'
+    return f'{text} The intervals are wider for it.'
 
 
 NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other in joint space'}
@@ -270,7 +270,7 @@ def neighbours_in_words(noise: Noise) -> str:
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
     text = (
         f'The errors of poses {" and ".join(parts)} are alike (correlation in brackets): the '
-        'device drifts, or the model lacks an effect.'
+        'device drifts, or the arm has errors that this model lacks.'
     )
     if (times := f'{noise.widened:.2f}') != '1.00':
         text += f' So standard deviations are {times} times those of independent errors.'

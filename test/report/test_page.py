@@ -166,10 +166,30 @@ def test_every_refusal_is_told_in_plain_words(rule):
 
 @pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])
 def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
-    (usual,) = advice.advice([Reason(rule, 'little gain')], 2.0)
-    (coarse,) = advice.advice([Reason(rule, 'little gain')], 47.6)
+    (usual,) = advice.advice([Reason(rule, 'little gain')], advice.Situation(left=2.0))
+    (coarse,) = advice.advice([Reason(rule, 'little gain')], advice.Situation(left=47.6))
     assert '48 times' in coarse.steps[0]
     assert coarse.steps[1:] == tuple(each for each in usual.steps if 'stood still' not in each)
+
+
+def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
+    refused = [Reason(Rule.GAIN, 'little gain')]
+    (few,) = advice.advice(refused, advice.Situation(poses=14, left=2.5, sigma=1e-4))
+    assert few.meaning.startswith('Only 14 different poses')
+    assert few.steps == advice.rules()[Rule.CONFIGURATIONS].steps
+    (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
+    assert 'a noise of 0.46 mm in each direction; 0.1 mm are set' in enough.meaning
+
+
+def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
+    problem, result = solved
+    origin = Origin(
+        (Input('cell/a.mcap', 1, 'a'), Input('cell/metadata.yaml', 1, 'b')), command='c <d>'
+    )
+    report = replace(report_of(problem, result), origin=origin)
+    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('identify again',))
+    assert report.of == 'cell'
+    assert 'c &lt;d&gt;' in render(refused)
 
 
 @pytest.mark.parametrize(('share', 'count', 'state'), [(0.0, 60, 'info'), (0.5, 8, 'bad')])
@@ -188,7 +208,8 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
 
 def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
     rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.OUTLIERS)
-    told = advice.advice([Reason(rule, rule.name) for rule in rules], 1000.0)
+    here = advice.Situation(left=1000.0)
+    told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
     assert [bool(each.steps) for each in told] == [True, True, False]
     assert told[-1].refusal == 'LARGEST_ERROR; GAIN'
     assert told[0].heading in told[-1].meaning
