@@ -16,7 +16,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from hashlib import sha256
 from pathlib import Path
 
@@ -49,10 +49,9 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
     placed = []
     try:
         for path, content in contents.items():
-            data = content.encode() if isinstance(content, str) else content
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
             with os.fdopen(os.open(partials[path], flags, 0o666), 'wb') as file:
-                file.write(data)
+                file.write(content.encode() if isinstance(content, str) else content)
                 file.flush()
                 os.fsync(file.fileno())
         for k, path in enumerate(contents if overwrite and len(contents) > 1 else ()):
@@ -60,10 +59,7 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
                 (os.replace if k else _link)(path, earlier[path])
                 placed.append(path)
         for path, partial in partials.items():
-            if overwrite:
-                partial.replace(path)
-            else:
-                _rename_new(partial, path)
+            (os.replace if overwrite else _rename_new)(partial, path)
             placed.append(path)
         placed = []
     except OSError as err:
@@ -102,12 +98,12 @@ def whole_folder(
         _check_place(path, place, own, overwrite)
         try:
             yield new
-            _sync(new)
+            _sync(new, *new.rglob('*'))
             if place.exists():
                 _carry_over(place, new, own or ())
                 place.rename(old)
             new.rename(place)
-            _sync(place.parent, deep=False)
+            _sync(place.parent)
         except OSError as err:  # which names the folder to work in
             name = str(err.filename or path).replace(str(new), str(path))
             raise OSError(err.errno, err.strerror or str(err), name) from err
@@ -144,7 +140,6 @@ def short_name(name: str) -> str:
 
 
 def _put_back(earlier: Mapping[Path, Path]) -> None:
-    """Make of files what they were earlier, or nothing where there was nothing."""
     for path, before in earlier.items():
         try:
             if before.exists():
@@ -161,7 +156,6 @@ def _exists(path: Path) -> InputError:
 
 
 def _rename_new(partial: Path, path: Path) -> None:
-    """Rename a file to a name that nothing has."""
     try:
         os.link(partial, path)
     except FileExistsError:
@@ -185,32 +179,26 @@ def _claim(work: Path, path: Path) -> int:
             made = False
         except OSError as err:
             raise OSError(err.errno, err.strerror, str(path)) from err
-        with suppress(FileNotFoundError):  # its owner has just ended: once more
+        with suppress(FileNotFoundError), ExitStack() as stack:
             handle = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-            try:
-                _lock(handle, work, path, made)
-                if os.path.samestat(os.fstat(handle), os.lstat(work)):
-                    return handle
-            except BaseException:
-                os.close(handle)
-                raise
-            os.close(handle)
+            stack.callback(os.close, handle)
+            _lock(handle, work, path, made)
+            if os.path.samestat(os.fstat(handle), os.lstat(work)):
+                stack.pop_all()
+                return handle  # else its owner has just ended: once more
 
 
 def _lock(handle: int, work: Path, path: Path, made: bool) -> None:
     if os.fstat(handle).st_uid != os.geteuid():
         raise InputError(f'{work} belongs to another user: choose another place for {path}')
+    other = f'another process is writing {path}'
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(
-            f'another process is writing {path}: wait for it or choose another name'
-        ) from None
+        raise InputError(f'{other}: wait for it or choose another name') from None
     except OSError:  # a file system without locks: whoever made the folder has it
         if not made:
-            raise InputError(
-                f'another process is writing {path}, or was killed: remove {work} if none runs'
-            ) from None
+            raise InputError(f'{other}, or was killed: remove {work} if none runs') from None
 
 
 def _clean_up(place: Path, new: Path, old: Path) -> None:
@@ -228,7 +216,6 @@ def _clean_up(place: Path, new: Path, old: Path) -> None:
 
 
 def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: bool) -> None:
-    """Refuse a place at which no folder can or must be put."""
     if not os.path.lexists(place):
         return
     if own is None:
@@ -252,9 +239,7 @@ def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
     def left_out(folder: str, names: list[str]) -> list[str]:
         return [name for name in names if Path(folder, name) in owned]
 
-    shutil.copytree(
-        source, target, symlinks=True, ignore=left_out, copy_function=_link, dirs_exist_ok=True
-    )
+    shutil.copytree(source, target, True, left_out, _link, dirs_exist_ok=True)
 
 
 def _link(first: str | Path, second: str | Path) -> None:
@@ -271,12 +256,11 @@ def _matching(folder: Path, patterns: Sequence[str]) -> set[Path]:
     return {path for each in patterns for path in folder.glob(each)}
 
 
-def _sync(folder: Path, *, deep: bool = True) -> None:
-    """Wait until a folder is on the disk, with all that is in it."""
-    paths = [folder]
-    if deep:
-        paths += [inner for inner in folder.rglob('*') if inner.is_file() or inner.is_dir()]
+def _sync(*paths: Path) -> None:
+    """Wait until files and folders are on the disk."""
     for path in paths:
+        if not (path.is_file() or path.is_dir()):
+            continue
         handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -168,10 +167,14 @@ class Settings:
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
-            lower = item.metadata['lower']
-            value = getattr(self, item.name)
-            if isinstance(item.default, tuple):
-                _check_list(item.name, value)
+            value, lower = getattr(self, item.name), item.metadata['lower']
+            if isinstance(item.default, tuple):  # what is done with longer lists takes for ever
+                longest = max(map(len, value), default=0)
+                for count, what in ((len(value), 'entries'), (longest, 'characters in an entry')):
+                    if count > MOST_ENTRIES:
+                        raise ConfigError(
+                            f'{item.name} has {count} {what}, at most {MOST_ENTRIES} are taken'
+                        )
             if lower is not None and not math.isfinite(value):
                 raise ConfigError(f'{item.name} must be a finite number, not {value}')
             if lower is not None and value < lower:
@@ -183,13 +186,3 @@ class Settings:
                     f'{name} ({value:g} s) must be shorter than longest_stop '
                     f'({self.longest_stop:g} s): else no stop is ever sampled'
                 )
-
-
-def _check_list(name: str, entries: Sequence[str]) -> None:
-    """Refuse lists that are too long to be meant: what is done with them may take for ever."""
-    for count, what in (
-        (len(entries), 'entries'),
-        *((len(e), 'characters in an entry') for e in entries),
-    ):
-        if count > MOST_ENTRIES:
-            raise ConfigError(f'{name} has {count} {what}, at most {MOST_ENTRIES} are taken')

@@ -1,9 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text files, tables and YAML, within limits.
+"""Text files, tables and YAML, within limits, and texts of others as no more than text.
 
 A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
 with any number of digits. The stream of its events is looked at before anything is made of it.
+A joint, a frame or a robot may be called `<script>`, `| x |` or `=cmd|...`: in a report that is
+markup, in a spreadsheet a formula.
 """
 
 from __future__ import annotations
@@ -11,18 +13,13 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import (
-    LONGEST_NAME,
-    MOST_ENTRIES,
-    CalibrationError,
-    ConfigError,
-    InputError,
-)
+from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, CalibrationError, ConfigError, InputError
 
 LARGEST_TEXT = 10 * MOST_ENTRIES**2
 """Bytes of a chain file, calibration, URDF or YAML program: ten lists as long as can be."""
@@ -35,6 +32,10 @@ DEEPEST = 20
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
 """Values in a YAML document with its aliases written out; 20 characters count as one."""
+MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
+"""What Markdown takes for more than text; underscores only where they may begin emphasis."""
+FORMULA = re.compile(r"'*[=+\-@\t\r]")
+"""How a cell begins that a spreadsheet computes, whatever apostrophes are before it."""
 
 
 def read_text(
@@ -98,7 +99,7 @@ def dump_json(value: Any, indent: str = '') -> str:
     if isinstance(value, Mapping):
         lines = [f'{json.dumps(name)}: {line}' for name, line in zip(value, lines, strict=True)]
         first, last = '{}'
-    return ''.join([first, ','.join(f'\n{indent}  {line}' for line in lines), f'\n{indent}{last}'])
+    return f'{first}\n{indent}  ' + f',\n{indent}  '.join(lines) + f'\n{indent}{last}'
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:
@@ -214,3 +215,24 @@ class _Weigher:
             if nodes > MOST_NODES:
                 raise self._error(f'{self._where} has more than {MOST_NODES} values')
         return nodes, height
+
+
+def one_line(text: str) -> str:
+    """Return a text without line breaks and characters that cannot be seen."""
+    return ' '.join(''.join(c if c.isprintable() else ' ' for c in text).split())
+
+
+def in_markdown(value: object) -> str:
+    """Return a value as text within a line of Markdown, free of HTML."""
+    text = MARKUP.sub(r'\\\g<0>', one_line(str(value)))
+    return text.replace('&', '&amp;').replace('<', '&lt;')
+
+
+def to_cell(text: str) -> str:
+    """Return a text as a cell of a table, which is no formula."""
+    return f"'{text}" if FORMULA.match(text) else text
+
+
+def from_cell(cell: str) -> str:
+    """Return the text of a cell by `to_cell`."""
+    return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell

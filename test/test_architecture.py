@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from calib_ros.cli.command import TEXTS
+from calib_ros.cli.main import TEXTS
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
 ORDER = 'kinematics < identification < sampling < apply < files < report < fleet < ros, cli'
@@ -26,7 +26,7 @@ ONLY = {
     **dict.fromkeys(ROS, ('ros.',)),
     'rosbags': ('files.bags',),
     'matplotlib': ('report.plots',),
-    **dict.fromkeys(('jinja2', 'plotly'), ('report.page', 'fleet.page')),
+    **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
     'weasyprint': ('report.page',),
     'cv2': ('files.images',),
     'pyarrow': ('files.history',),
@@ -35,7 +35,7 @@ ONLY = {
     'rich': ('fleet.', 'cli.screen'),
     'argcomplete': ('cli.main',),
     'yaml': (
-        *('texts', 'kinematics.chain_file', 'files.export', 'files.trajectories'),
+        *('texts', 'kinematics.chain_file', 'files.export', 'files.programs'),
         *('files.vendors', 'ros.arguments'),
     ),
 }

@@ -15,8 +15,8 @@ from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
 from calib_ros.files.layouts import COVARIANCE
+from calib_ros.files.programs import read_program
 from calib_ros.files.tables import read_journal, read_table
-from calib_ros.files.trajectories import read_program
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Joint

@@ -27,14 +27,13 @@ def _board(options: argparse.Namespace, screen: Screen) -> int:
     black = black_of(board)
     if options.out.suffix.lower() != '.pdf':
         raise InputError(f'--out must end in .pdf, not {options.out.name}')
-    width, height = (1e3 * side for side in board.size)
+    printed = ' x '.join(f'{1e3 * side:.2f}' for side in board.size) + ' mm'
     words = f'{board.type} {board.columns} x {board.rows}, {board.dictionary}; must measure '
-    words += f'{width:.2f} x {height:.2f} mm: print in true size (100 %)'
+    words += f'{printed}: print in true size (100 %)'
     described = options.out.with_suffix('.yaml')
     common.refuse_existing(options, options.out, described)
     drawn = {options.out: board_pdf(black, board.size, words)}
     write_together({**drawn, described: dump_yaml(content)}, overwrite=options.force)
-    printed = f'{width:.2f} x {height:.2f} mm'
     screen.say(f'wrote {options.out} and {described}: {printed}; measure the print')
     return 0
 

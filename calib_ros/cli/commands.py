@@ -5,11 +5,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
 
 from calib_ros.cli import options as common
-from calib_ros.cli.command import Command
 from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, Limits
 
 
@@ -313,26 +313,27 @@ import export.csv --preset optitrack --joints log.csv --joints-preset kuka --out
 """
 """For the foot of each help, without "calib_ros"."""
 
-COMMANDS = {
-    'robots': Command(lambda parser: None, 'robots._robots'),
-    'chain': Command(_add_chain, 'robots._chain'),
-    'demo': Command(_add_demo, 'simulate._demo'),
-    'simulate': Command(_add_simulate, 'simulate._run'),
-    'board': Command(_add_board, 'camera._board'),
-    'images': Command(_add_images, 'camera._images'),
-    'plan': Command(_add_plan, 'plan._run'),
-    'fleet': Command(_add_fleet, 'fleet._run_fleet'),
-    'history': Command(_add_history, 'fleet._run_history'),
-    'identify': Command(_add_identify, 'identify._run'),
-    'verify': Command(_add_verify, 'verify._run'),
-    'compare': Command(_add_compare, 'compare._run'),
-    'compensate': Command(_add_compensate, 'compensate._run'),
-    'export': Command(_add_export, 'export._run'),
-    'workspace': Command(_add_workspace, 'workspace._run'),
-    'bag2csv': Command(_add_bag2csv, 'convert._bag2csv'),
-    'csv2bag': Command(_add_csv2bag, 'convert._csv2bag'),
-    'import': Command(_add_import, 'convert._convert'),
+COMMANDS: Mapping[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
+    'robots': ('robots._robots', lambda parser: None),
+    'chain': ('robots._chain', _add_chain),
+    'demo': ('simulate._demo', _add_demo),
+    'simulate': ('simulate._run', _add_simulate),
+    'board': ('camera._board', _add_board),
+    'images': ('camera._images', _add_images),
+    'plan': ('plan._run', _add_plan),
+    'fleet': ('fleet._run_fleet', _add_fleet),
+    'history': ('fleet._run_history', _add_history),
+    'identify': ('identify._run', _add_identify),
+    'verify': ('verify._run', _add_verify),
+    'compare': ('calibrated._compare', _add_compare),
+    'compensate': ('calibrated._compensate', _add_compensate),
+    'export': ('calibrated._export', _add_export),
+    'workspace': ('workspace._run', _add_workspace),
+    'bag2csv': ('convert._bag2csv', _add_bag2csv),
+    'csv2bag': ('convert._csv2bag', _add_csv2bag),
+    'import': ('convert._convert', _add_import),
 }
+"""By name: MODULE.FUNCTION, which is imported when it runs, and what adds its options."""
 
 
 def examples_of(name: str) -> list[str]:

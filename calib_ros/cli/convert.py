@@ -47,11 +47,9 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     (fitted,) = table.fitted
     held_out = table.held_out[0] if table.held_out else fitted.select(np.zeros(0, int))
     oriented = bool(fitted.oriented.any() or held_out.oriented.any())
-    rows = Observations.from_arrays(
-        np.concatenate([fitted.joints, held_out.joints]),
-        np.concatenate([fitted.positions, held_out.positions]),
-        np.concatenate([fitted.rotations, held_out.rotations]) if oriented else None,
-    )
+    both = [(fitted.joints, held_out.joints), (fitted.positions, held_out.positions)]
+    both += [(fitted.rotations, held_out.rotations)] if oriented else []
+    rows = Observations.from_arrays(*map(np.concatenate, both))
     judging = np.arange(len(rows)) >= len(fitted)
     recording = Recording.of_dwells(chain.joint_names, rows, judging)
     with screen.work(f'writing {options.bag.name}') as work:

@@ -15,14 +15,12 @@ from calib_ros.cli import options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
-from calib_ros.files.rows import Row
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.fleet.page import write_report
     from calib_ros.fleet.plant import read_plant
     from calib_ros.fleet.run import Cluster, run
-    from calib_ros.fleet.standing import counts, metrics, standings
+    from calib_ros.fleet.standing import counts, metrics, standings, write_report
 
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')
@@ -34,17 +32,13 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
         done = run(robots, history, cluster, options.out, work)
         work('comparing nights')
         found = standings(robots, history, done, options.years)
-        if options.out is not None:
-            missing = write_report(options.out, found, done)
-            if missing:
-                screen.warn(missing, 'note')
+        if options.out is not None and (missing := write_report(options.out, found, done)):
+            screen.warn(missing, 'note')
         if options.metrics is not None:
             write_file(options.metrics, metrics(found, done, time.time()), overwrite=True)
     number = counts(found)
-    screen.title(
-        ', '.join(f'{count} {state}' for state, count in number.items() if count),
-        number['fine'] == len(found),
-    )
+    title = ', '.join(f'{count} {state}' for state, count in number.items() if count)
+    screen.title(title, number['fine'] == len(found))
     for each in found:
         for alarm in each.alarms:
             screen.bullet(f'{each.robot.serial}, {alarm}')
@@ -89,13 +83,9 @@ def _run_history(options: argparse.Namespace, screen: Screen) -> int:
         serials = (options.robot,)
     width = max(map(len, serials))
     screen.data(f'{"robot":{width}}  time (UTC)        what      verdict    poses  RMS [mm]  from')
-    for serial in serials:
-        for row in history.rows(serial):
-            screen.data(f'{serial:{width}}  {_line(row)}'.rstrip())
+    for row in (row for serial in serials for row in history.rows(serial)):
+        rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
+        line = f'{row.serial:{width}}  {row.time:%Y-%m-%d %H:%M}  {row.kind:8}  '
+        line += f'{row.verdict:9}  {row.poses:5}  {rms:>8}  {row.source}'
+        screen.data(line.rstrip())
     return 0
-
-
-def _line(row: Row) -> str:
-    rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
-    when = f'{row.time:%Y-%m-%d %H:%M}'
-    return f'{when}  {row.kind:8}  {row.verdict:9}  {row.poses:5}  {rms:>8}  {row.source}'

@@ -16,23 +16,13 @@ from calib_ros.errors import InputError
 from calib_ros.files import loading
 from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.history import History
+from calib_ros.files.history import Filing, History, content_hash, measured_at, settings_hash
 from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.rows import Filing, content_hash, measured_at, settings_hash
 from calib_ros.files.tables import Table
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
-from calib_ros.report.page import (
-    MISSING,
-    MISSING_PDF,
-    Origin,
-    Report,
-    input_of,
-    inputs_of,
-    on_paper,
-    render,
-)
+from calib_ros.report import page
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -84,36 +74,36 @@ def filing_of(
     """Return what is filed of a result besides the result."""
     settings = settings_hash(nominal, settings_of(options), *judged_by)
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
-    content = content_hash([each.sha256 for each in input_of(measured)], options.session or '')
+    content = content_hash(
+        [each.sha256 for each in page.input_of(measured)], options.session or ''
+    )
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
 
 
 def origin_of(
     options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
-) -> Origin:
+) -> page.Origin:
     """Return whence a result comes: the options, and the files that were read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    names = ('operator', 'serial', 'device')
-    told = {name: getattr(options, name, '') for name in names}
-    return Origin(inputs_of(known), settings=settings, **told)
+    told = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
+    return page.Origin(page.inputs_of(known), settings=settings, command=options.typed, **told)
 
 
 def page_of(
-    report: Report, screen: Screen, name: str = 'report.html', pdf: bool = False
+    report: page.Report, screen: Screen, name: str = 'report.html', pdf: bool = False
 ) -> Contents:
     """Return a report as the content of files by name; nothing where an extra is missing.
 
     That is said once. `pdf` asks for report.pdf as well.
     """
-    found: dict[str, str | bytes | None] = {name: render(report)}
-    if found[name] is None:
-        screen.warn(MISSING, 'note')
-    if pdf:
-        found['report.pdf'] = on_paper(report)
-        if found['report.pdf'] is None:
-            screen.warn(MISSING_PDF, 'note')
-    return {each: content for each, content in found.items() if content is not None}
+    made: list[tuple[str, str | bytes | None, str]]
+    made = [(name, page.render(report), page.MISSING)]
+    made += [('report.pdf', page.on_paper(report), page.MISSING_PDF)] if pdf else []
+    for _, content, missing in made:
+        if content is None:
+            screen.warn(missing, 'note')
+    return {each: content for each, content, _ in made if content is not None}
 
 
 def replayed(

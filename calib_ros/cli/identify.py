@@ -6,29 +6,40 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 from calib_ros.cli import given, options as common
-from calib_ros.cli.detections import detected
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.recalibrate import recalibrated
-from calib_ros.cli.results import (
-    RESULT_FILES,
-    Identified,
-    document,
-    identified,
-    result_files,
-    show,
-)
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.boards import POSED, posed_arm
+from calib_ros.files import boards
+from calib_ros.files.history import identified as row_of
 from calib_ros.files.loading import Loaded, of_bag, of_table
-from calib_ros.files.rows import identified as row_of
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.recalibration import recalibrate, years_since
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.progress import share_of
 from calib_ros.report import words
+from calib_ros.report.advice import BRINGS
+from calib_ros.report.page import Origin, markdown
+from calib_ros.report.poses import poses_of
+from calib_ros.report.reports import NOT_YET, identification_report, reasons_of, within_tolerance
+from calib_ros.sampling.problems import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_json
 
+RESULT_FILES = (
+    *('calibration.yaml', 'result.json', 'report.html', 'report.md', 'residuals.csv'),
+    *('before_after.png', 'settings.yaml'),
+)
 DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
 """Options for what a camera saw."""
 OF_TABLES = (
@@ -44,12 +55,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     if options.previous is not None:
-        return recalibrated(options, lambda: _loaded(options, screen)[0], screen)
+        return _recalibrated(options, screen)
     history = given.history_of(options)
     with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
-            contents |= result_files(found, screen, options.out, options.tolerance, options.pdf)
+            contents |= result_files(found, screen, options.out, options.pdf)
     if history is not None:
         problem, measured = found.loaded.problem, options.csv or options.detections
         sets, measured = (*problem.sets, *problem.judging), measured or options.measured
@@ -58,14 +69,68 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     for warning in (*found.loaded.warnings, *words.remarks(found.result)):
         screen.warn(warning)
     if options.json:
-        screen.data(dump_json(document(found, options.tolerance)))
+        screen.data(_document(found))
     else:
-        show(found, screen, options.tolerance)
+        show(found, screen)
         if options.out is None:
             screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
         else:
             screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.NOT_ACCEPTED
+
+
+def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
+    """Bring an earlier calibration up to date by a few poses; return the exit status."""
+    with common.results(options, ('calibration.yaml', 'result.json')) as contents:
+        loaded, _ = _loaded(options, screen)
+        common.at_least(options, growth=0)
+        previous = given.calibration_of(
+            options.previous, 'identify --previous', loaded.problem.chain
+        )
+        for warning in loaded.warnings:
+            screen.warn(warning)
+        new = ('base',) * options.new_base + ('tool',) * options.new_tool
+        years, growth = years_since(previous.record), 1e-3 * options.growth
+        with screen.work('looking for what has changed'):
+            found = recalibrate(previous, loaded.problem, years, growth, new)
+        text = dump_json(found.document()) + '\n'
+        contents['result.json'] = text
+        if found.accepted:
+            contents['calibration.yaml'] = found.calibration.dump()
+        elif options.out is not None:
+            contents |= _set_aside(options.out)
+    if options.json:
+        screen.data(text)
+    else:
+        screen.title(found.in_words(), found.accepted)
+        if options.out is not None:
+            screen.say(common.written(options.out, contents))
+    return 0 if found.accepted else common.NOT_ACCEPTED
+
+
+def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
+    loaded, settings = _loaded(options, screen)
+    configuration = words.configuration_yaml(options.chain, settings)
+    read = (options.csv, options.detections, options.measured)
+    origin = given.origin_of(options, read, configuration)
+    return identified(loaded, settings, screen, origin, options.tolerance)
+
+
+def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
+    """Return what there is to identify in a table or a bag, and the settings."""
+    source = _source(options)
+    posed = options.chain == boards.POSED
+    chain = boards.posed_arm() if posed else load_chain(options.chain)
+    settings = common.settings_of(options)
+    touch = options.sigma_touch
+    touched: dict[str, Any] = {} if touch is None else {'sigma_touch': touch}
+    if options.detections is not None:
+        return _detected(options, chain, settings, touched, screen), settings
+    if source == 'table':
+        found = given.table(options, options.csv, chain, settings, screen, options.eye_in_hand)
+        return of_table(found, chain, settings, **touched), settings
+    bag = given.replayed(options.measured, chain, settings, screen)
+    return of_bag(*bag, options.largest_loss), settings
 
 
 def _source(options: argparse.Namespace) -> str:
@@ -83,27 +148,177 @@ def _source(options: argparse.Namespace) -> str:
     return source
 
 
-def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
-    """Return what there is to identify in a table or a bag, and the settings."""
-    source = _source(options)
-    chain = posed_arm() if options.chain == POSED else load_chain(options.chain)
-    settings = common.settings_of(options)
-    if options.detections is not None:
-        loaded = detected(options, chain, settings, screen)
-    elif source == 'table':
-        touch = options.sigma_touch
-        touched = {} if touch is None else {'sigma_touch': touch}
-        found = given.table(options, options.csv, chain, settings, screen, options.eye_in_hand)
-        loaded = of_table(found, chain, settings, **touched)
+def _detected(
+    options: argparse.Namespace,
+    chain: Chain,
+    settings: Settings,
+    touched: dict[str, Any],
+    screen: Screen,
+) -> Loaded:
+    """Return what is to be fitted of corners of a board, and of a table besides."""
+    for name in ('board', 'places'):
+        if getattr(options, name) is None:
+            raise InputError(f'--detections need --{name} as well')
+    board = boards.read_board(options.board)
+    found = boards.read_detections(options.detections, board)
+    places, posed = boards.read_places(options.places, len(chain.joints))
+    if posed != (chain.name == boards.POSED):
+        raise InputError(
+            f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
+            + (f'give --chain {boards.POSED}' if posed else 'give the chain of the arm')
+        )
+    seen, warnings = boards.observed(found, board, places, options.eye_in_hand)
+    more: Sequence[Observations] = ()
+    held_out: Sequence[Observations] = ()
+    by_line = True
+    if options.csv is not None:
+        rows = given.table(options, options.csv, chain, settings, screen)
+        more, held_out, by_line = rows.fitted, rows.held_out, rows.by_line
+        warnings = (*warnings, *rows.warnings)
+        names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
+        seen = replace(seen, base=names[0], tool=names[1])
+    known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
+    lens = known if options.intrinsics is None else boards.read_lens(options.intrinsics)
+    if lens is not None:
+        chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
+    chosen = settings.for_problem() | touched
+    if posed:
+        chosen['fixed'] = (*chosen['fixed'], *(f'{name}.*' for name in chain.joint_names))
+    problem = Problem(chain, seen, held_out, more=more, **chosen)
+    reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'
+    refusals = (Reason(Rule.POSED, reason),) if posed else ()
+    count = sum(map(len, problem.sets))
+    samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
+    images = dict(zip(found.lines, found.names, strict=True)) if by_line else {}
+    return Loaded(problem, samples, warnings, '', by_line, images, refusals, instead=posed)
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """A result with its input and where that comes from; the wanted error [mm] if there is one."""
+
+    loaded: Loaded
+    result: Identification
+    origin: Origin
+    tolerance: float | None = None
+
+    @property
+    def wanted(self) -> float | None:
+        """Return the wanted error [m]."""
+        return None if self.tolerance is None else 1e-3 * self.tolerance
+
+
+def identified(
+    loaded: Loaded,
+    settings: Settings,
+    screen: Screen,
+    origin: Origin,
+    tolerance: float | None = None,
+) -> Identified:
+    """Identify with a sign of life."""
+    with screen.work('identifying') as work:
+        return Identified(loaded, loaded.identified(settings.model, work), origin, tolerance)
+
+
+def show(found: Identified, screen: Screen) -> None:
+    """Print a result: the verdict, six rows, and each reason or note once."""
+    result = found.result
+    if found.loaded.read:
+        screen.say(found.loaded.read)
+    if result.accepted:
+        within = within_tolerance(result.validation or result.fitted, found.wanted)
+        better = 'the calibration makes the arm better'
+        title = f'accepted: the arm gets better, {within}' if within else f'accepted: {better}'
+        screen.title(title, None if 'not' in within else True)
     else:
-        bag = given.replayed(options.measured, chain, settings, screen)
-        loaded = of_bag(*bag, options.largest_loss)
-    return loaded, settings
+        screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
+    screen.table(_rows(result))
+    for each in reasons_of(result):
+        screen.bullet(f'{each.heading}: {each.refusal}', each.steps or (each.meaning,))
+    if result.accepted:
+        for note in (*words.notes(result), NOT_YET):
+            screen.bullet(note)
+    elif (
+        result.noise.position > 1.0
+        and not result.noise.consistent
+        and {each.rule for each in result.refusals}.isdisjoint(BRINGS)
+    ):
+        screen.bullet(words.scatter_in_words(result.noise))
+    for line in words.cameras_in_words(result):
+        screen.bullet(line)
 
 
-def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
-    """Return what is identified."""
-    loaded, settings = _loaded(options, screen)
-    configuration = words.configuration_yaml(options.chain, settings)
-    read = (options.csv, options.detections, options.measured)
-    return identified(loaded, settings, screen, given.origin_of(options, read, configuration))
+def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
+    before, after = (result.validation or result.fitted).figures
+    proof = '' if result.validation else '; on the poses fitted, which proves nothing'
+    measured = words.measured(result)
+    if result.outliers:
+        measured += f', {len(result.outliers)} of them outliers without weight'
+    fitted = f'{result.rank} parameters fitted'
+    if result.chain.effects:
+        fitted += f', {len(result.chain.effects)} of them effects'
+    second = ('largest error', f'{before.max_mm:.3f} -> {after.max_mm:.3f} mm')
+    if before.rms_mrad is not None and after.rms_mrad is not None:
+        turn = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
+        second = ('orientation error', turn)
+    if before.rms_px is not None and after.rms_px is not None:
+        second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
+    valid = 'nowhere, because it is not accepted'
+    if result.accepted and result.region is not None:
+        valid = result.region.in_words().removeprefix('valid ')
+    return (
+        ('robot', f'{result.chain.name}, {fitted}'),
+        ('fitted to', measured),
+        ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm{proof}'),
+        second,
+        ('judged by', result.validated_by),
+        ('valid', valid),
+    )
+
+
+def _document(found: Identified) -> str:
+    """Return the content of result.json."""
+    content = words.as_document(found.result, found.loaded.samples)
+    content |= {'warnings': list(found.loaded.warnings), 'tolerance_mm': found.tolerance}
+    return dump_json(content | {'origin': found.origin.document()})
+
+
+def result_files(
+    found: Identified, screen: Screen, out: Path, pdf: bool = False
+) -> dict[str, str | bytes]:
+    """Return the files of a result by name; a chain only if it is accepted.
+
+    A chain that was accepted earlier, in `out`, is kept under another name when this result is
+    not: it does not belong to the files beside it any more.
+    """
+    from calib_ros.report.plots import before_after_png
+
+    loaded, result = found.loaded, found.result
+    with screen.work('writing the report') as work:
+        work('residuals.csv, 1 of 3')
+        poses = poses_of(loaded.problem, result, loaded.lines, loaded.images)
+        contents: dict[str, str | bytes] = {
+            'result.json': _document(found) + '\n',
+            'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),
+            'settings.yaml': found.origin.settings,
+        }
+        work('before_after.png, 2 of 3')
+        contents['before_after.png'] = before_after_png(result)
+        work('report.html, 3 of 3')
+        work(2 / 3)
+        report = identification_report(
+            loaded.problem, result, poses, found.origin, loaded.warnings, found.wanted
+        )
+        contents['report.md'] = markdown(report, loaded.samples)
+        contents |= given.page_of(report, screen, pdf=pdf)
+    if result.accepted:
+        kept = Calibration.of(result, owners=loaded.owners, fitted=loaded.problem.sets)
+        contents['calibration.yaml'] = kept.dump()
+        return contents
+    return contents | _set_aside(out)
+
+
+def _set_aside(out: Path) -> dict[str, bytes]:
+    """Return the calibration that was accepted earlier, if any, under another name."""
+    earlier = out / 'calibration.yaml'
+    return {'calibration.previous.yaml': earlier.read_bytes()} if earlier.exists() else {}

@@ -9,13 +9,9 @@ from pathlib import Path
 from calib_ros.errors import InputError
 
 BEGINNINGS = (
-    (b'\x89MCAP', 'bag'),
-    (b'SQLite format 3', 'bag'),
-    (b'\x28\xb5\x2f\xfd', 'bag'),
-    (b'\x89PNG', 'image'),
-    (b'\xff\xd8\xff', 'image'),
-    (b'%PDF', 'report'),
-    (b'<!doctype html', 'report'),
+    *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
+    *((mark, 'image') for mark in (b'\x89PNG', b'\xff\xd8\xff')),
+    *((mark, 'report') for mark in (b'%PDF', b'<!doctype html')),
     (b'<', 'urdf'),
 )
 SUFFIXES = {
@@ -40,6 +36,10 @@ WORDS = {
 }
 
 
+def _by_suffix(name: str) -> str:
+    return SUFFIXES.get(Path(name).suffix.lower(), '')
+
+
 def kind_of(path: Path) -> str:
     """Return a key of `WORDS`, or an empty text where nothing tells."""
     if path.is_dir():
@@ -60,10 +60,6 @@ def kind_of(path: Path) -> str:
             if b'points:' in file.read(100_000):
                 return 'program'
     return kind
-
-
-def _by_suffix(name: str) -> str:
-    return SUFFIXES.get(Path(name).suffix.lower(), '')
 
 
 def proposal(path: Path) -> str | None:

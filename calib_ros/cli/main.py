@@ -11,7 +11,9 @@ not pass; 130 interrupted.
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
+import shlex
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -21,10 +23,41 @@ from typing import Any
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
-from calib_ros.cli.command import GROUPS, TEXTS
-from calib_ros.cli.screen import Screen, help_width
+from calib_ros.cli.screen import Screen, help_width, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, shortened, trouble
 
+GROUPS = {
+    'First steps': {
+        'chain': 'print the chain file of a robot, to read and to edit',
+        'demo': 'simulate an arm, identify it, and compare the result with the truth',
+        'robots': 'list the arms that come with calib_ros',
+        'simulate': 'write the bag of a simulated robot cell, with the true chain',
+    },
+    'Before measuring': {
+        'board': 'print a board for cameras, as PDF in its true size',
+        'images': 'find the corners of a board in photographs',
+        'plan': 'choose the poses to measure, and say how accurate they make',
+    },
+    'Calibrate': {
+        'fleet': 'identify what is new of all robots of a plant, and tell which ones changed',
+        'history': 'list results over time',
+        'identify': 'identify the errors of an arm from a bag or a table of measured poses',
+        'verify': 'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
+    },
+    'Use the calibration': {
+        'compare': 'test what has changed between two calibrations of one robot',
+        'compensate': 'correct the joint values of a program by a calibration',
+        'export': 'write a calibration in the forms that controllers and others read',
+        'workspace': 'map errors over the workspace, and place a task where they are least',
+    },
+    'Convert files': {
+        'bag2csv': 'write the poses of a bag as a table',
+        'csv2bag': 'write a table of measured poses as a bag',
+        'import': 'write a table of others as one of ours',
+    },
+}
+"""Commands by the groups of the overview, and what they do."""
+TEXTS = {name: text for group in GROUPS.values() for name, text in group.items()}
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
     ('calib_ros robots', 'the arms that are known'),
@@ -40,7 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         options = _options(given)
-        status: int = options.run(options, Screen(options.quiet))
+        options.typed = shlex.join(('calib_ros', *given))
+        module, function = options.home.split('.')
+        run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
+        status: int = run(options, Screen(options.quiet))
         sys.stdout.flush()
     except BrokenPipeError:  # whoever read it has enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -97,30 +133,26 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
         if name not in given:
             names.add_parser(name, add_help=False)
             continue
-        command = COMMANDS[name]
+        home, add = COMMANDS[name]
         added = names.add_parser(
             name,
             add_help=False,
             description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', help_width()),
-            epilog=_foot(examples_of(name)),
+            epilog='\n'.join(['examples:', *map(_example, examples_of(name))]),
             formatter_class=_Help,
         )
-        added.set_defaults(run=command.run)
-        command.add(added)
-        more = added.add_argument_group('on the screen')
-        more.add_argument(
-            '--quiet', action='store_true', help='only warnings, errors and what is asked for'
-        )
-        more.add_argument('-h', '--help', action='help', help='this text')
+        added.set_defaults(home=home)
+        add(added)
+        add_more = added.add_argument_group('on the screen').add_argument
+        text = 'only warnings, errors and what is asked for'
+        add_more('--quiet', action='store_true', help=text)
+        add_more('-h', '--help', action='help', help='this text')
     return parser
 
 
-def _foot(examples: Iterable[str]) -> str:
-    lines = ['examples:']
-    for each in examples:
-        parts = textwrap.wrap(f'calib_ros {each}', help_width() - 8, break_on_hyphens=False)
-        lines.append('  ' + ' \\\n      '.join(parts))
-    return '\n'.join(lines)
+def _example(words: str) -> str:
+    parts = textwrap.wrap(f'calib_ros {words}', help_width() - 8, break_on_hyphens=False)
+    return '  ' + ' \\\n      '.join(parts)
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -130,11 +162,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=26, width=help_width())
 
     def add_usage(
-        self,
-        usage: str | None,
-        actions: Iterable[argparse.Action],
-        groups: Iterable[Any],
-        prefix: str | None = None,
+        self, usage: Any, actions: Iterable[argparse.Action], groups: Any, prefix: Any = None
     ) -> None:
         """Show what must be given; the rest are options."""
         words = ['usage:', self._prog]
@@ -172,12 +200,8 @@ def _overview() -> str:
         lines += ['', f'{group}:']
         for name, text in entries.items():
             head = f'  {name:12}'
-            lines.append(
-                textwrap.fill(text, help_width(), initial_indent=head, subsequent_indent=' ' * 14)
-            )
-    lines += ['', 'The way:']
-    for command, words in WAY:
-        lines.append(f'  {command:45}{words}'.rstrip())
+            lines.append(wrapped(text, head, ' ' * 14, help_width()))
+    lines += ['', 'The way:', *(f'  {command:45}{words}'.rstrip() for command, words in WAY)]
     lines += ['', '`calib_ros COMMAND --help` tells the options of a command, with examples.']
     return '\n'.join(lines)
 

@@ -18,12 +18,12 @@ from calib_ros.atomic import write_together
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.waypoints import joints_csv, read_joints
+from calib_ros.files.programs import joints_csv, read_joints
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told
-from calib_ros.report.maps import plan_report
+from calib_ros.report.applied import plan_report
 
 TESTS = (
     'P1 to P5 of ISO 9283 in a cube of {:.3f} m, one orientation: go to them in turn, 30 times, '
@@ -53,20 +53,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             joints, words, plan = _measurement(options, design, visibility, rng, work)
     screen.say(words)
     if chain.tool is None:
-        x, y, z = ASSUMED_TOOL
-        screen.say(
-            f'the tool is unknown: the target is assumed at {x:g} {y:g} {z:g} m from the flange'
-        )
+        place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
+        screen.say(f'the tool is unknown: the target is assumed at {place} m from the flange')
     if options.out is not None:
         page = _page_beside(options.out)
-        report = plan_report(
-            design.chain,
-            joints,
-            words,
-            given.origin_of(options, (options.candidates, options.task, options.taken)),
-            plan,
-            options.accuracy,
-        )
+        origin = given.origin_of(options, (options.candidates, options.task, options.taken))
+        report = plan_report(design.chain, joints, words, origin, plan, options.accuracy)
         pages = given.page_of(report, screen, page.name)
         beside = {options.out.with_name(name): text for name, text in pages.items()}
         write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
@@ -87,10 +79,8 @@ def _measurement(
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
     if options.taken is not None:
         design = design.after(read_joints(options.taken, design.chain))
-    if options.task is None:
-        task = design.chain.random_joints(300, rng)
-    else:
-        task = read_joints(options.task, design.chain)
+    chain = design.chain
+    task = read_joints(options.task, chain) if options.task else chain.random_joints(300, rng)
     if options.candidates is None:
         candidates = draw_candidates(design, options.draw, rng, visibility)
     else:
@@ -101,8 +91,7 @@ def _measurement(
     choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
     needed = chosen = None
     if options.accuracy is not None:
-        wanted = 1e-3 * options.accuracy
-        fewest = planning.fewest(design, candidates, task, wanted, **choice)
+        fewest = planning.fewest(design, candidates, task, 1e-3 * options.accuracy, **choice)
         needed = len(fewest)
         chosen = fewest if options.poses in (None, needed) else None
     count = options.poses or needed or 25
@@ -113,7 +102,6 @@ def _measurement(
 
 
 def _check(options: argparse.Namespace) -> None:
-    """Refuse options of `plan` that make no sense."""
     for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
         if options.iso9283 and getattr(options, name) is not None:
             raise InputError(f'--{name} is of no use with --iso9283')
@@ -127,5 +115,4 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _page_beside(path: Path) -> Path:
-    """Return where the report of a plan is."""
     return path.with_name(f'{path.stem}.report.html')

@@ -69,17 +69,15 @@ class Screen:
             return
         width = max(len(name) for name, _ in rows) + 4
         for name, value in rows:
-            head = f'  {name}'.ljust(width)
-            print(_wrapped(value, head, ' ' * width, _width(sys.stdout)))
+            _print(value, f'  {name}'.ljust(width))
 
     def bullet(self, text: str, steps: Sequence[str] = ()) -> None:
         """Print a reason or a note, and what to do, in steps if there are several."""
         if self.quiet:
             return
-        print(_wrapped(text, '- ', '  ', _width(sys.stdout)))
+        _print(text, '- ')
         for k, step in enumerate(steps):
-            head = f'  {k + 1}. ' if len(steps) > 1 else '  -> '
-            print(_wrapped(step, head, ' ' * len(head), _width(sys.stdout)))
+            _print(step, f'  {k + 1}. ' if len(steps) > 1 else '  -> ')
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
@@ -137,15 +135,15 @@ class Work(Progress):
         with progress.Progress(*columns, console=console, transient=True) as bar:
             task = bar.add_task('', total=None, told='')
             while True:
-                bar.update(
-                    task,
-                    description=_printable(self.words),
-                    total=1.0 if 0.0 < self.share < 1.0 else None,
-                    completed=self.share,
-                    told=self.times,
-                )
+                total = 1.0 if 0.0 < self.share < 1.0 else None
+                shown: dict[str, Any] = {'description': _printable(self.words), 'told': self.times}
+                bar.update(task, total=total, completed=self.share, **shown)
                 if self.done.wait(FIRST_S / 5):
                     break
+
+
+def _print(text: str, head: str) -> None:
+    print(wrapped(text, head, ' ' * len(head), _width(sys.stdout)))
 
 
 def _console(stream: TextIO) -> Any:
@@ -166,7 +164,6 @@ def _rich_text(text: str, style: str = '') -> Any:
 
 
 def _width(stream: TextIO) -> int:
-    """Return how many columns a line may have."""
     return min(shutil.get_terminal_size((WIDTH, 24)).columns, 100) if stream.isatty() else WIDTH
 
 
@@ -181,19 +178,13 @@ def _printable(text: str) -> str:
 
 def _fitted(line: str, indent: str, stream: TextIO) -> str:
     """Return a line as a terminal takes it; in a file it stays one."""
-    return _wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
+    return wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
 
 
-def _wrapped(text: str, head: str, indent: str, width: int) -> str:
+def wrapped(text: str, head: str, indent: str, width: int) -> str:
+    """Return a text behind a head, in lines of so many columns, but for longer words."""
     text = _printable(text)
     if len(head) + len(text) <= width and '\n' not in text:
         return head + text
-    return textwrap.fill(
-        text,
-        width,
-        initial_indent=head,
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-        drop_whitespace=True,
-    )
+    whole: dict[str, Any] = {'break_long_words': False, 'break_on_hyphens': False}
+    return textwrap.fill(text, width, initial_indent=head, subsequent_indent=indent, **whole)

@@ -12,15 +12,15 @@ from calib_ros.cli import given, options as common
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.rows import verified
-from calib_ros.files.waypoints import read_joints
+from calib_ros.files.history import verified
+from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import calibration_file
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
+from calib_ros.report.applied import STANDINGS, verification_report
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verified import STANDINGS, verification_report
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
@@ -40,24 +40,14 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     nominal = load_chain(options.chain)
     arm = given.calibration_of(options.calibration, 'verify', nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
-    commanded = None
-    if options.commanded is not None:
-        commanded = read_joints(options.commanded, nominal)
+    commanded = read_joints(options.commanded, nominal) if options.commanded else None
+    tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
+    confidence, moved = options.confidence, (options.new_base, options.new_tool)
     with screen.work('judging') as work:
-        found = verify(
-            arm,
-            sets,
-            None if options.tolerance is None else 1e-3 * options.tolerance,
-            options.confidence,
-            options.new_base,
-            commanded,
-            options.new_tool,
-            work,
-        )
+        found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)
     if history is not None:
-        judged_by = (options.tolerance, options.confidence, options.new_base, options.new_tool)
-        hashed = table_hash(arm.chain)
-        about = given.filing_of(options, nominal, sets, options.measured, hashed, *judged_by)
+        judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved)
+        about = given.filing_of(options, nominal, sets, options.measured, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)
@@ -68,9 +58,8 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report') as work:
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
-        report = verification_report(
-            arm.chain, found, poses, given.origin_of(options, read), warnings
-        )
+        origin = given.origin_of(options, read)
+        report = verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['verification.txt'] = f'{in_words(found)}\n'
         contents |= given.page_of(report, screen, pdf=options.pdf)
@@ -80,12 +69,12 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
 def show(found: Verification, screen: Screen) -> None:
     """Print a verdict, six rows, the poses if they are few, and what to do."""
     before, after = found.comparison.figures
-    orientation = 'not measured'
+    orientation, tolerance = 'not measured', 'none given (--tolerance MM)'
     if before.rms_mrad is not None and after.rms_mrad is not None:
         orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
-    tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
+    interval = f'RMS {1e3 * found.lower:.4f} to {1e3 * found.upper:.4f} mm over poses like these'
     state, steps = STANDINGS[found.verdict]
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     screen.table(
@@ -94,10 +83,7 @@ def show(found: Verification, screen: Screen) -> None:
             ('position error', f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm'),
             ('largest', f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm'),
             ('orientation error', orientation),
-            (
-                f'{100.0 * found.confidence:g} % sure',
-                f'RMS {1e3 * found.lower:.4f} to {1e3 * found.upper:.4f} mm over poses like these',
-            ),
+            (f'{100.0 * found.confidence:g} % sure', interval),
             ('tolerance', tolerance),
         )
     )

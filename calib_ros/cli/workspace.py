@@ -13,12 +13,12 @@ from calib_ros.apply.workspace import Spread, Survey, in_base, regions, task_of
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.waypoints import csv_of, joints_csv, read_poses
+from calib_ros.files.programs import csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report.maps import workspace_report
-from calib_ros.report.markdown import markdown
+from calib_ros.report.applied import workspace_report
+from calib_ros.report.page import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
@@ -67,7 +67,6 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
 
 
 def _show(survey: Survey, screen: Screen) -> None:
-    """Print six rows."""
     rows = [('position error', f'at {len(survey.joints)} random poses of the joint range')]
     for label, errors in survey.parts.items():
         s = Spread.of(1e3 * errors)

@@ -2,13 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder in which a node keeps the journals and calibrations of one robot.
 
-Rows that cannot be written, because the disk is full say, wait in memory until they can be.
+A journal has every sample at once, in a table that can be identified by itself. A row is written
+by one call, so that a process that is killed leaves whole rows; a row that a crash of the machine
+cut off is left out when the journal is read again. Rows that cannot be written, because the disk
+is full say, wait in memory until they can be. A sample that is taken back gets a second row,
+marked `removed`; nothing is ever deleted.
 """
 
 from __future__ import annotations
 
+import codecs
+import csv
+import fcntl
+import io
+import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,11 +26,92 @@ from urllib.parse import quote
 
 from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
-from calib_ros.files.journal import Journal
-from calib_ros.files.tables import read_journal
+from calib_ros.files.tables import cells, columns, read_journal
 from calib_ros.sampling.sample import Sample
 
 CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
+
+
+class Journal:
+    """An open journal, which only grows and which no other process can open meanwhile.
+
+    The file is made if there is none, else rows are added.
+    """
+
+    def __init__(self, path: Path, joints: int) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.path = path
+        self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            self._lock()
+            self._begin(columns(joints))
+        except BaseException:
+            self.close()
+            raise
+
+    def add(self, sample: Sample, removed: bool = False) -> None:
+        """Write a sample, or that it was taken back; what is there stays whole."""
+        self._write(cells(sample, 'removed' if removed else None))
+
+    @property
+    def gone(self) -> bool:
+        """Tell whether the file was deleted, moved or replaced, so that nobody finds its rows."""
+        try:
+            return not os.path.samestat(os.stat(self.path), os.fstat(self._file))
+        except FileNotFoundError:
+            return True
+
+    @property
+    def content(self) -> bytes:
+        """Return what was written, wherever the file is now."""
+        return os.pread(self._file, os.fstat(self._file).st_size, 0)
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _lock(self) -> None:
+        try:  # until the file is closed or the process has ended
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f'{self.path} is being written by another process: give each robot a serial or '
+                'a data_dir of its own'
+            ) from None
+        except OSError:  # a file system without locks: a journal without one is better than none
+            return
+
+    def _begin(self, header: Sequence[str]) -> None:
+        """Write the header into a new file; leave out what a crash cut off."""
+        expected = ','.join(header).encode() + b'\n'
+        found = os.pread(self._file, len(expected), 0)
+        plain = found.removeprefix(codecs.BOM_UTF8).replace(b'\r', b'')
+        if plain != found and expected.startswith(plain):
+            raise InputError(
+                f'{self.path} was saved by another program (a byte order mark, or lines that end '
+                'in CR LF), so no rows can be added: save it without these, or move it. calib_ros '
+                'identify reads it as it is'
+            )
+        if not expected.startswith(found):
+            raise InputError(
+                f"{self.path} does not have this robot's columns: move it, or choose another "
+                'data_dir'
+            )
+        if found != expected:
+            os.ftruncate(self._file, 0)
+            self._write(header)
+            return
+        os.ftruncate(self._file, self.content.rfind(b'\n') + 1)  # the header ends a line
+
+    def _write(self, row: Sequence[str]) -> None:
+        text = io.StringIO()
+        csv.writer(text).writerow(row)  # by its own end of lines it quotes names with any
+        data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
+        begin = os.fstat(self._file).st_size
+        written = os.write(self._file, data)
+        if written < len(data):  # the disk is full: no half row may stay
+            os.ftruncate(self._file, begin)
+            raise OSError(f'{self.path}: the disk is full, the pose was not written')
 
 
 class Archive:
@@ -37,7 +127,8 @@ class Archive:
         self.folder = folder
         self.error = ''
         """Why poses are in memory only; empty while all are in the journal."""
-        self._robot = _file_name(robot)
+        words = (re.sub(r'[^\w.-]', _quoted, each) for each in robot.split('/', 1))
+        self._robot = short_name('_'.join(words))  # no two robots alike
         self._joints = joints
         self._configuration = configuration
         self._journal: Journal | None = None
@@ -195,7 +286,6 @@ class Archive:
         return self.folder / f'{self._robot}_{digits[:8]}T{digits[8:]}Z{ending}'
 
     def _dated(self) -> list[tuple[str, str, Path]]:
-        """Return the digits of the times of this robot's files, their endings and paths."""
         name = re.compile(rf'{re.escape(self._robot)}_([0-9]{{8}})T([0-9]{{12}})Z(.*)')
         found = ((name.fullmatch(path.name), path) for path in self.folder.glob('*'))
         return [(match[1] + match[2], match[3], path) for match, path in found if match]
@@ -206,12 +296,5 @@ class Archive:
         return [path for path in mine if path.stat().st_size]
 
 
-def _file_name(robot: str) -> str:
-    """Return how the files of a robot begin: no two names of a chain's robots alike.
-
-    What no file name may hold is quoted as in URLs.
-    """
-    parts = (
-        re.sub(r'[^\w.-]', lambda c: quote(c[0], safe=''), each) for each in robot.split('/', 1)
-    )
-    return short_name('_'.join(parts))
+def _quoted(found: re.Match[str]) -> str:
+    return quote(found[0], safe='')

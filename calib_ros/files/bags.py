@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache, partial
@@ -13,17 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import InputError, UnknownNameError, shortened
+from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
-from calib_ros.files.salvage import (
-    NOT_CLOSED,
-    Salvage,
-    check,
-    named,
-    recorded,
-    salvage,
-    unpacked_files,
-)
-from calib_ros.files.stored import LARGEST_MESSAGE, largest, read
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.hints import Account
@@ -68,16 +59,14 @@ class Replayed:
         if self.recorded is None and largest_loss < 1.0:
             text = f'how much of the bag is lost is not known, {ALLOW} 1'
             return (Reason(Rule.UNKNOWN_LOSS, text),)
-        share = _share(self.recorded, self.read)
+        share = _lost(self.recorded, self.read)
         lost = {'of the messages could not be read': (Rule.UNREADABLE, share)}
-        for name, all_of_them in ((JOINTS, account.joint_states), (POSES, account.poses)):
-            dropped = sum(
-                count
-                for cause, count in account.dropped.items()
-                if cause.startswith(name) and _LOSS.search(cause) and not _TWICE.search(cause)
-            )
+        for name, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
+            causes = (each for each in account.dropped if each.startswith(name))
+            causes = (each for each in causes if _LOSS.search(each) and not _TWICE.search(each))
             cause = f'of the {name} were dropped for their stamps or for want of room'
-            lost[cause] = (Rule.DROPPED, _share(all_of_them, all_of_them - dropped))
+            left = count - sum(account.dropped[each] for each in causes)
+            lost[cause] = (Rule.DROPPED, _lost(count, left))
         return tuple(
             Reason(rule, f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}')
             for cause, (rule, share) in lost.items()
@@ -85,8 +74,7 @@ class Replayed:
         )
 
 
-def _share(expected: int | None, found: int) -> float:
-    """Return the share that is missing."""
+def _lost(expected: int | None, found: int) -> float:
     return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
@@ -106,7 +94,7 @@ def replay(path: Path, session: CalibrationSession, told: Told = nobody) -> Repl
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
     session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
-    with unpacked_files(path) as folder:
+    with stored.unpacked_files(path) as folder:
         return _replay(path, folder, session, told)
 
 
@@ -116,40 +104,36 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -
     try:
         reader = _opened(path, folder)
     except InputError:
-        found = salvage(folder)
+        found = stored.salvage(folder)
         if found is None:
             raise
         return _salvaged(path, folder, found, session)
     with closing(reader):
-        available = named((c.topic, c.msgtype) for c in reader.connections)
+        available = stored.named((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
-        streams, deserialise = _chosen(session, available, partial(read, reader), defined)
+        streams, deserialise = _chosen(session, available, partial(stored.read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
-        count, problem = _feed(
-            session,
-            read(reader, streams),
-            deserialise,
-            lambda count: told(count / max(expected, count, 1)),
-        )
+        messages = stored.read(reader, streams)
+        count, problem = _feed(session, messages, deserialise, told, expected)
     if problem is not None and count == 0:
-        found = salvage(folder)
+        found = stored.salvage(folder)
         if found is not None:
             _check_joints(session, streams, found.on, deserialise)
             count, _ = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
-    if problem is None:
-        return Replayed(expected, count, session.warnings)
-    lost = max(0, expected - count)
-    damaged = f'{path} is damaged ({shortened(problem)}): {lost} of {expected} messages are lost'
-    return Replayed(expected, count, (*session.warnings, damaged))
+    warnings = session.warnings
+    if problem is not None:
+        lost = f'{max(0, expected - count)} of {expected} messages are lost'
+        warnings = (*warnings, f'{path} is damaged ({shortened(problem)}): {lost}')
+    return Replayed(expected, count, warnings)
 
 
 def _opened(path: Path, folder: Path) -> Any:
     """Return the library's reader of the files in a folder, those of the bag at a path."""
     library = rosbag2()
     try:
-        check(folder)
+        stored.check(folder)
         reader = library.Reader(folder)
         reader.open()
     except Exception as err:  # a damaged file fails in many ways, in the library and below it
@@ -157,25 +141,24 @@ def _opened(path: Path, folder: Path) -> Any:
     return reader
 
 
-def _salvaged(path: Path, folder: Path, found: Salvage, session: CalibrationSession) -> Replayed:
-    """Feed what could be read of a bag without the library."""
+def _salvaged(
+    path: Path, folder: Path, found: stored.Salvage, session: CalibrationSession
+) -> Replayed:
     streams, deserialise = _chosen(session, found.topics, found.on, {})
     count, problem = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     problem = problem or found.problem
-    total = recorded(folder if folder.is_dir() else folder.parent)
+    total = stored.recorded(folder if folder.is_dir() else folder.parent)
     if total is None and found.whole:
         total = found.count
-    if not problem and total == found.count:
-        return Replayed(total, found.count, session.warnings)
-    lost = 'how many are lost is not known'
-    if total is not None and not (total == found.count and problem == NOT_CLOSED):
-        lost = f'{max(0, total - found.count)} of {total} messages are lost'
-    damaged = (
-        f'{path} is damaged ({shortened(problem)}): {count} messages could be read and are used, '
-        f'{lost}'
-    )
-    return Replayed(total, found.count, (*session.warnings, damaged))
+    warnings = session.warnings
+    if problem or total != found.count:
+        lost = 'how many are lost is not known'
+        if total is not None and not (total == found.count and problem == stored.NOT_CLOSED):
+            lost = f'{max(0, total - found.count)} of {total} messages are lost'
+        used = f'{count} messages could be read and are used, {lost}'
+        warnings = (*warnings, f'{path} is damaged ({shortened(problem)}): {used}')
+    return Replayed(total, found.count, warnings)
 
 
 def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
@@ -186,12 +169,12 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
     deserialise = _deserialiser({})
-    with unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
+    with stored.unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
         found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}
         if topic and topic not in found:
             raise UnknownNameError(f'topic of images in {path}', topic, found)
         if len(found) != 1 and not topic:
-            names = ', '.join(found) or f'{" or ".join(PICTURES)}'
+            names = ', '.join(found) or ' or '.join(PICTURES)
             problem = 'several topics of images, choose one with --topic' if found else 'no'
             raise InputError(f'{path} has {problem}: {names}')
         wanted = [found[topic]] if topic else list(found.values())
@@ -230,7 +213,6 @@ def _check_joints(
     messages_on: Reading,
     deserialise: Deserialise,
 ) -> None:
-    """Refuse several topics of the same joints, unless they were named."""
     joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
     if len(joints) > 1 and not session.settings.joint_topics:
         check_joints(_decodable(messages_on)(joints), session.joint_names, deserialise)
@@ -275,8 +257,8 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
     for kind, (form, text) in defined.items():
         idl = form == MessageDefinitionFormat.IDL
         try:
-            if len(text) > LARGEST_MESSAGE:
-                raise ValueError(f'it has more than {LARGEST_MESSAGE} characters')
+            if len(text) > stored.LARGEST_MESSAGE:
+                raise ValueError(f'it has more than {stored.LARGEST_MESSAGE} characters')
             found = get_types_from_idl(text) if idl else get_types_from_msg(text, kind)
             store.register({k: each for k, each in found.items() if k not in store.fielddefs})
         except Exception as err:  # a damaged definition fails in many ways
@@ -300,7 +282,7 @@ def _decoded(store: Any, data: bytes, kind: str) -> Any:
 
 def _is_message(stream: Stream, data: object) -> bool:
     """Tell whether it may be a message: a file may hold anything."""
-    return isinstance(data, bytes) and len(data) <= largest(stream)
+    return isinstance(data, bytes) and len(data) <= stored.largest(stream)
 
 
 def _decodable(messages_on: Reading) -> Reading:
@@ -312,9 +294,10 @@ def _feed(
     session: CalibrationSession,
     messages: Iterator[tuple[Stream, bytes]],
     deserialise: Deserialise,
-    told: Callable[[int], None] = lambda count: None,
+    told: Told = nobody,
+    expected: int = 0,
 ) -> tuple[int, str | None]:
-    """Feed serialised messages, and tell how many so far; return that and what is wrong if any."""
+    """Feed serialised messages, telling of their share; return how many, and what is wrong."""
     count, problem = 0, None
     for batch, err in batches(messages):
         if err is not None:
@@ -323,8 +306,10 @@ def _feed(
         problems = feed(session, usable, deserialise)
         count += len(usable) - len(problems)
         if len(usable) < len(batch):
-            problems.append(f'messages without data, or of more than {LARGEST_MESSAGE} bytes')
+            problems.append(
+                f'messages without data, or of more than {stored.LARGEST_MESSAGE} bytes'
+            )
         problem = (problem, *problems)[-1]
-        told(count)
+        told(count / max(expected, count, 1))
     session.finish()
     return count, problem

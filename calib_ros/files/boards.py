@@ -26,18 +26,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
-from calib_ros.escapes import to_cell
 from calib_ros.files.columns import check_quaternions
 from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import joint_columns
-from calib_ros.files.waypoints import POSE
+from calib_ros.files.programs import POSE
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
-from calib_ros.texts import csv_text, parse_yaml, read_text
+from calib_ros.texts import csv_text, parse_yaml, read_text, to_cell
 from calib_ros.values import parse_mapping, parse_number
 
 TYPES = ('charuco', 'markers')
@@ -114,7 +114,6 @@ class Board:
 
 
 def _grid(columns: int, rows: int) -> NDArray[np.intp]:
-    """Return the places (columns * rows, 2) on a board, row by row."""
     return np.column_stack([each.ravel() for each in np.meshgrid(range(columns), range(rows))])
 
 
@@ -127,15 +126,9 @@ def read_board(path: Path) -> Board:
             raise ConfigError(f'{path}: {key} must be a whole number, not {content[key]!r}')
     if not isinstance(content.get('legacy', False), bool):
         raise ConfigError(f'{path}: legacy must be true or false, not {content["legacy"]!r}')
-    return Board(
-        str(content['type']),
-        content['columns'],
-        content['rows'],
-        parse_number(content['square'], f'{path}: square'),
-        parse_number(content['marker'], f'{path}: marker'),
-        str(content['dictionary']),
-        content.get('legacy', False),
-    )
+    sizes = {key: parse_number(content[key], f'{path}: {key}') for key in ('square', 'marker')}
+    texts = {key: str(content[key]) for key in ('type', 'dictionary')}
+    return Board(**content | sizes | texts)
 
 
 def read_lens(path: Path) -> Lens:
@@ -162,8 +155,8 @@ def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], wh
         raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
     if any(distortion[5:]):
         raise ConfigError(f'{where}: of distortion only k1 k2 p1 p2 k3 are known')
-    k1, k2, p1, p2, k3 = (*distortion[:5], *(0.0,) * (5 - len(distortion[:5])))
-    return Lens(fx, fy, cx, cy, k1, k2, p1, p2, k3)
+    distorted: dict[str, Any] = dict(zip(LENS_KINDS[4:], distortion, strict=False))
+    return Lens(fx, fy, cx, cy, **distorted)
 
 
 def _numbers(
@@ -210,7 +203,7 @@ def read_detections(path: Path, board: Board) -> Detections:
             f'{corner[row]}'
         )
     _, first = np.unique(image * most + corner, return_index=True)
-    for row in np.setdiff1d(np.arange(len(image)), first)[:1].tolist():
+    for row in np.delete(np.arange(len(image)), first)[:1].tolist():
         raise InputError(
             f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]} is there '
             'already'

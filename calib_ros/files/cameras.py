@@ -20,8 +20,6 @@ from calib_ros.sampling.messages import Source, parse_sources
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
 
-NO_INFO = Refusal('before any CameraInfo', 'no CameraInfo of it has come')
-
 
 class BoardCamera:
     """Finds a board, which its source names, in the images of that source."""
@@ -30,7 +28,8 @@ class BoardCamera:
         self._source = source
         self._board = read_board(Path(source.board).expanduser())
         self._detector = Detector(self._board)
-        self._lens: Lens | Refusal = NO_INFO
+        reason = 'no CameraInfo of it has come'
+        self._lens: Lens | Refusal = Refusal('before any CameraInfo', reason)
         self._size = (0, 0)
 
     def learn(self, info: Any) -> None:
@@ -74,13 +73,11 @@ def lens_in(info: Any) -> Lens:
 
 def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
     """Return the cameras among sources, by the topics of their images."""
-    cameras = {}
-    for source in parse_sources(texts):
-        if source.board:
-            if 'image_rect' in source.topic.rpartition('/')[2]:
-                raise ConfigError(
-                    f'source "{source.topic}": CameraInfo describes the image before it is '
-                    'rectified, give that (image_raw)'
-                )
-            cameras[source.topic] = BoardCamera(source)
-    return cameras
+    sources = [source for source in parse_sources(texts) if source.board]
+    for source in sources:
+        if 'image_rect' in source.topic.rpartition('/')[2]:
+            raise ConfigError(
+                f'source "{source.topic}": CameraInfo describes the image before it is '
+                'rectified, give that (image_raw)'
+            )
+    return {source.topic: BoardCamera(source) for source in sources}

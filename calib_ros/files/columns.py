@@ -5,7 +5,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
@@ -14,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
-from calib_ros.escapes import from_cell
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
+from calib_ros.texts import from_cell
 from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, parse_number
 
 Row = tuple[int, Sequence[str]]
@@ -38,7 +40,7 @@ class Columns:
         """Return the place of a cell in words."""
         return f'{self.path}, line {self.lines[row]}: {name}'
 
-    def _no_number(self, row: int, name: str, text: str) -> InputError:
+    def _no_number(self, row: int, name: str, text: str = '') -> InputError:
         return InputError(
             f'{self.where(row, name)} must be a finite number, not {text!r}: mend that row, or '
             'leave it out'
@@ -50,24 +52,9 @@ class Columns:
         Many columns at once take hardly longer than one. Errors name them as they are `called`.
         """
         found = self._numbers(names)
-        if found is not None:
-            return found
-        parsed = np.full((len(self.lines), len(names)), np.nan)
-        first: tuple[int, int, str] | None = None
-        for k, name in enumerate(names):
-            texts = self.texts(name)
-            for row, text in enumerate(texts[: first[0]] if first else texts):
-                try:
-                    parsed[row, k] = float(text) if text else np.nan
-                except ValueError:
-                    parsed[row, k] = np.inf
-                if text and not np.isfinite(parsed[row, k]):
-                    first = (row, k, text)
-                    break
-        if first is not None:
-            row, k, text = first
-            raise self._no_number(row, (called or names)[k], text)
-        return parsed
+        for row, k in np.argwhere(np.isinf(found))[:1].tolist():
+            raise self._no_number(row, (called or names)[k], self.texts(names[k])[row])
+        return found
 
     def block(
         self,
@@ -86,7 +73,7 @@ class Columns:
             nothing = np.isnan(found)
             lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
-                raise self._no_number(row, names[int(nothing[row].argmax())], '')
+                raise self._no_number(row, names[int(nothing[row].argmax())])
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
@@ -96,12 +83,9 @@ class Columns:
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """Return the integers (N,) of a column, for empty cells those given if any are."""
         texts = self.texts(name)
-        try:
-            found = np.array([int(text) for text in texts], dtype=np.int64)
-            if list(map(str, found.tolist())) == texts:
-                return found
-        except (ValueError, OverflowError):
-            pass
+        if re.fullmatch('(-?[0-9]{1,19},)*', ','.join([*texts, ''])):
+            with suppress(OverflowError):  # of which cell, is told below
+                return np.array(list(map(int, texts)), dtype=np.int64)
         numbers = [
             int(blank[row])
             if blank is not None and not text
@@ -120,7 +104,7 @@ class Columns:
 
     def blank(self, name: str) -> NDArray[np.bool_]:
         """Return (N,) which cells of a column are empty."""
-        raise NotImplementedError
+        return np.array([not text for text in self.texts(name)], dtype=bool)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -134,9 +118,12 @@ class Columns:
         """Return the number of each row's text, and the texts."""
         return numbered(self.texts(name))
 
-    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
-        """Return the numbers of columns, None where a cell may be none."""
-        raise NotImplementedError
+    def _numbers(self, names: Sequence[str]) -> FloatArray:
+        """Return the numbers (N, len(names)), infinite for what is none."""
+        found = np.zeros((len(self.lines), len(names)))
+        for k, name in enumerate(names):
+            found[:, k] = list(map(_number, self.texts(name)))
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +149,8 @@ class MadeColumns(Columns):
         )
 
     def blank(self, name: str) -> NDArray[np.bool_]:
-        """Return (N,) where a column holds nothing."""
-        if name in self.words:
-            return np.array([not word for word in self.words[name]], dtype=bool)
-        return np.isnan(self.values[name])
+        """Return (N,) which cells of a column are empty."""
+        return np.isnan(self.values[name]) if name in self.values else super().blank(name)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -173,19 +158,10 @@ class MadeColumns(Columns):
             return list(self.words[name])
         return ['' if value != value else repr(value) for value in self.values[name].tolist()]
 
-    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
-        found = np.zeros((len(self.lines), len(names)))
-        for k, name in enumerate(names):
-            words = self.words.get(name)
-            try:
-                found[:, k] = (
-                    self.values[name] if words is None else [float(w or 'nan') for w in words]
-                )
-            except ValueError:
-                return None
-            if not (np.isfinite(found[:, k]) | self.blank(name)).all():
-                return None
-        return found
+    def _numbers(self, names: Sequence[str]) -> FloatArray:
+        if set(names) <= set(self.values):
+            return np.array([self.values[name] for name in names]).T
+        return super()._numbers(names)
 
 
 def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColumns:
@@ -193,6 +169,15 @@ def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColu
     cells = zip_longest(header, *(row for _, row in rows), fillvalue='')
     words = {name: column for name, *column in cells}
     return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)
+
+
+def _number(text: str) -> float:
+    """Return the number in a cell, NaN for a blank one, infinity for anything else."""
+    try:
+        number = float(text or 'nan')
+    except ValueError:
+        return math.inf
+    return number if not text or math.isfinite(number) else math.inf
 
 
 def numbered(texts: Sequence[str]) -> Codes:

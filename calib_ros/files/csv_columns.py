@@ -70,20 +70,11 @@ class TextColumns(Columns):
         cells = np.frombuffer(self._data, dtype=np.uint8)[place]
         cells[beyond] = 0
         words = np.ascontiguousarray(cells).view(f'S{longest}').ravel()
-        numbers = np.full(len(words), -1, dtype=np.intp)
-        known: list[str] = []
-        first = 0
-        while len(known) < MOST_NAMES:
-            word = words[first]
-            numbers[words == word] = len(known)
-            known.append(bytes(word).decode())
-            rest = numbers[first:] < 0
-            if not rest.any():
-                return numbers, known
-            first += int(np.argmax(rest))
-        return numbered(self.texts(name))
+        runs = np.flatnonzero(np.append(True, words[1:] != words[:-1]))
+        numbers, known = numbered([word.decode() for word in words[runs].tolist()])
+        return np.repeat(numbers, np.diff(np.append(runs, len(words)))), known
 
-    def _numbers(self, names: Sequence[str]) -> FloatArray | None:
+    def _numbers(self, names: Sequence[str]) -> FloatArray:
         columns = [self.header.index(name) for name in names]
         blank = (np.diff(self._ends) == 1).reshape(-1, len(self.header))[:, columns]
         lacking = np.asarray(blank.any(axis=0))
@@ -97,10 +88,10 @@ class TextColumns(Columns):
         try:  # latin1 knows every byte, whatever the other columns hold
             read = np.loadtxt(rows, float, None, sep, usecols=use, ndmin=2, encoding='latin1')
         except (ValueError, OverflowError):
-            return None
+            return super()._numbers(names)
         finite = np.isfinite(read)
-        if not (finite.all() or (finite | blank[:, some]).all()):
-            return None
+        if not finite.all():
+            read[~finite & ~blank[:, some]] = np.inf
         if len(some) == len(names):
             return read
         found = np.full(blank.shape, np.nan)
@@ -108,7 +99,6 @@ class TextColumns(Columns):
         return found
 
     def _filled(self) -> bytes:
-        """Return the rows with NaN in empty cells."""
         sep = self._separator.encode()
         data = b'\n' + self._data[int(self._ends[0]) + 1 :]
         for _ in range(2):  # neighbours share a separator
@@ -116,7 +106,6 @@ class TextColumns(Columns):
         return data.replace(b'\n' + sep, b'\nnan' + sep).replace(sep + b'\n', sep + b'nan\n')
 
     def _places(self, name: str) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Return where the cells of a column begin and end."""
         k, width = self.header.index(name), len(self.header)
         return self._ends[k:-1:width] + np.int32(1), self._ends[k + 1 :: width]
 

@@ -62,7 +62,6 @@ def _dictionary(name: str) -> Any:
 
 
 def _halvings(image: Image) -> int:
-    """Return how often an image is halved at most."""
     return int(np.log2(max(*image.shape[:2], COARSE) / COARSE))
 
 
@@ -195,7 +194,6 @@ class Detector:
     def _judged(
         self, image: Image, corners: FloatArray, ids: NDArray[np.intp]
     ) -> Corners | Refusal:
-        """Return the corners of the board by its markers, or why they are not used."""
         number, pixels = self._corners(image, corners, ids)
         whole = len(self._board.corners)
         if len(number) < self._fewest:
@@ -228,7 +226,6 @@ class Detector:
         return np.asarray(flat).reshape(others.shape)
 
     def _charuco(self) -> Callable[[Image, FloatArray, NDArray[np.intp]], Corners]:
-        """Return what finds the corners between markers."""
         board, aruco = self._board, self._cv2.aruco
         size = (board.columns, board.rows)
         if self._new:
@@ -341,7 +338,6 @@ def detect(
 
 
 def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:
-    """Return the corners of markers as those of the board."""
     order = np.argsort(ids)
     number = (4 * ids[order, np.newaxis] + np.arange(4)).ravel()
     return number, corners[order].reshape(-1, 2)
@@ -363,5 +359,4 @@ def _nth(values: NDArray[Any], percent: float) -> float:
 
 
 def _area(points: FloatArray) -> float:
-    """Return the area that points (K, 2) spread over."""
     return float(np.sqrt(max(np.linalg.det(np.cov(points.T)), 0.0)))

@@ -28,14 +28,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import CalibrationError
-from calib_ros.escapes import from_cell, to_cell
 from calib_ros.identification.start import likened
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import csv_text, dump_yaml
+from calib_ros.texts import csv_text, dump_yaml, from_cell, to_cell
 from calib_ros.values import SAME
 
 FILES = (
@@ -44,6 +43,8 @@ FILES = (
 )
 CORRECTED_URDF = '_corrected.urdf'
 """End of the name of a corrected URDF beside these files."""
+TAIL = ('a', 'alpha', 'beta')
+"""What ends the row of a joint in the one convention, and begins that of the next in the other."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)
 
 
@@ -110,28 +111,22 @@ def converted(chain: Chain, convention: Convention) -> Chain:
     """Return the same arm by another convention; what is cut off goes into base and tool."""
     if chain.convention == convention:
         return chain
-    tails = [(joint.a, joint.alpha, joint.beta) for joint in chain.joints]
-    base, tool = chain.frame('base'), chain.frame('tool')
+    tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
+    none, base, tool = dict.fromkeys(TAIL, 0.0), chain.frame('base'), chain.frame('tool')
     if convention == 'modified':
-        tool = replace(tool, matrix=_tail(*tails[-1]) @ tool.matrix)
-        tails = [(0.0, 0.0, 0.0), *tails[:-1]]
+        tool = replace(tool, matrix=_tail(**tails[-1]) @ tool.matrix)
+        tails = [none, *tails[:-1]]
     else:
-        base = replace(base, matrix=base.matrix @ _tail(*tails[0]))
-        tails = [*tails[1:], (0.0, 0.0, 0.0)]
-    joints = tuple(
-        replace(joint, a=a, alpha=alpha, beta=beta)
-        for joint, (a, alpha, beta) in zip(chain.joints, tails, strict=True)
-    )
+        base = replace(base, matrix=base.matrix @ _tail(**tails[0]))
+        tails = [*tails[1:], none]
+    joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))
     frames: dict[str, Any] = {'base': base, 'tool': tool, 'frames': ()}
     return replace(chain, convention=convention, joints=joints, parallel=None, **frames)
 
 
 def _tail(a: float, alpha: float, beta: float) -> FloatArray:
-    """Return Tx(a) Rx(alpha) Ry(beta)."""
-    turn = se3.exp_rotation(np.array([alpha, 0.0, 0.0])) @ se3.exp_rotation(
-        np.array([0.0, beta, 0.0])
-    )
-    return se3.transform(turn, np.array([a, 0.0, 0.0]))
+    about_x, about_y = se3.exp_rotation(np.array([[alpha, 0.0, 0.0], [0.0, beta, 0.0]]))
+    return se3.transform(about_x @ about_y, np.array([a, 0.0, 0.0]))
 
 
 def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
@@ -143,10 +138,8 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
     names = (*chain.joint_names, 'flange')
     poses = {name: xyz_rpy(place) for name, place in zip(names, origins(form), strict=True)}
-    document: dict[str, Any] = {
-        'kinematics': poses,
-        'signs': {joint.name: joint.sign for joint in form.joints},
-    }
+    signs = {joint.name: joint.sign for joint in form.joints}
+    document: dict[str, Any] = {'kinematics': poses, 'signs': signs}
     digest = hashlib.sha256(dump_yaml(document).encode()).hexdigest()
     document['hash'] = f'sha256_{digest}'
     if origin:
@@ -182,7 +175,7 @@ def walked(
     places: Sequence[FloatArray], q: FloatArray, slides: Sequence[bool] | None = None
 ) -> FloatArray:
     """Return the poses (N, 4, 4) behind frames that turn about their z, or slide along it."""
-    pose = np.tile(np.eye(4), (len(q), 1, 1))
+    pose = np.eye(4)
     for k, place in enumerate(places):
         moved = np.tile(np.eye(4), (len(q), 1, 1))
         if slides is not None and slides[k]:
@@ -222,7 +215,6 @@ def urdf_foot(chain: Chain) -> str:
 
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
-    """Return the table of a chain with a line that says what it is."""
     rows = [
         (to_cell(each.name), each.type, each.sign, *(getattr(each, kind) for kind in DH_KINDS))
         for each in chain.joints
@@ -231,7 +223,6 @@ def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
 
 
 def _read_csv(text: str, form: Chain) -> Chain:
-    """Return a chain with the rows of a table, in the frames of another one."""
     joints = []
     for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
         kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'
@@ -261,14 +252,8 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
 
     `zero` stands for the joints' offsets. Base and tool are fitted as well.
     """
-    start = replace(
-        nominal,
-        parallel=(),
-        base=chain.frame('base'),
-        tool=chain.frame('tool'),
-        frames=(),
-        effects=(),
-    )
+    base, tool = chain.frame('base'), chain.frame('tool')
+    start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
     driven = {joint.driven for joint in start.joints}
     names = [
         name

@@ -26,6 +26,7 @@ from calib_ros.files.layouts import (
     WORDS,
     Expression,
     Layout,
+    joint_columns,
 )
 from calib_ros.files.sheets import Sheet, read_sheet
 from calib_ros.files.turns import finished
@@ -61,24 +62,25 @@ class Foreign:
     def convert(self, path: Path) -> tuple[MadeColumns, tuple[str, ...]]:
         """Return our columns of a table, and what was guessed and left out, in words."""
         table = _Table(path, self.layout, self.chain, self.log is None)
-        values, words, lines = table.values(), table.words(), table.lines
-        notes = table.notes
+        values, notes, lines = table.values(), table.notes, table.lines
         if self.log is not None:
             log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
-            joints = log.values()
+            values = log.values() | values
             if len(log.lines) != len(lines):
                 raise InputError(
                     f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: each '
                     'measurement needs the row of its joint values'
                 )
-            values = {**joints, **values}
             notes += [*log.notes, f'row by row, {self.log} holds the joint values of {path}']
-        made = MadeColumns(path, lines, values, words)
+        made = MadeColumns(path, lines, values, table.words())
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
-        made, left_out = _measured_only(made)
-        if left_out:
-            notes.append(left_out)
+        measured = [made.values[name] for name in MEASURED if name in made.values]
+        good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
+        if not good.all():
+            lines = made.lines[~good].tolist()
+            notes.append(f'nothing was measured in {lines_in_words(lines)}: left out')
+            made = made.select(good)
         return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 
 
@@ -97,37 +99,30 @@ def _place(name: str) -> tuple[int, int]:
 
 
 class _Table:
-    """One table while it is converted."""
-
     def __init__(
         self, path: Path, layout: Layout, chain: Chain | None, joints: bool, alone: bool = False
     ) -> None:
         self._path, self._layout, self._chain = path, layout, chain
         most = MOST_NAMES if chain is None else len(chain.joints)
-        self._ours = {
-            ours: theirs
-            for ours, theirs in layout.columns.items()
-            if (joints and int(ours[1:]) <= most if JOINT.fullmatch(ours) else not alone)
-        }
-        expressions = {
-            ours: Expression.parse(theirs)
-            for ours, theirs in self._ours.items()
-            if ours not in WORDS
-        }
-        self._optional = {
-            name
-            for ours, each in expressions.items()
-            if chain is None and JOINT.fullmatch(ours)
-            for name in each.names
-        }
-        needed = [n for each in expressions.values() for n in each.names]
-        needed += [_bare(self._ours[ours]) for ours in WORDS if ours in self._ours]
-        if chain is None:
-            first = expressions.get('q1')
-            firsts = set() if first is None else set(first.names)
-            needed = [n for n in needed if n not in self._optional or n in firsts]
+        self._ours: dict[str, str] = {}
+        expressions: dict[str, Expression] = {}
+        needed: dict[str, None] = {}
+        self._optional: set[str] = set()
+        for ours, theirs in layout.columns.items():
+            of_joint = JOINT.fullmatch(ours)
+            if not (joints and int(ours[1:]) <= most if of_joint else not alone):
+                continue
+            self._ours[ours] = theirs
+            names: tuple[str, ...] = (_bare(theirs),)
+            if ours not in WORDS:
+                expressions[ours] = Expression.parse(theirs)
+                names = expressions[ours].names
+            if chain is None and of_joint:  # as many as there are
+                self._optional |= {*names}
+            if chain is not None or not of_joint or ours == 'q1':
+                needed |= dict.fromkeys(names)
         own = _own_names(chain, joints, alone)
-        self._sheet: Sheet = read_sheet(path, layout, list(dict.fromkeys(needed)), list(own))
+        self._sheet: Sheet = read_sheet(path, layout, list(needed), list(own))
         self.notes = list(self._sheet.notes)
         self._expressions = self._completed(expressions, own)
         self.lines = self._sheet.columns.lines
@@ -136,23 +131,20 @@ class _Table:
         self, expressions: dict[str, Expression], own: dict[str, str]
     ) -> dict[str, Expression]:
         """Return the expressions with what the header calls by our names, or the chain's."""
-        kept = {}
-        absent = []
+        kept, absent, guessed = {}, [], []
         for ours, each in expressions.items():
             missing = [name for name in each.names if self._sheet.number(name) is None]
             if not missing:
                 kept[ours] = each
             elif not set(missing) <= self._optional:
                 raise InputError(
-                    f'{self._path} has no column {", ".join(missing)} for {ours}; it has '
-                    f'{", ".join(each for each in self._sheet.header if each)}'
+                    f'{self._path} has no column {", ".join(missing)} for {ours}; {self._has()}'
                 )
             else:
                 absent.append(f'{ours} ({", ".join(missing)})')
         if 0 < len(absent) <= 5:  # `q*=A*` stands for as many as there are
             self.notes.append(f'it has no {", ".join(absent)}: left out')
         lower = [name.lower() for name in self._sheet.header]
-        guessed = []
         for name, ours in own.items():
             if ours in kept or ours in self._ours or lower.count(name.lower()) != 1:
                 continue
@@ -168,24 +160,23 @@ class _Table:
         if guessed:
             self.notes.append(f'by the names of the joints, {", ".join(guessed)}')
         if self._chain is not None and any(re.fullmatch('q[0-9]+', ours) for ours in kept):
-            missing = [
-                f'q{k + 1}' for k in range(len(self._chain.joints)) if f'q{k + 1}' not in kept
-            ]
-            if missing:
+            names = joint_columns(len(self._chain.joints))
+            if missing := [name for name in names if name not in kept]:
                 raise InputError(
                     f'{self._path} has no column for {", ".join(missing)}: name it by --columns '
-                    f'{missing[0]}=NAME; it has '
-                    f'{", ".join(each for each in self._sheet.header if each)}'
+                    f'{missing[0]}=NAME; {self._has()}'
                 )
         return kept
+
+    def _has(self) -> str:
+        return f'it has {", ".join(filter(None, self._sheet.header))}'
 
     def words(self) -> dict[str, list[str]]:
         """Return the texts that are taken over."""
         found = {}
         for ours in WORDS:
             if ours in self._ours:
-                number = self._sheet.number(_bare(self._ours[ours]))
-                assert number is not None
+                number = self._sheet.number(_bare(self._ours[ours])) or ''
                 cells, known = self._sheet.columns.codes(number)
                 found[ours] = [known[cell] for cell in cells.tolist()]
         return found
@@ -193,11 +184,8 @@ class _Table:
     def values(self) -> dict[str, FloatArray]:
         """Return our columns in m and rad."""
         names = list(dict.fromkeys(n for each in self._expressions.values() for n in each.names))
-        numbers = [self._sheet.number(name) for name in names]
-        ids = [each for each in numbers if each is not None]
-        read = np.zeros((len(self.lines), 0))
-        if ids:
-            read = self._sheet.columns.numbers(ids, names)
+        numbers = [self._sheet.number(name) or '' for name in names]
+        read = self._sheet.columns.numbers(numbers, names)
         columns = dict(zip(names, read.T, strict=True))
         units = self._units()
         found = {}
@@ -209,8 +197,8 @@ class _Table:
             found[ours] = value
         return found
 
-    def _units(self) -> tuple[str, str, str]:
-        """Return the units of lengths, angles and joint values."""
+    def _units(self) -> tuple[float, float, float]:
+        """Return the factors of lengths, angles and joint values."""
         layout = self._layout
         length, angle = layout.length, layout.angle
         for cells in self._sheet.above:
@@ -230,10 +218,10 @@ class _Table:
             assumed.append('joint values in rad (--joint-angle)')
         if assumed:
             self.notes.append(f'no units are given: taking {", ".join(assumed)}')
-        return length or 'm', angle or 'rad', joint or 'rad'
+        return LENGTHS[length or 'm'], ANGLES[angle or 'rad'], ANGLES[joint or 'rad']
 
-    def _factor(self, ours: str, units: tuple[str, str, str]) -> float:
-        length, angle, joint = LENGTHS[units[0]], ANGLES[units[1]], ANGLES[units[2]]
+    def _factor(self, ours: str, units: tuple[float, float, float]) -> float:
+        length, angle, joint = units
         if ours in (*POSITION, 'distance', *SIGMAS[:3]):
             return length
         if ours in (*TURNS, *IN_TURN, *SIGMAS[3:]):
@@ -250,11 +238,10 @@ def _bare(name: str) -> str:
 
 
 def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]:
-    """Return what each name in a header stands for when nothing is said."""
     found: dict[str, str] = {}
     if joints:
         count = MOST_NAMES if chain is None else len(chain.joints)
-        found = {f'{letter}{k}': f'{letter}{k}' for letter in 'qsva' for k in range(1, count + 1)}
+        found = {name: name for letter in 'qsva' for name in joint_columns(count, letter)}
         if chain is not None:
             found |= {name: f'q{k + 1}' for k, name in enumerate(chain.joint_names)}
     if not alone:
@@ -271,13 +258,3 @@ def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
     there = slice(max(0, shift), count - max(0, -shift))
     moved = {name: made.values[name][there] for name in made.values if JOINT.fullmatch(name)}
     return replace(here, values={**here.values, **moved})
-
-
-def _measured_only(made: MadeColumns) -> tuple[MadeColumns, str]:
-    """Return the rows in which anything was measured, and what is left out, in words."""
-    measured = [made.values[name] for name in MEASURED if name in made.values]
-    good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
-    if good.all():
-        return made, ''
-    lines = lines_in_words(made.lines[~good].tolist())
-    return made.select(good), f'nothing was measured in {lines}: left out'

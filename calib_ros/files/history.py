@@ -2,19 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results over time: a Parquet dataset to which rows are added, read by anything that reads one.
 
-A row is a file `robot=SERIAL/KEY.parquet`. KEY is a hash of the robot, of what was done, of the
-content of the inputs, of the settings and of the software: the same result has the same name, so
-it is there once however often and by however many processes it is filed. A file is written under a
-temporary name and renamed: it is there as a whole or not at all. Nothing is changed or removed.
-
-`.cache` holds what was read before, a file for each robot; it can be removed at any time.
+A row is a file `robot=SERIAL/KEY.parquet`. KEY is a hash of all that the result depends on: it is
+there once however often and by however many processes it is filed, as a whole or not at all.
+Nothing is changed or removed. `.cache` holds what was read before, a file for each robot; it can
+be removed at any time.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import secrets
-from dataclasses import fields
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields
+from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -22,12 +25,201 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
+import calib_ros
+from calib_ros.apply.confidence import rms_interval
+from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.files.rows import Row
+from calib_ros.identification.identification import Identification
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.validation import ErrorFigures
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import chain_document, parse_chain
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Settings
+from calib_ros.shown import Shown
+from calib_ros.values import LONGEST_NAME, parse_name
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
+
+
+@dataclass(frozen=True)
+class Filing:
+    """What is known of a result besides the result: whose it is, when and from what.
+
+    `inputs` and `settings` are hashes; `fingerprint` tells cheaply that the `source` is unchanged.
+    """
+
+    serial: str
+    time: datetime
+    inputs: str
+    settings: str
+    source: str = ''
+    fingerprint: str = ''
+
+    def __post_init__(self) -> None:
+        """Refuse a serial number that cannot name a folder."""
+        parse_serial(self.serial, 'the serial number')
+
+
+def parse_serial(value: object, where: str) -> str:
+    """Return a serial number that can name a folder; `where` names it in the error."""
+    if not isinstance(value, str) or value in ('', '.', '..'):
+        raise ConfigError(f'{where} must be text ("0042" in quotes), not {value!r}')
+    if len(quote(parse_name(value, where), safe='')) > LONGEST_NAME:
+        raise ConfigError(f'{where} is too long to name a folder: {value}')
+    return value
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Row(Shown):
+    """A result as it is filed; docs/fleet.md describes the columns.
+
+    Lengths of figures are in mm, angles in mrad; offsets and their covariance (P, P) in m and rad,
+    of the parameters `names`.
+    """
+
+    serial: str
+    kind: str
+    time: datetime
+    verdict: str
+    inputs: str
+    settings: str
+    source: str = ''
+    fingerprint: str = ''
+    software: str = calib_ros.__version__
+    filed: datetime = field(default_factory=lambda: datetime.now(timezone.utc))
+    model: str = ''
+    reasons: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    poses: int = 0
+    rms_before_mm: float | None = None
+    rms_mm: float | None = None
+    lower_mm: float | None = None
+    upper_mm: float | None = None
+    mean_mm: float | None = None
+    max_mm: float | None = None
+    rms_mrad: float | None = None
+    rms_freedom: float | None = None
+    freedom: float | None = None
+    names: tuple[str, ...] = ()
+    offsets: FloatArray = field(default_factory=lambda: np.zeros(0))
+    covariance: FloatArray = field(default_factory=lambda: np.zeros(0))
+    chain: str = ''
+
+    @property
+    def key(self) -> str:
+        """Return the name of the result: the same for the same work."""
+        return digest([self.serial, self.kind, self.inputs, self.settings, self.software])
+
+    @property
+    def accepted(self) -> bool:
+        """Tell whether it is an identification that was accepted."""
+        return self.verdict == 'accepted'
+
+    def corrected(self) -> Chain:
+        """Return the corrected chain with its frames."""
+        return parse_chain(self.chain, f'the chain of {self.serial} in the history')
+
+
+def digest(content: object) -> str:
+    """Return the SHA-256 of plain values."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
+    """Return the hash of all that a result depends on besides the measurements."""
+    return digest([chain_document(nominal), asdict(settings), *more])
+
+
+def content_hash(files: Sequence[str], session: str = '') -> str:
+    """Return the hash of the content of files, by their own hashes, or of a session in them."""
+    return digest([session, *sorted(files)])
+
+
+def samples_hash(sets: Sequence[Observations]) -> str:
+    """Return the hash of samples that are in no file."""
+    found = hashlib.sha256()
+    for each in sets:
+        for array in (each.stamps_ns, each.joints, each.positions, each.rotations):
+            found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()
+
+
+def is_time(stamp_ns: int) -> bool:
+    """Tell whether a stamp is a time: of 1973 or later, not since a start or from lines."""
+    return stamp_ns >= 10**17
+
+
+def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
+    """Return when the last pose was measured; another time where stamps are no times."""
+    last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
+    if not is_time(last):
+        return otherwise or datetime.now(timezone.utc)
+    return datetime.fromtimestamp(last / 1e9, timezone.utc)
+
+
+def identified(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:
+    """Return the row of an identification; `warnings` are of the measurements."""
+    offsets = {str(each.name): each.offset for each in result.parameters}
+    names = tuple(map(str, result.names))
+    which = result.validation or result.fitted
+    errors = which.after
+    shown = which.judged & ~np.isnan(errors.position).any(axis=1)
+    freedom = result.uncertainty.overall
+    return _row(
+        about,
+        'identify',
+        result.chain,
+        'accepted' if result.accepted else 'refused',
+        which.figures,
+        rms_interval(errors.position[shown], errors.configurations[shown], 0.975),
+        reasons=tuple(map(str, result.refusals)),
+        remarks=tuple(map(str, (*warnings, *result.remarks))),
+        freedom=freedom if np.isfinite(freedom) else None,
+        names=names,
+        offsets=np.array([offsets[name] for name in names]),
+        covariance=result.covariance,
+    )
+
+
+def judged(
+    chain: Chain, before: ErrorFigures | None, after: ErrorFigures, verdict: str, about: Filing
+) -> Row:
+    """Return the row of a validation: a calibration on poses that were measured since."""
+    return _row(about, 'validate', chain, verdict, (before, after))
+
+
+def verified(chain: Chain, found: Verification, about: Filing) -> Row:
+    """Return the row of a verification."""
+    figures, limits = found.comparison.figures, (found.lower, found.upper)
+    return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=found.freedom)
+
+
+def _row(
+    about: Filing,
+    kind: str,
+    chain: Chain,
+    verdict: str,
+    figures: tuple[ErrorFigures | None, ErrorFigures],
+    limits: tuple[float, float] | None = None,
+    **more: Any,
+) -> Row:
+    before, after = figures
+    more |= {name: getattr(after, name) for name in ('rms_mm', 'mean_mm', 'max_mm', 'rms_mrad')}
+    if limits is not None and np.isfinite(limits).all():
+        more |= {'lower_mm': 1e3 * limits[0], 'upper_mm': 1e3 * limits[1]}
+    return Row(
+        **asdict(about),
+        kind=kind,
+        model=chain.name,
+        chain=json.dumps(chain_document(chain)),
+        verdict=verdict,
+        poses=after.count,
+        rms_before_mm=None if before is None else before.rms_mm,
+        **more,
+    )
 
 
 class History:
@@ -47,30 +239,30 @@ class History:
 
     def file(self, row: Row) -> bool:
         """Add a row; return False where it was there already."""
+        import pyarrow as pa
         import pyarrow.parquet as parquet
 
         path = self._path(row.serial, row.key)
         if self._files.exists(path):
             return False
+        values = ((each.name, getattr(row, each.name)) for each in fields(row))
+        record = {name: x.ravel() if isinstance(x, np.ndarray) else x for name, x in values}
+        table = pa.Table.from_pylist([record | {'key': row.key}], schema=_schema())
         buffer = io.BytesIO()
         small = {'use_dictionary': False, 'write_statistics': False}  # most of a file of one row
-        parquet.write_table(_table_of(row), buffer, compression='zstd', **small)
+        parquet.write_table(table, buffer, compression='zstd', **small)
         self._write(path, buffer.getvalue())
         return True
 
     def serials(self) -> tuple[str, ...]:
         """Return the robots that have rows."""
-        names = (Path(each).name for each in self._names(self._root))
+        names = self._names(self._root)
         return tuple(sorted(unquote(n[len(FOLDER) :]) for n in names if n.startswith(FOLDER)))
 
     def keys(self, serial: str) -> frozenset[str]:
         """Return the keys of the rows of a robot."""
-        names = (Path(each).name for each in self._names(self._folder(serial)))
-        return frozenset(
-            name[: -len(ENDING)]
-            for name in names
-            if name.endswith(ENDING) and not name.startswith('.')
-        )
+        names = self._names(self._folder(serial))
+        return frozenset(n[: -len(ENDING)] for n in names if n.endswith(ENDING) and n[0] != '.')
 
     def rows(self, serial: str) -> tuple[Row, ...]:
         """Return the rows of a robot in the order of their times."""
@@ -86,15 +278,15 @@ class History:
         rows = [row for row in _rows_of(table) if row.key in keys]
         return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))
 
-    def _folder(self, serial: str) -> str:
-        return f'{self._root}/{FOLDER}{quote(serial, safe="")}'
+    def _folder(self, serial: str, under: str = '') -> str:
+        return f'{self._root}/{under}{FOLDER}{quote(serial, safe="")}'
 
     def _path(self, serial: str, key: str) -> str:
         return f'{self._folder(serial)}/{key}{ENDING}'
 
     def _names(self, folder: str) -> list[str]:
         try:
-            return [str(each) for each in self._files.ls(folder, detail=False, refresh=True)]
+            return [Path(each).name for each in self._files.ls(folder, detail=False, refresh=True)]
         except FileNotFoundError:
             return []
         except OSError as err:
@@ -106,8 +298,7 @@ class History:
         path = self._path(serial, key)
         try:
             with self._files.open(path, 'rb') as file:
-                table = parquet.ParquetFile(file).read()
-            return _conformed(table, key)
+                return _conformed(parquet.ParquetFile(file).read(), key)
         except Exception as err:  # a damaged file fails in many ways
             raise InputError(
                 f'{path} is no row of a history ({err}): move it away, its work is done again'
@@ -126,19 +317,16 @@ class History:
         self._files.pipe_file(partial, content)
         self._files.mv(partial, path)
 
-    def _cache_path(self, serial: str) -> str:
-        return f'{self._root}/.cache/{FOLDER}{quote(serial, safe="")}.arrow'
-
     def _cached(self, serial: str) -> Any:
         """Return the rows of a robot that were read before, as far as they can be used."""
         import pyarrow as pa
 
-        try:
-            with self._files.open(self._cache_path(serial), 'rb') as file:
-                table = pa.ipc.open_file(io.BytesIO(file.read())).read_all()
-        except (OSError, pa.ArrowException):
-            return _schema().empty_table()
-        return table if table.schema.equals(_schema()) else _schema().empty_table()
+        with suppress(OSError, pa.ArrowException):
+            data = self._files.cat_file(f'{self._folder(serial, ".cache/")}.arrow')
+            table = pa.ipc.open_file(io.BytesIO(data)).read_all()
+            if table.schema.equals(_schema()):
+                return table
+        return _schema().empty_table()
 
     def _cache(self, serial: str, table: Any) -> None:
         """Keep what was read; a history that cannot be written is read without."""
@@ -147,10 +335,8 @@ class History:
         buffer = io.BytesIO()
         with pa.ipc.new_file(buffer, table.schema) as writer:
             writer.write_table(table.combine_chunks())
-        try:
-            self._write(self._cache_path(serial), buffer.getvalue())
-        except (OSError, CalibrationError, NotImplementedError):
-            return
+        with suppress(OSError, CalibrationError, NotImplementedError):
+            self._write(f'{self._folder(serial, ".cache/")}.arrow', buffer.getvalue())
 
 
 def is_local(files: Any) -> bool:
@@ -160,7 +346,6 @@ def is_local(files: Any) -> bool:
 
 @cache
 def _schema() -> Any:
-    """Return the columns: the key, and the fields of a row."""
     import pyarrow as pa
 
     kinds = {
@@ -173,17 +358,6 @@ def _schema() -> Any:
     }
     columns = [(each.name, kinds[str(each.type)]) for each in fields(Row)]
     return pa.schema([('key', pa.string()), *columns])
-
-
-def _table_of(row: Row) -> Any:
-    """Return a row as a table; matrices row by row."""
-    import pyarrow as pa
-
-    record: dict[str, Any] = {'key': row.key}
-    for each in fields(row):
-        value = getattr(row, each.name)
-        record[each.name] = value.ravel() if isinstance(value, np.ndarray) else value
-    return pa.Table.from_pylist([record], schema=_schema())
 
 
 def _conformed(table: Any, key: str) -> Any:
@@ -202,7 +376,6 @@ def _conformed(table: Any, key: str) -> Any:
 
 
 def _rows_of(table: Any) -> list[Row]:
-    """Return the rows of a table."""
     rows = []
     for record in table.drop_columns(['key']).to_pylist():
         for each in fields(Row):

@@ -15,6 +15,20 @@ from calib_ros.files.stored import LARGEST_IMAGE
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 Image = NDArray[np.uint8]
+ENCODINGS = {
+    'mono8': (1, ''),
+    '8UC1': (1, ''),
+    'rgb8': (3, 'RGB'),
+    'bgr8': (3, 'BGR'),
+    '8UC3': (3, 'BGR'),
+    'rgba8': (4, 'RGBA'),
+    'bgra8': (4, 'BGRA'),
+    'bayer_rggb8': (1, 'BayerBG'),
+    'bayer_bggr8': (1, 'BayerRG'),
+    'bayer_gbrg8': (1, 'BayerGR'),
+    'bayer_grbg8': (1, 'BayerGB'),
+}
+"""Channels, and what OpenCV calls them: a Bayer pattern by its second row."""
 
 
 def opencv() -> Any:
@@ -64,27 +78,14 @@ def image_of(message: Any) -> Image:
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
     """Return the content of a sensor_msgs/Image in grey; refuse unknown encodings and sizes."""
-    cv2 = opencv()
-    known = {  # channels, and how they become grey; OpenCV names a Bayer pattern by its second row
-        'mono8': (1, None),
-        '8UC1': (1, None),
-        'rgb8': (3, cv2.COLOR_RGB2GRAY),
-        'bgr8': (3, cv2.COLOR_BGR2GRAY),
-        '8UC3': (3, cv2.COLOR_BGR2GRAY),
-        'rgba8': (4, cv2.COLOR_RGBA2GRAY),
-        'bgra8': (4, cv2.COLOR_BGRA2GRAY),
-        'bayer_rggb8': (1, cv2.COLOR_BayerBG2GRAY),
-        'bayer_bggr8': (1, cv2.COLOR_BayerRG2GRAY),
-        'bayer_gbrg8': (1, cv2.COLOR_BayerGR2GRAY),
-        'bayer_grbg8': (1, cv2.COLOR_BayerGB2GRAY),
-    }
-    if encoding not in known:
-        raise UnknownNameError('encoding of images', encoding, known)
-    channels, code = known[encoding]
+    if encoding not in ENCODINGS:
+        raise UnknownNameError('encoding of images', encoding, ENCODINGS)
+    channels, kind = ENCODINGS[encoding]
     if step < width * channels or len(data) < height * step or height < 1 or width < 1:
         raise InputError(f'an image of {width} x {height} px holds {len(data)} bytes only')
     rows = data[: height * step].reshape(height, step)[:, : width * channels]
-    if code is None:
+    if not kind:
         return np.ascontiguousarray(rows)
     shape = (height, width) if channels == 1 else (height, width, channels)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows).reshape(shape), code))
+    code = getattr(opencv(), f'COLOR_{kind}2GRAY')
+    return np.asarray(opencv().cvtColor(np.ascontiguousarray(rows).reshape(shape), code))

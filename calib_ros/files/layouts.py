@@ -125,65 +125,33 @@ def _value(tree: ast.expr, terms: Sequence[FloatArray | float]) -> Any:
 
 @dataclass(frozen=True)
 class Layout:
-    """How a table is laid out.
-
-    Attributes
-    ----------
-    description, source : str
-        What it is of, and where its form is documented.
-    separator : str
-        Between cells: comma, semicolon, tab or space; guessed when empty.
-    decimal : str
-        '.' or ','; guessed when empty.
-    columns : mapping of str to str
-        Our columns as expressions of theirs.
-    length, angle, joint_angle : str
-        Units of lengths, of Euler angles and rotation vectors, and of joint values.
-    euler : str
-        Letters of the axes: XYZ turned about in turn (intrinsic), xyz fixed ones (extrinsic).
-    quaternion : str
-        Order of the four columns qx qy qz qw, xyzw or wxyz.
-    rotation_vector : bool
-        rx ry rz are a rotation vector.
-    inverse : bool
-        The poses are those of the device in the target's frame.
-    shift : int
-        Joint values stand so many rows below the measurement that they belong to.
-    comment : str
-        How lines begin that say nothing.
-    sheet : str
-        Of a workbook; the first one when empty.
-
-    """
+    """How a table is laid out; what is empty is guessed, or not there."""
 
     description: str = ''
-    source: str = ''
-    separator: str = ''
-    decimal: str = ''
-    columns: Mapping[str, str] = field(default_factory=dict)
+    source: str = ''  # where the form is documented
+    separator: str = ''  # between cells: comma, semicolon, tab or space
+    decimal: str = ''  # '.' or ','
+    columns: Mapping[str, str] = field(default_factory=dict)  # ours as expressions of theirs
     length: str = ''
-    angle: str = ''
+    angle: str = ''  # unit of Euler angles and rotation vectors
     joint_angle: str = ''
-    euler: str = ''
-    quaternion: str = ''
-    rotation_vector: bool = False
-    inverse: bool = False
-    shift: int = 0
-    comment: str = ''
-    sheet: str = ''
+    euler: str = ''  # axes: XYZ turned about in turn (intrinsic), xyz fixed ones (extrinsic)
+    quaternion: str = ''  # order of the four columns qx qy qz qw, xyzw or wxyz
+    rotation_vector: bool = False  # rx ry rz are one
+    inverse: bool = False  # the poses are those of the device in the target's frame
+    shift: int = 0  # joint values stand so many rows below the measurement they belong to
+    comment: str = ''  # how lines begin that say nothing
+    sheet: str = ''  # of a workbook
 
     def __post_init__(self) -> None:
         """Refuse what no table is like."""
         for item in fields(self):
-            kind = {'bool': bool, 'int': int, 'str': str}.get(str(item.type))
             value = getattr(self, item.name)
-            if kind is not None and (
-                not isinstance(value, kind) or isinstance(value, bool) is not (kind is bool)
-            ):
+            if item.name != 'columns' and type(value) is not type(item.default):
                 raise ConfigError(
                     f'"{item.name}" of a layout must be a {item.type}, not {value!r}'
                 )
-        for name, known in (
+        for name, all_of_them in (
             ('separator', (*SEPARATORS, *SEPARATORS.values())),
             ('decimal', ('.', ',')),
             ('length', LENGTHS),
@@ -192,14 +160,10 @@ class Layout:
             ('quaternion', ('xyzw', 'wxyz')),
         ):
             value = getattr(self, name)
-            if value and value not in known:
-                raise UnknownNameError(name.replace('_', ' '), value, tuple(known))
-        letters = self.euler.upper()
-        if self.euler and (
-            not re.fullmatch('[XYZ]{3}|[xyz]{3}', self.euler)
-            or letters[0] == letters[1]
-            or letters[1] == letters[2]
-        ):
+            if value and value not in all_of_them:
+                raise UnknownNameError(name.replace('_', ' '), value, tuple(all_of_them))
+        known = r'(?!.?(.)\1)([XYZ]{3}|[xyz]{3})'  # no axis twice in a row
+        if self.euler and not re.fullmatch(known, self.euler):
             raise ConfigError(
                 f'Euler angles must be three axes, ZYX (each about the axis as turned before) or '
                 f'zyx (about fixed axes), not "{self.euler}"'
@@ -255,9 +219,8 @@ def parse_columns(text: str) -> dict[str, str]:
         if not equals or not ours or not theirs:
             raise ConfigError(f'columns are given as OURS=THEIRS,..., not "{part.strip()}"')
         if re.fullmatch(r'[qsva]\*', ours):
-            found |= {
-                f'{ours[0]}{k}': theirs.replace('*', str(k)) for k in range(1, MOST_NAMES + 1)
-            }
+            for k in range(1, MOST_NAMES + 1):
+                found[f'{ours[0]}{k}'] = theirs.replace('*', str(k))
         else:
             found[ours] = theirs
     return found

@@ -60,10 +60,7 @@ class Loaded:
 
 
 def replayed(
-    path: Path,
-    chain: Chain,
-    settings: Settings,
-    told: Told = nobody,
+    path: Path, chain: Chain, settings: Settings, told: Told = nobody
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has taken a bag."""
     session = CalibrationSession(chain, settings)

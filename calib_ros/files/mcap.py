@@ -25,7 +25,6 @@ _HEAD = struct.Struct('<BQ')  # kind and size
 _LOGGED = struct.Struct('<HIQQ')  # channel, sequence, and when it was logged and published
 MESSAGE_HEAD = _LOGGED.size
 _CHUNK = struct.Struct('<QQQI')  # first and last log time, uncompressed size and checksum
-
 FOOTER = _HEAD.size + struct.calcsize('<QQI') + len(MAGIC)
 """Bytes of the last record, with the place of the index, and of the magic after it."""
 MODULES = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
@@ -111,9 +110,8 @@ def logged(
                 key, _, time, _ = _LOGGED.unpack_from(record)
                 if key in channels and begin <= time <= end:
                     found.append((time, channels[key], record[MESSAGE_HEAD:]))
-    except (EOFError, ValueError, struct.error) as err:
+    except (EOFError, ValueError, struct.error):
         problem = ValueError('a record in a chunk is damaged')
-        problem.__cause__ = err
     found.sort(key=itemgetter(0))
     return found, problem
 
@@ -131,7 +129,14 @@ def string(record: bytes, start: int) -> str:
 
 def unpacked(data: bytes, compression: str, largest: int) -> bytes:
     """Return what is packed in some bytes; of one that is cut off what there is."""
-    found = _unpack(data, compression, largest + 1) if compression else data
+    module: Any = _module(compression) if compression else None
+    found = data
+    if compression == 'lz4':
+        found = module.LZ4FrameDecompressor().decompress(data, largest + 1)
+    elif hasattr(module, 'ZstdCompressionDict'):  # zstandard
+        found = module.ZstdDecompressor().stream_reader(data).read(largest + 1)
+    elif compression:
+        found = module.ZstdDecompressor().decompress(data, largest + 1)
     if len(found) > largest:
         raise ValueError(f'it unpacks to more than the {largest} bytes that it may have')
     return found
@@ -148,16 +153,6 @@ def _unpacked(chunk: bytes) -> bytes:
 def open_zstd(file: Path) -> Any:
     """Return a packed file, to read what is in it."""
     return _module('zstd').open(file, 'rb')
-
-
-def _unpack(data: bytes, name: str, most: int) -> bytes:
-    """Return so many bytes at most."""
-    module = _module(name)
-    if name == 'lz4':
-        return bytes(module.LZ4FrameDecompressor().decompress(data, most))
-    if hasattr(module, 'ZstdCompressionDict'):  # zstandard
-        return bytes(module.ZstdDecompressor().stream_reader(data).read(most))
-    return bytes(module.ZstdDecompressor().decompress(data, most))
 
 
 @cache  # looking for a module that is not there takes ten times as long as a message

@@ -131,17 +131,15 @@ class Measurements:
                     same.pop()
             rows = sorted(row for same in open_rows.values() for row in same)
             found = self.select(np.array(rows, dtype=np.intp))
-        if (np.diff(found.stamps_ns) > 0).all():
+        stamps = found.stamps_ns
+        if (np.diff(stamps) > 0).all():
             return found
         _, number = distinct(found.codes)
-        order = np.lexsort((number, found.stamps_ns))
-        same_stamp, same_kind = np.diff(found.stamps_ns[order]), np.diff(number[order])
-        again = np.flatnonzero((same_stamp == 0) & (same_kind == 0))
-        if len(again):
-            row = order[again + 1].min()
+        order = np.lexsort((number, stamps))
+        again = (np.diff(stamps[order]) == 0) & (np.diff(number[order]) == 0)
+        for row in np.sort(order[1:][again])[:1].tolist():
             raise InputError(
-                f'{self.path}, line {found.lines[row]}: stamp_ns {found.stamps_ns[row]} is there '
-                'already'
+                f'{self.path}, line {found.lines[row]}: stamp_ns {stamps[row]} is there already'
             )
         return found
 
@@ -151,8 +149,8 @@ class Measurements:
         A row that names no frame may be of any.
         """
         kinds, number = distinct(self.codes[:, :3])
-        if len(kinds) > (most := 100):
-            line = self.lines[int(np.argmax(number == most))]
+        most = 100
+        for line in self.lines[number == most][:1].tolist():
             raise InputError(
                 f'{self.path}, line {line}: more than {most} sessions, devices and targets; each '
                 'has a frame to be fitted'
@@ -165,11 +163,9 @@ class Measurements:
             if self.frame_id[1][frame]:
                 frames.setdefault(tuple(device), {})[self.frame_id[1][frame]] = k
         for names in frames.values():
+            lines = {name: self.lines[number == k].tolist() for name, k in names.items()}
             if len(names) > 1:
-                found = ', '.join(
-                    f'{name} ({lines_in_words(self.lines[number == k].tolist())})'
-                    for name, k in names.items()
-                )
+                found = ', '.join(f'{name} ({lines_in_words(lines[name])})' for name in names)
                 raise InputError(
                     f'{self.path}: poses came in different frames: {found}; one is needed: '
                     'leave out the rows of the others, or give each a device of its own'
@@ -288,13 +284,8 @@ def _check_header(columns: Columns, joints: int) -> None:
     needed = [*joint_columns(joints)]
     if not set(KINDS[1:]) & header:
         needed += POSITION
-    together = (
-        *(joint_columns(joints, letter) for letter in 'sva'),
-        POSITION,
-        QUATERNION,
-        COVARIANCE,
-    )
-    for block in (*together, ('location', 'socket')):
+    blocks = (joint_columns(joints, letter) for letter in 'sva')
+    for block in (*blocks, POSITION, QUATERNION, COVARIANCE, ('location', 'socket')):
         needed += block if set(block) & header else ()
     missing = [name for name in dict.fromkeys(needed) if name not in header]
     if missing:
@@ -322,7 +313,6 @@ def choices(
 
 
 def _stamps(columns: Columns) -> NDArray[np.int64]:
-    """Return the stamps (N,) [ns]: a row without one is measured at its line, in seconds."""
     lines = columns.lines.astype(np.int64) * 1_000_000_000
     if 'stamp_ns' not in columns.header or columns.blank('stamp_ns').all():
         return lines
@@ -331,21 +321,19 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
 
 def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
     """Return the devices; a socket and a plane stand for one, as does what measures distances."""
-    device = columns.labels('device')
-    plane, place = columns.labels('plane'), columns.labels('location')
-    socket = columns.labels('socket')
     if not kind.any():
-        return device
-    combined = np.column_stack([kind, device[0], plane[0], place[0], socket[0]])
-    kinds, number = distinct(combined)
+        return columns.labels('device')
+    labels = [columns.labels(name) for name in ('device', 'plane', 'location', 'socket')]
+    kinds, number = distinct(np.column_stack([kind, *(codes for codes, _ in labels)]))
     names = []
-    for k, (what, by, touched, location, hole) in enumerate(kinds.tolist()):
-        name = device[1][by]
+    for k, (what, *codes) in enumerate(kinds.tolist()):
+        told = zip(labels, codes, strict=True)
+        name, plane, place, socket = (texts[code] for (_, texts), code in told)
         if what == PLANE:
-            name = plane[1][touched]
+            name = plane
         elif what == SOCKET:
             try:
-                name = socket_place(f'{place[1][location]}/{socket[1][hole]}')
+                name = socket_place(f'{place}/{socket}')
             except ConfigError as err:
                 row = int(np.argmax(number == k))
                 raise InputError(f'{columns.path}, line {columns.lines[row]}: {err}') from err
@@ -381,8 +369,7 @@ def _covariance(
     given = placed & ~np.isnan(upper[:, 0])
     full = np.full((len(upper), 6, 6), np.nan)
     rows, across = np.transpose(UPPER)
-    full[:, rows, across] = upper
-    full[:, across, rows] = upper
+    full[:, rows, across] = full[:, across, rows] = upper
     known = np.where(oriented[given, np.newaxis], 1.0, np.repeat([1.0, 0.0], 3))
     faults = covariance_faults(full[given] * known[:, :, np.newaxis] * known[:, np.newaxis, :])
     for k in np.flatnonzero(faults != '')[:1].tolist():

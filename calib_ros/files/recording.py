@@ -34,21 +34,14 @@ class Recording:
 
     @classmethod
     def of_dwells(
-        cls,
-        joint_names: tuple[str, ...],
-        observations: Observations,
-        held_out: NDArray[np.bool_],
+        cls, joint_names: tuple[str, ...], observations: Observations, held_out: NDArray[np.bool_]
     ) -> Recording:
         """Turn a table into a recording: the arm stands for 0.4 s at every row, once a second."""
         begin = (1 + np.arange(len(observations))[:, np.newaxis]) * 1_000_000_000
         stamps = begin + np.arange(5) * 100_000_000
-        return cls(
-            joint_names,
-            stamps.ravel(),
-            np.repeat(observations.joints, stamps.shape[1], axis=0),
-            observations.at(stamps[:, 3]),
-            held_out,
-        )
+        joints = np.repeat(observations.joints, stamps.shape[1], axis=0)
+        poses = observations.at(stamps[:, 3])
+        return cls(joint_names, stamps.ravel(), joints, poses, held_out)
 
 
 def write_bag(
@@ -80,8 +73,8 @@ def _write_bag(path: Path, recording: Recording, storage: str, told: Told) -> No
     time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
     joint_state, poses = types[JOINT_STATE], recording.poses
     oriented = bool(poses.oriented.all())
-    kind = f'geometry_msgs/msg/{"PoseStamped" if oriented else "PointStamped"}'
     noun = 'pose' if oriented else 'point'
+    kind = f'geometry_msgs/msg/{noun.capitalize()}Stamped'
     none = np.zeros(0)
     quats = to_quat(poses.rotations)
 
@@ -90,12 +83,11 @@ def _write_bag(path: Path, recording: Recording, storage: str, told: Told) -> No
         return header(time(sec=seconds, nanosec=nanoseconds), frame_id)
 
     def measured(k: int, stamp_ns: int) -> Any:
-        point = types['geometry_msgs/msg/Point'](*poses.positions[k].tolist())
-        if not oriented:
-            return types[kind](head(stamp_ns, 'tracker'), point)
-        turn = types['geometry_msgs/msg/Quaternion'](*quats[k].tolist())
-        pose = types['geometry_msgs/msg/Pose'](point, turn)
-        return types[kind](head(stamp_ns, 'tracker'), pose)
+        place = types['geometry_msgs/msg/Point'](*poses.positions[k].tolist())
+        if oriented:
+            turn = types['geometry_msgs/msg/Quaternion'](*quats[k].tolist())
+            place = types['geometry_msgs/msg/Pose'](place, turn)
+        return types[kind](head(stamp_ns, 'tracker'), place)
 
     stamps = np.concatenate([recording.joint_stamps_ns, poses.stamps_ns])
     names = list(recording.joint_names)
@@ -109,12 +101,13 @@ def _write_bag(path: Path, recording: Recording, storage: str, told: Told) -> No
         for done, k in enumerate(np.argsort(stamps, kind='stable').tolist()):
             told(done / len(stamps))
             stamp_ns = int(stamps[k])
-            if k < len(recording.joints):
+            pose = k - len(recording.joints)
+            if pose < 0:
                 values = np.ascontiguousarray(recording.joints[k])
                 message = joint_state(head(stamp_ns, ''), names, values, none, none)
-                data = store.serialize_cdr(message, JOINT_STATE)
-                writer.write(joint_connection, stamp_ns, data)
-                continue
-            k -= len(recording.joints)
-            data = store.serialize_cdr(measured(k, stamp_ns), kind)
-            writer.write(pose_connections[int(recording.held_out[k])], stamp_ns, data)
+                connection = joint_connection
+            else:
+                message = measured(pose, stamp_ns)
+                connection = pose_connections[int(recording.held_out[pose])]
+            data = store.serialize_cdr(message, connection.msgtype)
+            writer.write(connection, stamp_ns, data)

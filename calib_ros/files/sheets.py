@@ -7,9 +7,11 @@ What is guessed (the coding, the separator, the decimal sign, the line of the he
 
 from __future__ import annotations
 
+import codecs
 import re
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -60,9 +62,9 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     columns only, the first with some of the names `known`.
     """
     notes: list[str] = []
+    text, separator = '', ''
     if path.suffix.lower() in SHEETS:
         rows = _workbook(path, layout.sheet, notes)
-        text, separator = '', ''
     else:
         text, coding = _text(path)
         if coding:
@@ -82,8 +84,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
     first = _first(path, rows, at, used, decimal, notes)
     width = len(rows[first][1])
-    if not header:
-        header = ('',) * width
+    header = header or ('',) * width
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
     columns: Columns | None = None
     start = rows[first][0]
@@ -91,21 +92,24 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         body = text[_after(text, start - 1) :].encode()
         if decimal == ',':
             body = body.replace(b',', b'.')
-        numbers = [f'#{k + 1}' for k in range(width)]
-        columns = regular(path, body, separator, numbers, start - 1)
+        columns = regular(path, body, separator, _numbered(width), start - 1)
         if columns is None:
             rows = _cells(path, text, separator)
-            first = next(k for k, (line, _) in enumerate(rows) if line >= start)
     if columns is None:
-        rows = [(n, _dotted(cells) if decimal == ',' else cells) for n, cells in rows[first:]]
+        rows = [(line, cells) for line, cells in rows if line >= start]
+        if decimal == ',':
+            rows = [(line, [cell.replace(',', '.') for cell in cells]) for line, cells in rows]
         width = max(len(header), *(len(cells) for _, cells in rows))
-        columns = of_cells(path, [f'#{k + 1}' for k in range(width)], rows)
+        columns = of_cells(path, _numbered(width), rows)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
 
 
+def _numbered(columns: int) -> list[str]:
+    return [f'#{k + 1}' for k in range(columns)]
+
+
 def _after(text: str, lines: int) -> int:
-    """Return where a text goes on after so many lines."""
     at = 0
     for _ in range(lines):
         at = text.find('\n', at) + 1
@@ -117,15 +121,13 @@ def _after(text: str, lines: int) -> int:
 def _text(path: Path) -> tuple[str, str]:
     """Return the text of a file, and what coding it was taken for if that was a guess."""
     data = read_bytes(path, LARGEST_TABLE, InputError)
-    if data[:2] in (b'\xff\xfe', b'\xfe\xff'):
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         try:
             return data.decode('utf-16'), ''
         except UnicodeDecodeError as err:
             raise InputError(f'cannot read {path}: {err}') from err
-    try:
+    with suppress(UnicodeDecodeError):
         return data.decode('utf-8-sig'), ''
-    except UnicodeDecodeError:
-        pass
     if b'\0' in data:
         raise InputError(f'cannot read {path}: it is no text, and no workbook by its name (.xlsx)')
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is no UTF-8'
@@ -171,7 +173,6 @@ def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
 
 
 def _cell(value: object) -> str:
-    """Return a cell of a workbook as text; numbers are exact."""
     if value is None:
         return ''
     if isinstance(value, bool):
@@ -181,35 +182,29 @@ def _cell(value: object) -> str:
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
-    """Return the separator by which most lines have the same number of cells, more than one."""
     lines = [line for line in text[: _after(text, HEAD)].split('\n') if line.strip()]
     lines = lines[-30:]  # under most of what stands above the header
     if not lines:
         raise InputError(f'{path} has no rows')
-    best, most = ',', 0
-    for mark in ('\t', ';', ',', ' '):
-        counts = [
-            len(re.split(' +', line.strip())) if mark == ' ' else line.count(mark) + 1
-            for line in lines
-        ]
+    best, most = 'comma', 0
+    for name in ('tab', 'semicolon', 'comma', 'space'):
+        mark = SEPARATORS[name]
+        counts = [len(line.split() if mark == ' ' else line.split(mark)) for line in lines]
         usual = max(set(counts), key=counts.count)
         agreed = counts.count(usual) if usual > 1 else 0
         if agreed > 1.2 * most:
-            best, most = mark, agreed
-    name = next(name for name, mark in SEPARATORS.items() if mark == best)
-    if best != ',':
-        notes.append(f'cells are separated by {name}s (--separator)')
-    return best
+            best, most = name, agreed
+    if best != 'comma':
+        notes.append(f'cells are separated by {best}s (--separator)')
+    return SEPARATORS[best]
 
 
 def _decimal(rows: Sequence[Row], separator: str, notes: list[str]) -> str:
-    """Return the decimal sign of the numbers."""
-    if separator == ',':
+    commas = any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells)
+    if separator == ',' or not commas:
         return '.'
-    if any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells):
-        notes.append('numbers have decimal commas (--decimal)')
-        return ','
-    return '.'
+    notes.append('numbers have decimal commas (--decimal)')
+    return ','
 
 
 def _cells(path: Path, text: str, separator: str) -> list[Row]:
@@ -225,10 +220,7 @@ def _cells(path: Path, text: str, separator: str) -> list[Row]:
 
 
 def _header(
-    path: Path,
-    rows: Sequence[Row],
-    names: Sequence[str],
-    known: Sequence[str],
+    path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]
 ) -> tuple[int, tuple[str, ...]]:
     """Return where the header is among the rows, and its names; -1 where there is none."""
     wanted = {name for name in names if not name.startswith('#')}
@@ -243,9 +235,7 @@ def _header(
         if len(missing) < len(best[1]):
             best = (k, missing)
     if not wanted:
-        if names:
-            return -1, ()
-        return 0, tuple(rows[0][1])
+        return (-1, ()) if names else (0, tuple(rows[0][1]))
     found = ', '.join(f'"{cell}"' for cell in rows[best[0]][1] if cell)
     raise InputError(
         f'{path} has no column {", ".join(sorted(best[1]))}; line {rows[best[0]][0]} has {found}'
@@ -253,14 +243,8 @@ def _header(
 
 
 def _first(
-    path: Path,
-    rows: Sequence[Row],
-    at: int,
-    used: Sequence[int],
-    decimal: str,
-    notes: list[str],
+    path: Path, rows: Sequence[Row], at: int, used: Sequence[int], decimal: str, notes: list[str]
 ) -> int:
-    """Return which row is the first of numbers, after the header and lines of units."""
     limit = HEAD if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]
@@ -270,10 +254,6 @@ def _first(
                 notes.append(f'there are no numbers in {left}: left out')
             return k
     raise InputError(f'{path} has no rows of numbers in the columns that are named')
-
-
-def _dotted(cells: Sequence[str]) -> list[str]:
-    return [cell.replace(',', '.') for cell in cells]
 
 
 def _is_number(cell: str, decimal: str) -> bool:

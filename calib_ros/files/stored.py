@@ -1,20 +1,34 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of an open bag, in the order in which they were logged."""
+"""The messages that are stored in a recording.
+
+An intact one is read by its index. A damaged one, cut off or never closed by its recorder, has
+none, so its files are read from their beginning up to the damage. So are those that the library,
+which trusts them, must not open.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+import mmap
+import re
+import shutil
+import sqlite3
+import struct
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from calib_ros.errors import MOST_ENTRIES
-from calib_ros.files.mcap import Room, logged, unpacked, unpacked_size
-from calib_ros.files.salvage import Salvage
+from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
+from calib_ros.files import mcap
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import PICTURES
-from calib_ros.texts import LARGEST_TABLE
+from calib_ros.texts import LARGEST_TABLE, parse_yaml, read_text
 
 if TYPE_CHECKING:
     from rosbags.rosbag2 import Reader
@@ -27,6 +41,224 @@ LARGEST_MESSAGE = 64 * MOST_ENTRIES
 """Bytes of a message: those of a joint in a joint state, its name and three numbers, for each."""
 LARGEST_IMAGE = 2 * LARGEST_TABLE
 """Bytes of an image, as a message or a file."""
+NOT_CLOSED = 'the recording was not closed'
+GROWING = {
+    'topics': 'SELECT id FROM topics NOT INDEXED',
+    'messages': 'SELECT id FROM messages NOT INDEXED',
+    'message_definitions': 'SELECT id FROM message_definitions NOT INDEXED',
+    'timestamp_idx': 'SELECT timestamp, id FROM messages INDEXED BY timestamp_idx ORDER BY 1, 2',
+}
+"""What must grow from row to row; in a file that was made to be endless it comes again."""
+_PLAIN = re.compile(r'CREATE (TABLE|INDEX) (?!.*\b(AS|GENERATED)\b)', re.IGNORECASE | re.DOTALL)
+_NUMBERED = re.compile(r'[^(]*\(\s*id INTEGER PRIMARY KEY', re.IGNORECASE)
+
+
+def recorded(path: Path) -> int | None:
+    """Return how many messages the recorder says it has written; None when it does not."""
+    try:
+        text = read_text(path / 'metadata.yaml')
+    except ConfigError:
+        return None
+    found = re.search(r'^  message_count: ([0-9]{1,15})\s*$', text, re.MULTILINE)
+    return None if found is None else int(found.group(1))
+
+
+@contextmanager
+def unpacked_files(path: Path) -> Iterator[Path]:
+    """Give a bag whose files are whole: it itself, or one that goes away again.
+
+    Neither are they compressed, nor is a part of them in a write-ahead log beside.
+    """
+    files = _files(path, '.mcap', '.db3', '.zstd')
+    if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
+        yield path
+        return
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for file in files:
+            if file.suffix != '.zstd':
+                _with_log(file, folder / file.name)
+            elif not (folder / file.stem).exists():
+                _unpack_file(file, folder / file.stem)
+        with suppress(ConfigError):
+            text = read_text((path if path.is_dir() else path.parent) / 'metadata.yaml')
+            text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
+            (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
+        yield folder if path.is_dir() else folder / path.name.removesuffix('.zstd')
+
+
+def _log(file: Path) -> Path:
+    """Return where a database has its write-ahead log while it is written, or was when killed."""
+    return file.with_name(f'{file.name}-wal')
+
+
+def _with_log(file: Path, target: Path) -> None:
+    """Copy a file that has a log, with what is in it; link to one that has none."""
+    if not _log(file).is_file():
+        target.symlink_to(file.resolve())
+        return
+    shutil.copyfile(file, target)
+    shutil.copyfile(_log(file), _log(target))
+    try:
+        with closing(sqlite3.connect(target)) as connection:
+            _, pages, _ = connection.execute('PRAGMA wal_checkpoint').fetchone()
+    except sqlite3.OperationalError as err:  # of a full disk
+        raise InputError(f'{_log(file)} cannot be applied to a copy of {file}: {err}') from err
+    except sqlite3.DatabaseError:  # no database; what is missing will be told
+        return
+    if pages == 0 and _log(file).stat().st_size > 32:  # its head, before any page
+        raise InputError(
+            f'{_log(file)} is damaged, what was recorded last cannot be read: copy it again, or '
+            'move it away to use the rest'
+        )
+
+
+def _unpack_file(file: Path, target: Path) -> None:
+    room = mcap.Room(file.stat().st_size)
+    try:
+        with target.open('wb') as out, mcap.open_zstd(file) as packed:
+            while part := packed.read(1 << 20):
+                room.take(len(part))
+                out.write(part)
+    except InputError as err:
+        raise InputError(f'{file} is too large: {err}') from err
+    except OSError:  # of a full disk
+        raise
+    except Exception:  # decompressors have errors of their own; what is missing will be told
+        return
+
+
+def named(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
+    """Return the types of topics; a database may hold something else than text for both."""
+    return {name: kind for name, kind in topics if isinstance(name, str) and isinstance(kind, str)}
+
+
+def check(path: Path) -> None:
+    """Refuse a bag folder or file that the library must not open, though messages may be in it."""
+    metadata = path / 'metadata.yaml'
+    if metadata.exists():
+        parse_yaml(read_text(metadata), str(metadata))
+    for file in _files(path):
+        if file.suffix == '.db3':
+            with closing(_open(file)) as connection:
+                _check_layout(connection)
+                names = connection.execute('SELECT name FROM sqlite_master').fetchall()
+                for name in {name for (name,) in names} & set(GROWING):
+                    deque(_growing(connection.execute(GROWING[name]), name), maxlen=0)
+        elif not mcap.is_indexed(file):
+            raise ValueError('it has no index, and no messages could be found without')
+
+
+@dataclass
+class Salvage:
+    """Topics with their types, how many messages there are, and what is wrong; empty if nothing.
+
+    `whole` tells whether each file could be read to its end.
+    """
+
+    files: tuple[Path, ...]
+    topics: dict[str, str] = field(default_factory=dict)
+    count: int = 0
+    problem: str = ''
+    whole: bool = True
+
+    def messages(self) -> Iterator[tuple[str, bytes]]:
+        """Yield the serialised messages as (topic, data), up to the damage in each file."""
+        for file in self.files:
+            yield from (_of_sqlite3 if file.suffix == '.db3' else _of_mcap)(file, self)
+
+    def note(self, problem: str) -> None:
+        """Note why a file could not be read to its end."""
+        self.problem, self.whole = problem, False
+
+    def on(self, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
+        """Yield the messages on some topics, as what these carry."""
+        return ((streams[topic], data) for topic, data in self.messages() if topic in streams)
+
+
+def salvage(path: Path) -> Salvage | None:
+    """Return what can be read of a bag folder or file; None when nothing can."""
+    found = Salvage(_files(path))
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        found.problem = NOT_CLOSED
+    found.count = sum(1 for _ in found.messages())
+    return found if found.count else None
+
+
+def _files(path: Path, *kinds: str) -> tuple[Path, ...]:
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    return tuple(file for file in files if file.suffix in (kinds or ('.mcap', '.db3')))
+
+
+def _open(file: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f'{file.resolve().as_uri()}?mode=ro&immutable=1', uri=True)
+
+
+def _check_layout(connection: sqlite3.Connection) -> None:
+    """Refuse a database that computes what it holds: views, virtual tables and columns."""
+    for name, statement in connection.execute('SELECT name, sql FROM sqlite_master'):
+        if statement is None:  # an index that comes with a table
+            continue
+        plain = isinstance(statement, str) and _PLAIN.match(statement)
+        if not plain or (name in ('topics', 'messages') and not _NUMBERED.match(statement)):
+            raise ValueError(f'"{name}" is not what a recorder makes')
+
+
+def _growing(rows: Iterable[tuple[Any, ...]], name: str) -> Iterator[tuple[Any, ...]]:
+    """Yield rows whose first cell grows, or the first two together."""
+    before: tuple[Any, ...] | None = None
+    for row in rows:
+        if before is not None and row[:2] <= before:
+            raise ValueError(f'rows of "{name}" come again')
+        before = row[:2]
+        yield row
+
+
+def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
+    with closing(_open(file)) as connection:
+        try:
+            connection.execute('PRAGMA writable_schema=ON')
+            _check_layout(connection)
+            rows = connection.execute('SELECT id, name, type FROM topics')
+            topics = {key: (name, kind) for key, name, kind in _growing(rows, 'topics')}
+            found.topics |= named(topics.values())
+            rows = connection.execute('SELECT id, topic_id, data FROM messages ORDER BY id')
+            for _, key, data in _growing(rows, 'messages'):
+                yield topics[key][0], data
+            (pages,) = connection.execute('PRAGMA page_count').fetchone()
+            (size,) = connection.execute('PRAGMA page_size').fetchone()
+            if pages * size > file.stat().st_size:
+                found.note('the file is cut off')
+        except Exception as err:  # numbers, texts and names may be anything
+            found.note(str(err) or type(err).__name__)
+
+
+def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
+    schemas: dict[int, str] = {}
+    channels: dict[int, str] = {}
+    try:
+        with (
+            file.open('rb') as opened,
+            closing(mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ)) as content,
+        ):
+            if content[: len(mcap.MAGIC)] != mcap.MAGIC:
+                raise ValueError('no mcap file')
+            for kind, record in mcap.records(content, len(mcap.MAGIC)):
+                if kind == mcap.SCHEMA:
+                    (key,) = struct.unpack_from('<H', record)
+                    schemas[key] = mcap.string(record, 2)
+                elif kind == mcap.CHANNEL:
+                    key, schema = struct.unpack_from('<HH', record)
+                    channels[key] = mcap.string(record, 4)
+                    found.topics[channels[key]] = schemas[schema]
+                elif kind == mcap.MESSAGE:
+                    (key,) = struct.unpack_from('<H', record)
+                    yield channels[key], record[mcap.MESSAGE_HEAD :]
+                elif kind == mcap.DATA_END:
+                    return
+        found.problem = NOT_CLOSED
+    except Exception as err:  # decompressors have errors of their own
+        found.note(f'cut off or damaged: {err}')
 
 
 def largest(stream: Stream) -> int:
@@ -43,12 +275,8 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
     storage = getattr(reader, 'storage', None)
     storages = getattr(storage, 'storages', [storage])
     if not all(map(_is_known, storages)):
-        connections = [c for c in reader.connections if c.topic in streams]
-        return (
-            (streams[c.topic], data)
-            for c, _, data in reader.messages(connections)
-            if c.msgtype == streams[c.topic].type
-        )
+        connections = _wanted(reader, streams)
+        return ((streams[c.topic], data) for c, _, data in reader.messages(connections))
     found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
     if reader.compression_mode == 'message':
         return ((stream, _unpacked(data, largest(stream))) for stream, data in found)
@@ -58,11 +286,16 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
 def _unpacked(data: bytes, most: int) -> bytes:
     """Return a message, without any bytes where it cannot be unpacked: the next one may be."""
     try:
-        return unpacked(data, 'zstd', most)
+        return mcap.unpacked(data, 'zstd', most)
     except OSError:  # nothing to unpack with
         raise
     except Exception:  # decompressors have errors of their own
         return b''
+
+
+def _wanted(storage: Any, streams: Mapping[str, Stream]) -> list[Any]:
+    connections = (each for each in storage.connections if each.topic in streams)
+    return [each for each in connections if each.msgtype == streams[each.topic].type]
 
 
 def _is_known(storage: Any) -> bool:
@@ -76,11 +309,7 @@ def _is_known(storage: Any) -> bool:
 
 def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
     """Yield the messages of a file; what is wrong with a chunk is raised at the end."""
-    wanted = [
-        each
-        for each in storage.connections
-        if each.topic in streams and each.msgtype == streams[each.topic].type
-    ]
+    wanted = _wanted(storage, streams)
     channels = {each.id: streams[each.topic] for each in wanted}
     if hasattr(storage, 'dbconn'):
         if wanted:
@@ -93,7 +322,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
             raise ValueError(whole.problem)
         return
     with storage.path.open('rb') as file:
-        room = Room(storage.path.stat().st_size)
+        room = mcap.Room(storage.path.stat().st_size)
         problem: Exception | None = None
         for overlapping in _together(storage.chunks, channels):
             found: list[tuple[int, Stream, bytes]] = []
@@ -101,8 +330,8 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
                 file.seek(chunk.chunk_start_offset)
                 try:
                     data = file.read(chunk.chunk_length)
-                    room.take(unpacked_size(data))
-                    messages, wrong = logged(data, channels)
+                    room.take(mcap.unpacked_size(data))
+                    messages, wrong = mcap.logged(data, channels)
                 except Exception as err:  # see `replay`
                     messages, wrong = [], err
                 found += messages

@@ -5,8 +5,9 @@
 Joint values are in q1 ... qn. What was measured shows in the cells of the row that are filled: a
 pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), that a
 ball sat in a socket (location, socket) or that a plane was touched (plane), whose places are not
-known. A pose may be that of a board whose corners are in the row (view). Rows of all kinds may
-stand in one table.
+known. A pose may be that of a board whose corners are in the row (view): the lens, fx fy cx cy k1
+k2 p1 p2 k3 and whether it is fixed (1 or 0), then x y z u v of each corner, joined by semicolons.
+Rows of all kinds may stand in one table.
 """
 
 from __future__ import annotations
@@ -21,18 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.escapes import to_cell
 from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import (
-    COVARIANCE,
-    POSITION,
-    QUATERNION,
-    TURNS,
-    UPPER,
-    joint_columns,
-)
+from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
 from calib_ros.files.measurements import (
     DISTANCE,
     PLANE,
@@ -42,15 +35,16 @@ from calib_ros.files.measurements import (
     joined,
     measurements,
 )
-from calib_ros.files.views import view_cell, view_of
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.problems import Measured
-from calib_ros.sampling.sample import Frames, Sample, collect, lenses, sets_of, socket_pairs
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes
+from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
+from calib_ros.values import parse_number
 
 Sets = tuple[Observations, ...]
 
@@ -113,7 +107,6 @@ def read_table(
 
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
-    """Yield which columns are not read that someone may have wanted to be."""
     if f'q{joints + 1}' in found.header:
         yield f'{found.path}: the column q{joints + 1} is left out: the arm has {joints} joints'
     if {*TURNS} <= {*found.header} and QUATERNION[0] not in found.header:
@@ -130,7 +123,15 @@ def table_of(
     warnings: tuple[str, ...] = (),
 ) -> Table:
     """Return the table of columns; the arguments are those of `read_table`."""
-    made = measurements(_of_sessions(found, joints, sessions), joints)
+    if not len(found.lines):
+        measurements(found, joints)  # a column that is missing says more
+        raise InputError(f'{found.path} has no rows')
+    if 'session' not in found.header and sessions:
+        names = ', '.join(sessions)
+        raise InputError(f'{found.path} has no column "session" to choose "{names}" from')
+    rows = _rows_of(found.path, found.labels('session'), sessions)
+    chosen = found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
+    made = measurements(chosen, joints)
     return _table(made, sigmas, eye_in_hand, warnings, 'stamp_ns' not in found.header)
 
 
@@ -141,7 +142,6 @@ def _table(
     warnings: tuple[str, ...],
     by_line: bool = False,
 ) -> Table:
-    """Return the table of the rows of some sessions."""
     made = made.kept()
     made.check_frames()
     if made.test.all():
@@ -156,8 +156,7 @@ def _table(
         fitted, held_out = collect(samples, sigmas, frames)
         pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
     place, names = made.frame_id
-    first = np.flatnonzero(np.array([bool(name) for name in names])[place])[:1]
-    world_frame = names[place[first[0]]] if len(first) else ''
+    world_frame = next((names[k] for k in place.tolist() if names[k]), '')
     return Table(fitted, held_out, pairs, world_frame, cameras, warnings, by_line)
 
 
@@ -242,7 +241,6 @@ def _of_journal(
 
 
 def _samples(made: Measurements) -> Iterator[Sample]:
-    """Yield the rows one by one."""
     for k, kind in enumerate(made.kind.tolist()):
         texts: dict[str, Any] = {
             name: getattr(made, name)[1][getattr(made, name)[0][k]]
@@ -263,7 +261,7 @@ def _samples(made: Measurements) -> Iterator[Sample]:
             distance=float(made.distance[k]) if kind in (DISTANCE, PLANE) else None,
             socket=kind == SOCKET,
             plane=kind == PLANE,
-            view=view_of(view, where) if view else None,
+            view=_view_of(view, where) if view else None,
             eye_in_hand=bool(made.eye_in_hand[k]),
             validation=bool(made.test[k]),
             delay=float(made.delay[k]),
@@ -304,8 +302,26 @@ def cells(sample: Sample, split: str | None = None) -> list[str]:
     row += [repr(sample.delay), str(sample.count), repr(sample.spread)]
     row.append(to_cell(sample.session))
     row.append(split or ('test' if sample.validation else 'train'))
-    view = '' if sample.view is None else view_cell(sample.view)
+    view = '' if sample.view is None else _view_cell(sample.view)
     return [*row, *map(to_cell, place), view]
+
+
+def _view_cell(view: View) -> str:
+    rows = np.column_stack([view.points, view.pixels]).tolist()
+    lens = [*view.lens.values.values(), int(view.lens.fixed)]
+    return ';'.join(' '.join(map(repr, row)) for row in (lens, *rows))
+
+
+def _view_of(text: str, where: str) -> View:
+    first, *rows = [
+        [parse_number(cell, where, InputError) for cell in part.split(' ')]
+        for part in text.split(';')
+    ]
+    if len(first) != len(LENS_KINDS) + 1 or not rows or any(len(row) != 5 for row in rows):
+        raise InputError(f'{where} must be a lens of 10 numbers, then x y z u v of each corner')
+    corners = np.array(rows)
+    values = dict(zip(LENS_KINDS, first, strict=False))
+    return View(corners[:, :3], corners[:, 3:], Lens(**values, fixed=bool(first[-1])))
 
 
 def table_text(samples: Sequence[Sample], joints: int) -> str:
@@ -318,32 +334,17 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
 
 def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
     """Return the content of a table, and warnings; `journal` is the header of one."""
-    data = whole = read_bytes(path, LARGEST_TABLE, InputError)
+    data = read_bytes(path, LARGEST_TABLE, InputError)
     header = ','.join(journal).encode() + b'\n'
     if data and header.startswith(data):
         return header, ()
-    if data.startswith(header):
-        whole = data[: data.rfind(b'\n') + 1]
-    if len(whole) < len(data):
-        line = whole.count(b'\n') + 1
-        return whole, (_cut_off(path, line),)
-    return data, ()
+    whole = data[: data.rfind(b'\n') + 1] if data.startswith(header) else data
+    warnings = (_cut_off(path, whole.count(b'\n') + 1),) if len(whole) < len(data) else ()
+    return whole, warnings
 
 
 def _cut_off(path: Path, line: int) -> str:
     return f'{path}: line {line} was cut off and is left out'
-
-
-def _of_sessions(found: Columns, joints: int, sessions: Sequence[str]) -> Columns:
-    """Return the rows of the sessions that are asked for, session by session."""
-    path = found.path
-    if not len(found.lines):
-        measurements(found, joints)  # a column that is missing says more
-        raise InputError(f'{path} has no rows')
-    if 'session' not in found.header and sessions:
-        raise InputError(f'{path} has no column "session" to choose "{", ".join(sessions)}" from')
-    rows = _rows_of(path, found.labels('session'), sessions)
-    return found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:
@@ -354,8 +355,8 @@ def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.i
             f'{path} holds several sessions, choose one of {", ".join(known)} (or several, '
             'joined by commas, to fit them together)'
         )
-    for name in sessions:
-        if list(sessions).count(name) > 1:
+    for k, name in enumerate(sessions):
+        if name in sessions[:k]:
             raise InputError(f'session "{name}" is named twice')
         if name not in known:
             raise UnknownNameError(f'session in {path}', name, known)

@@ -18,69 +18,52 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.files import layouts
 from calib_ros.files.columns import MadeColumns, check_quaternions
-from calib_ros.files.layouts import (
-    COVARIANCE,
-    IN_TURN,
-    POSITION,
-    QUATERNION,
-    SIGMAS,
-    TURNS,
-    UPPER,
-    Layout,
-)
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.se3 import FloatArray
 
 
-def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
+def finished(made: MadeColumns, layout: layouts.Layout) -> MadeColumns:
     """Return the columns with quaternions for rotations, covariances for standard deviations."""
     path, values, words = made.path, dict(made.values), dict(made.words)
     time = values.pop('time', None)
     if time is not None:
-        if np.isnan(time).any() or np.abs(time).max(initial=0.0) > 9e9:
-            line = made.lines[int(np.argmax(~(np.abs(time) <= 9e9)))]
+        for line in made.lines[~(np.abs(time) <= 9e9)][:1].tolist():
             raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
         words['stamp_ns'] = [str(round(each * 1e9)) for each in time.tolist()]
     rotation, axes = _rotations(values, layout, made)
-    sigmas = [values.pop(name, None) for name in SIGMAS]
-    for name in (*TURNS, *IN_TURN):
+    sigmas = [values.pop(name, None) for name in layouts.SIGMAS]
+    for name in (*layouts.TURNS, *layouts.IN_TURN):
         values.pop(name, None)
     covariance = _covariance(sigmas, axes, path)
     if layout.inverse:
-        if rotation is None or not set(POSITION) <= set(values):
+        if rotation is None or not set(layouts.POSITION) <= set(values):
             raise ConfigError('--inverse needs poses with their rotations')
-        given = np.column_stack([values[name] for name in POSITION])
-        count = len(made.lines)
-        turned = Observations(
-            np.arange(count),
-            np.zeros((count, 1)),
-            given,
-            rotation,
-            np.ones(count, bool),
-            covariance,
-        ).inverted()
-        values |= dict(zip(POSITION, turned.positions.T, strict=True))
+        given = np.column_stack([values[name] for name in layouts.POSITION])
+        poses = Observations.from_arrays(np.zeros((len(given), 1)), given, rotation)
+        turned = replace(poses, covariance=covariance).inverted()
+        values |= dict(zip(layouts.POSITION, turned.positions.T, strict=True))
         rotation, covariance = turned.rotations, turned.covariance
     if rotation is not None:
-        values |= dict(zip(QUATERNION, se3.to_quat(rotation).T, strict=True))
+        values |= dict(zip(layouts.QUATERNION, se3.to_quat(rotation).T, strict=True))
     if covariance is not None:
-        rows, columns = np.transpose(UPPER)
-        values |= dict(zip(COVARIANCE, covariance[:, rows, columns].T, strict=True))
+        rows, columns = np.transpose(layouts.UPPER)
+        values |= dict(zip(layouts.COVARIANCE, covariance[:, rows, columns].T, strict=True))
     return replace(made, values=values, words=words)
 
 
 def _rotations(
-    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
+    values: dict[str, FloatArray], layout: layouts.Layout, made: MadeColumns
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns that standard deviations are
     about; None where there are none.
     """
-    if set(QUATERNION) & set(values):
+    if set(layouts.QUATERNION) & set(values):
         return _from_quaternions(values, layout, made)
-    three = [name for name in (TURNS, IN_TURN) if set(name) & set(values)]
+    three = [each for each in (layouts.TURNS, layouts.IN_TURN) if set(each) & set(values)]
     if not three:
         for name in ('euler', 'rotation_vector', 'quaternion'):
             if getattr(layout, name):
@@ -89,19 +72,17 @@ def _rotations(
                     'rx=NAME,ry=NAME,rz=NAME (or qx, qy, qz, qw)'
                 )
         return None, None
-    names = three[0]
+    names, called = three[0], ', '.join(three[0])
     missing = [name for name in names if name not in values]
     if missing or len(three) > 1:
         raise ConfigError(
             f'{made.path}: give rx, ry, rz or r1, r2, r3, all three; missing {missing}'
         )
     angles = np.column_stack([values[name] for name in names])
-    _require_whole(angles, made, ', '.join(names))
-    large = np.abs(angles).max(axis=1) > TWO_TURNS
-    if large.any():
-        row = int(np.argmax(large))
+    _require_whole(angles, made, called)
+    for row in np.flatnonzero(np.abs(angles).max(axis=1) > TWO_TURNS)[:1].tolist():
         raise InputError(
-            f'{made.where(row, ", ".join(names))} are angles of up to '
+            f'{made.where(row, called)} are angles of up to '
             f'{np.abs(angles[row]).max():.6g} rad: if they are in degrees, give --angle deg '
             '(and --joint-angle rad if the joint values are in radians)'
         )
@@ -110,11 +91,11 @@ def _rotations(
         return se3.exp_rotation(angles), np.asarray(left)
     if not layout.euler:
         raise ConfigError(
-            f'{made.path} has {", ".join(names)}: say what they are, --euler XYZ (or ZYX, '
+            f'{made.path} has {called}: say what they are, --euler XYZ (or ZYX, '
             'zyx, ...) or --rotation-vector'
         )
     letters = layout.euler
-    if names == TURNS:
+    if names == layouts.TURNS:
         if len(set(letters.upper())) < 3:
             raise ConfigError(
                 f'with --euler {letters} an axis comes twice: give r1, r2, r3 in its order'
@@ -122,26 +103,24 @@ def _rotations(
         angles = angles[:, ['XYZ'.index(letter) for letter in letters.upper()]]
     axes = np.zeros((len(angles), 3, 3))
     turned = np.tile(np.eye(3), (len(angles), 1, 1))
-    order = range(3) if letters.isupper() else range(2, -1, -1)
-    for k in order:
+    for k in range(3) if letters.isupper() else (2, 1, 0):
         unit = 'XYZ'.index(letters[k].upper())
         axes[:, :, k] = turned[:, :, unit]
         turned = turned @ se3.exp_rotation(np.eye(3)[unit] * angles[:, k, np.newaxis])
-    if names == TURNS:  # columns in the order of rx, ry, rz
+    if names == layouts.TURNS:  # columns in the order of rx, ry, rz
         axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
     return turned, axes
 
 
 def _from_quaternions(
-    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
+    values: dict[str, FloatArray], layout: layouts.Layout, made: MadeColumns
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rotations, and the device's axes."""
-    missing = [name for name in QUATERNION if name not in values]
+    missing = [name for name in layouts.QUATERNION if name not in values]
     if missing:
         raise ConfigError(
             f'{made.path}: a quaternion has four columns, missing {", ".join(missing)}'
         )
-    quat = np.column_stack([values[name] for name in QUATERNION])
+    quat = np.column_stack([values[name] for name in layouts.QUATERNION])
     if layout.quaternion == 'wxyz':
         quat = quat[:, [1, 2, 3, 0]]
     _require_whole(quat, made, 'qx, qy, qz, qw')
@@ -150,9 +129,7 @@ def _from_quaternions(
 
 
 def _require_whole(values: FloatArray, made: MadeColumns, names: str) -> None:
-    nothing = np.isnan(values).any(axis=1)
-    if nothing.any():
-        row = int(np.argmax(nothing))
+    for row in np.flatnonzero(np.isnan(values).any(axis=1))[:1].tolist():
         raise InputError(f'{made.where(row, names)} must be numbers, not blank')
 
 
@@ -160,21 +137,18 @@ def _covariance(
     sigmas: Sequence[FloatArray | None], axes: FloatArray | None, path: Path
 ) -> FloatArray | None:
     """Return covariances (N, 6, 6) of standard deviations (N,); None where there are none."""
-    place = sigmas[:3]
-    if all(each is None for each in sigmas):
+    place, turn = ([x for x in each if x is not None] for each in (sigmas[:3], sigmas[3:]))
+    if not place and not turn:
         return None
-    if any(each is None for each in place):
+    if len(place) < 3:
         raise ConfigError(f'{path}: standard deviations need sx, sy and sz')
-    turn = [each for each in sigmas[3:] if each is not None]
     if turn and (len(turn) < 3 or axes is None):
         raise ConfigError(
             f'{path}: standard deviations of rotations need srx, sry, srz, and rotations'
         )
-    position = np.column_stack([each for each in place if each is not None])
-    found = np.zeros((len(position), 6, 6))
-    found[:, :3, :3] = np.square(position)[:, :, np.newaxis] * np.eye(3)
-    if turn:
-        assert axes is not None
+    found = np.zeros((len(place[0]), 6, 6))
+    found[:, :3, :3] = np.square(np.column_stack(place))[:, :, np.newaxis] * np.eye(3)
+    if turn and axes is not None:
         scaled = axes * np.column_stack(turn)[:, np.newaxis, :]
         found[:, 3:, 3:] = scaled @ np.swapaxes(scaled, 1, 2)
     return found

@@ -24,17 +24,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros.errors import ConfigError
-from calib_ros.files.export import (
-    Export,
-    anywhere,
-    checked,
-    converted,
-    head,
-    origins,
-    pose_matrix,
-    walked,
-    xyz_rpy,
-)
+from calib_ros.files import export
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import table_hash
@@ -63,6 +53,11 @@ class Vendor:
     height: float = 0.0
     families: tuple[str, ...] = ('',)
 
+    @property
+    def all_keys(self) -> tuple[str, ...]:
+        """Return the keys in the file, that of the end last."""
+        return self.keys if self.end is None else (*self.keys, self.end)
+
     def describes(self, chain: Chain) -> bool:
         """Tell whether a chain has the joints of this vendor's arms."""
         names = chain.joint_names
@@ -74,7 +69,7 @@ class Vendor:
         )
 
     def has_layout(self, places: FloatArray) -> bool:
-        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths.
+        """Tell whether nominal export.origins (N, 4, 4) are those of this vendor, but for lengths.
 
         To 0.1 rad, since layouts differ by quarters of a turn, and to 0.01 m of the flange behind
         the last axis: elsewhere a tool is part of the table.
@@ -116,7 +111,7 @@ def vendor_files(
     urdf: str = '',
     links: Mapping[str, str | None] | None = None,
     checksum: str = '',
-) -> tuple[Export, ...]:
+) -> tuple[export.Export, ...]:
     """Return a corrected chain as the files of the vendor that its joints are named by, if any.
 
     `origin` is for the record. Frames are those of the nominal `urdf`, if given, which has the
@@ -135,24 +130,22 @@ def vendor_files(
             continue
         arm = replace(chain, effects=(), frames=())
         if vendor.end is None and arm.convention == 'standard':
-            arm = _with_last_link_of(nominal, arm)
+            # The last frame of the file is on the last axis: what follows belongs to the tool.
+            before, last = nominal.joints[-1], arm.joints[-1]
+            last = replace(last, **{name: getattr(before, name) for name in export.TAIL})
+            arm = replace(arm, joints=(*arm.joints[:-1], last))
         layouts = [_layout(vendor, each, urdf, links or {}) for each in (nominal, arm)]
         if layouts[0] is None or layouts[1] is None or not vendor.has_layout(layouts[0][0]):
             continue
         places, reference = layouts[1]
-        document = _document(vendor, places, origin, checksum)
-        found.append(_checked(vendor, chain, arm, reference, document))
+        q = export.anywhere(chain)
+        shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
+        lost = float(np.linalg.norm(shift, axis=1).max())
+        text = export.head(chain, 'kinematics', lost, table_hash(chain))
+        text += _document(vendor, places, origin, checksum)
+        again = forward_of(text, vendor, q)
+        found.append(export.checked(vendor.file, text, again, reference.forward(q), lost))
     return tuple(found)
-
-
-def _checked(vendor: Vendor, chain: Chain, arm: Chain, reference: Chain, document: str) -> Export:
-    """Return the file of an arm, read back and compared with the chain that it stands for."""
-    q = anywhere(chain)
-    shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
-    lost = float(np.linalg.norm(shift, axis=1).max())
-    content = head(chain, 'kinematics', lost, table_hash(chain)) + document
-    again = forward_of(content, vendor, q)
-    return checked(vendor.file, content, again, reference.forward(q), lost)
 
 
 def forward_of(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
@@ -160,40 +153,23 @@ def forward_of(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
     import yaml
 
     document = yaml.safe_load(text)
-    pose = walked([pose_matrix(_entry(document, vendor, key)) for key in vendor.keys], q)
-    if vendor.end is not None:
-        pose = pose @ pose_matrix(_entry(document, vendor, vendor.end))
-    return pose
-
-
-def _entry(document: Mapping[str, Any], vendor: Vendor, key: str) -> Mapping[str, float]:
-    entry: Mapping[str, float] = (
-        document['kinematics'][key] if vendor is UR else document[key]['kinematic']
-    )
-    return entry
+    poses = document['kinematics'] if vendor is UR else document
+    entries = [poses[key] if vendor is UR else poses[key]['kinematic'] for key in vendor.all_keys]
+    places = [export.pose_matrix(entry) for entry in entries]
+    pose = export.walked(places[: len(vendor.keys)], q)
+    return pose if vendor.end is None else pose @ places[-1]
 
 
 def _document(
     vendor: Vendor, places: FloatArray, origin: Mapping[str, Any] | None, checksum: str
 ) -> str:
-    keys = vendor.keys if vendor.end is None else (*vendor.keys, vendor.end)
-    poses = {key: xyz_rpy(place) for key, place in zip(keys, places, strict=True)}
+    poses = {k: export.xyz_rpy(place) for k, place in zip(vendor.all_keys, places, strict=True)}
     if vendor is UR:
         number = int(hashlib.sha256(dump_yaml(poses).encode()).hexdigest()[:16], 16)
         document: dict[str, Any] = {'kinematics': {**poses, 'hash': checksum or f'calib_{number}'}}
     else:
         document = {key: {'kinematic': pose} for key, pose in poses.items()}
     return dump_yaml({**document, 'calibration': dict(origin)} if origin else document)
-
-
-def _with_last_link_of(nominal: Chain, arm: Chain) -> Chain:
-    """Return an arm with what follows its last axis as it is nominally.
-
-    The last frame of the file is on that axis: the rest belongs to the tool.
-    """
-    last, before = arm.joints[-1], nominal.joints[-1]
-    last = replace(last, a=before.a, alpha=before.alpha, beta=before.beta)
-    return replace(arm, joints=(*arm.joints[:-1], last))
 
 
 def _layout(
@@ -203,15 +179,15 @@ def _layout(
     if urdf:
         return _layout_of_urdf(vendor, arm.joint_names, corrected_urdf(urdf, arm, **links))
     arm = replace(arm, base=Frame(), tool=Frame())
-    form = converted(arm, 'modified')
-    places = origins(form)
+    form = export.converted(arm, 'modified')
+    places = export.origins(form)
     if vendor.end is None:  # the flange of the table is the last frame
         return (places[:-1], arm) if np.allclose(places[-1], np.eye(4), atol=SAME) else None
     # The vendor has what the table calls d of the last joint behind it.
     last = form.joints[-1]
     shift = np.eye(4)
     shift[2, 3] = last.d
-    places = origins(replace(form, joints=(*form.joints[:-1], replace(last, d=0.0))))
+    places = export.origins(replace(form, joints=(*form.joints[:-1], replace(last, d=0.0))))
     places[-1] = shift @ places[-1]
     return places, arm
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
-from calib_ros.files.rows import parse_serial, settings_hash
+from calib_ros.files.history import parse_serial, settings_hash
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import EXCEPTION, Settings
@@ -86,24 +86,17 @@ def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Rob
     if not isinstance(rows, list) or not rows:
         raise ConfigError(f'{where}: robots must be a list, each with serial, chain and measured')
     chains: dict[str, Chain] = {}
-    robots = [
-        _robot(row, groups, folder, f'{where}: robot {number}', chains)
-        for number, row in enumerate(rows, 1)
-    ]
-    seen: set[str] = set()
-    for robot in robots:
-        if robot.serial in seen:
+    robots: dict[str, Robot] = {}
+    for number, row in enumerate(rows, 1):
+        robot = _robot(row, groups, folder, f'{where}: robot {number}', chains)
+        if robot.serial in robots:
             raise ConfigError(f'{where}: there are two robots with the serial {robot.serial}')
-        seen.add(robot.serial)
-    return tuple(robots)
+        robots[robot.serial] = robot
+    return tuple(robots.values())
 
 
 def _robot(
-    row: object,
-    groups: Mapping[str, Any],
-    folder: Path,
-    where: str,
-    chains: dict[str, Chain],
+    row: object, groups: Mapping[str, Any], folder: Path, where: str, chains: dict[str, Chain]
 ) -> Robot:
     own = parse_mapping(row, KEYS['a robot'], where)
     serial = parse_serial(own.get('serial'), f'{where}: serial')
@@ -116,6 +109,12 @@ def _robot(
     chosen: dict[str, Any] = {}
     for each in (shared, own):
         chosen |= parse_mapping(each.get('settings') or {}, KEYS['settings'], f'{where}: settings')
+    for name, value in chosen.items():
+        chosen[name] = parse_like(getattr(Settings, name), value, f'{where}: {name}')
+    try:
+        settings = Settings(**chosen)
+    except ConfigError as err:
+        raise ConfigError(f'{where}: {err}') from err
     tolerance = given.get('tolerance')
     if tolerance is not None:
         tolerance = parse_number(tolerance, f'{where}: tolerance')
@@ -128,7 +127,7 @@ def _robot(
         serial,
         _chain(given.get('chain'), folder, where, chains),
         _measured(own.get('measured'), folder, where),
-        _settings(chosen, where),
+        settings,
         tolerance,
         loss,
         _moment(own.get('since'), f'{where}: since'),
@@ -165,18 +164,6 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
             raise ConfigError(f'{where}: session must be text, not {session!r}')
         found.append(Measured(files if '://' in files else str(folder / files), session))
     return tuple(found)
-
-
-def _settings(given: Mapping[str, Any], where: str) -> Settings:
-    """Return settings by their names, the others by default."""
-    values = {
-        name: parse_like(getattr(Settings, name), value, f'{where}: {name}')
-        for name, value in given.items()
-    }
-    try:
-        return Settings(**values)
-    except ConfigError as err:
-        raise ConfigError(f'{where}: {err}') from err
 
 
 def _moment(value: object, where: str) -> datetime | None:

@@ -10,7 +10,6 @@ running; the next run does the rest.
 from __future__ import annotations
 
 import logging
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -22,8 +21,7 @@ from urllib.parse import quote
 import calib_ros
 from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, shortened
-from calib_ros.files.history import History
-from calib_ros.files.rows import Row
+from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
 from calib_ros.progress import Told, nobody
@@ -124,16 +122,12 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
     last = max(there, key=lambda each: (each.modified or NEVER, each.name))
-    return [
-        Task(
-            robot,
-            source,
-            frozenset(row.inputs for row in rows if row.source == source.name),
-            page=out is not None and source == last,
-        )
-        for source in there
-        if (source.name, source.fingerprint) not in done
-    ]
+    tasks = []
+    for source in there:
+        if (source.name, source.fingerprint) not in done:
+            known = frozenset(row.inputs for row in rows if row.source == source.name)
+            tasks.append(Task(robot, source, known, out is not None and source == last))
+    return tasks
 
 
 def _without_page(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
@@ -175,20 +169,18 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         raise ConfigError(MISSING) from None
     logging.getLogger('distributed.client').setLevel(logging.CRITICAL)  # LostError says it
     with ExitStack() as stack:
-        if cluster.address:
-            where: Any = cluster.address
-        else:
+        where: Any = cluster.address
+        if not where:
             stack.enter_context(dask.config.set(DASK))
-            where = stack.enter_context(
-                LocalCluster(
-                    n_workers=cluster.workers or None,
-                    threads_per_worker=1,
-                    processes=True,
-                    memory_limit=cluster.memory,
-                    dashboard_address='127.0.0.1:0',
-                    silence_logs=logging.ERROR,
-                )
+            local = LocalCluster(
+                n_workers=cluster.workers or None,
+                threads_per_worker=1,
+                processes=True,
+                memory_limit=cluster.memory,
+                dashboard_address='127.0.0.1:0',
+                silence_logs=logging.ERROR,
             )
+            where = stack.enter_context(local)
         try:
             client = stack.enter_context(Client(where, set_as_default=False, timeout=ANSWER_S))
             client.wait_for_workers(1, timeout=ANSWER_S)
@@ -208,47 +200,34 @@ def _version() -> str:
 
 
 def _done(
-    client: Any,
-    tasks: Sequence[Task],
-    work: Callable[[Task], Outcome] = work,
-    span: float = 2.0,
+    client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
 ) -> Iterator[tuple[Task, Outcome]]:
     """Yield tasks with what became of them, as they are done.
 
-    Several make a piece that takes a `span` [s]: much to dask's 4 ms for it, little to lose.
+    Up to four make a piece: much to dask's 4 ms for it, little to lose.
     """
     from distributed import as_completed
 
-    workers = max(1, len(client.nthreads()))
-    waiting, alone = deque(tasks), deque[Task]()
-    running: dict[str, tuple[Task, ...]] = {}
-    seconds, count = 0.0, 0
+    size = max(1, min(4, len(tasks) // (4 * max(1, len(client.nthreads())))))
+    running: dict[str, Sequence[Task]] = {}
 
-    def submitted() -> list[Any]:
-        chosen: list[tuple[Task, ...]] = []
-        while (waiting or alone) and len(running) + len(chosen) < 3 * workers:  # none waits
-            fair = len(waiting) // (2 * workers)
-            fit = span * count / max(seconds, 1e-9)
-            most = 1 if alone else max(1, int(min(fair, fit)))
-            source = alone or waiting
-            chosen.append(tuple(source.popleft() for _ in range(most)))
-        futures = client.map(_all, chosen, [work] * len(chosen), pure=False) if chosen else []
-        running.update(zip((future.key for future in futures), chosen, strict=True))
+    def submitted(pieces: Sequence[Sequence[Task]]) -> list[Any]:
+        futures = client.map(_all, pieces, [work] * len(pieces), pure=False)
+        running.update(zip((future.key for future in futures), pieces, strict=True))
         return list(futures)
 
-    completed = as_completed(submitted(), client.loop, with_results=True, raise_errors=False)
+    futures = submitted([tasks[k : k + size] for k in range(0, len(tasks), size)])
+    completed = as_completed(futures, client.loop, with_results=True, raise_errors=False)
     for future, outcomes in completed:
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are filed, run again')
         done = running.pop(future.key)
         if future.status == 'error' and len(done) > 1:  # which of them ends a worker?
-            alone.extend(done)
-            outcomes = ()
-        elif future.status == 'error':
+            completed.update(submitted([(task,) for task in done]))
+            continue
+        if future.status == 'error':
             outcomes = (Outcome(error=f'its worker ended: {shortened(str(future.exception()))}'),)
-        seconds, count = seconds + sum(each.seconds for each in outcomes), count + len(outcomes)
-        completed.update(submitted())
-        yield from zip(done, outcomes, strict=False)
+        yield from zip(done, outcomes, strict=True)
 
 
 def _all(tasks: Sequence[Task], work: Callable[[Task], Outcome]) -> tuple[Outcome, ...]:

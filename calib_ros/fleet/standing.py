@@ -1,33 +1,40 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How each robot of a plant stands after a run, the worst first, and as figures for Prometheus."""
+"""How the robots of a plant stand after a run, the worst first: a page, and for Prometheus."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
+import calib_ros
 from calib_ros.apply.confidence import Drift, drift
-from calib_ros.errors import CalibrationError
-from calib_ros.files.history import History
-from calib_ros.files.rows import Row
+from calib_ros.atomic import write_file
+from calib_ros.errors import MOST_ENTRIES, CalibrationError
+from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.run import Run, results
-from calib_ros.fleet.watch import Watched, watch
+from calib_ros.fleet.run import Run, page_path, results
+from calib_ros.fleet.watch import Change, Watched, watch
+from calib_ros.fleet.work import PLOTLY
+from calib_ros.report.page import MARKS, MISSING, State, filled, plotly_script
 
-State: TypeAlias = Literal['changed', 'worse', 'unreadable', 'refused', 'beyond tolerance', 'fine']
-STATES: tuple[State, ...] = get_args(State)
-MEANING: Mapping[State, str] = {
-    'changed': 'the arm is another one than in the nights before',
-    'worse': 'the errors of its verifications have grown',
-    'unreadable': 'some of its measurements could not be used',
-    'refused': 'the newest identification was not accepted',
-    'beyond tolerance': 'the error of the corrected arm is larger than wanted',
-    'fine': 'nothing to do',
+STATES: Mapping[str, tuple[State, str]] = {
+    'changed': ('bad', 'the arm is another one than in the nights before'),
+    'worse': ('bad', 'the errors of its verifications have grown'),
+    'unreadable': ('bad', 'some of its measurements could not be used'),
+    'refused': ('open', 'the newest identification was not accepted'),
+    'beyond tolerance': ('open', 'the error of the corrected arm is larger than wanted'),
+    'fine': ('good', 'nothing to do'),
 }
+"""From the worst to the best, with their looks and meaning."""
+MOST_ROBOTS, MOST_NIGHTS = MOST_ENTRIES, MOST_ENTRIES // 10
+"""Robots, the worst ones, and nights of each, that the page shows; the history has all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 """How Prometheus takes what would end a label."""
 
@@ -62,17 +69,14 @@ class Standing:
         cls, robot: Robot, rows: tuple[Row, ...], errors: Mapping[str, str], years: float
     ) -> Standing:
         own = results(robot, rows)
-        known = tuple(
-            row
-            for row in rows
-            if row.kind == 'verify' and row.rms_mm and row.rms_freedom and robot.compares(row.time)
-        )
+        rows = tuple(row for row in rows if robot.compares(row.time))
+        known = tuple(r for r in rows if r.kind == 'verify' and r.rms_mm and r.rms_freedom)
         found = drift([r.rms_mm or 0 for r in known], [r.rms_freedom or 0 for r in known], years)
-        watched = watch([row for row in own if robot.compares(row.time)], years)
+        watched = watch(results(robot, rows), years)
         return cls(robot, own[-1] if own else None, watched, errors, known, found)
 
     @property
-    def state(self) -> State:
+    def state(self) -> str:
         """Return the worst that is to be said of it."""
         if self.watched.changes:
             return 'changed'
@@ -106,15 +110,16 @@ def standings(
 ) -> tuple[Standing, ...]:
     """Return how robots stand, the worst first."""
     found = [Standing.of(r, history, done.errors.get(r.serial, {}), years) for r in robots]
+    order = list(STATES)
 
     def rank(one: Standing) -> tuple[int, float, float, str]:
         rms = (one.last and one.last.rms_mm) or 0.0
-        return STATES.index(one.state), -one.share, -rms, one.robot.serial
+        return order.index(one.state), -one.share, -rms, one.robot.serial
 
     return tuple(sorted(found, key=rank))
 
 
-def counts(found: Sequence[Standing]) -> dict[State, int]:
+def counts(found: Sequence[Standing]) -> dict[str, int]:
     """Return how many robots are in each state."""
     number = Counter(each.state for each in found)
     return {state: number[state] for state in STATES}
@@ -157,3 +162,73 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
             if value is not None and math.isfinite(value)
         ]
     return '\n'.join(lines) + '\n'
+
+
+def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
+    """Write the page and the script that it shares with those of the robots.
+
+    Returns what is missing to write it, if anything.
+    """
+    script = plotly_script()
+    page = None if script is None else page_of(out, found, done)
+    if script is None or page is None:
+        return MISSING
+    out.mkdir(parents=True, exist_ok=True)
+    if not (out / PLOTLY).exists() or (out / PLOTLY).stat().st_size != len(script.encode()):
+        write_file(out / PLOTLY, script, overwrite=True)
+    write_file(out / 'index.html', page, overwrite=True)
+    return ''
+
+
+def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
+    """Return the page; None where jinja2 is not installed."""
+    shown = found[:MOST_ROBOTS]
+    return filled(
+        'fleet.html.jinja',
+        mark=STATES[found[0].state][0] if found else 'info',
+        marks=MARKS,
+        states=STATES,
+        counts={state: number for state, number in counts(found).items() if number},
+        total=len(found),
+        alarmed=[each for each in shown if each.alarms],
+        unreadable=[each for each in shown if each.errors],
+        rows=[(each, _link(out, each)) for each in shown],
+        done=done,
+        script=PLOTLY,
+        software=f'calib_ros {calib_ros.__version__}',
+        made=datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC'),
+        data=[_chart(each) for each in shown],
+    )
+
+
+def _link(out: Path, standing: Standing) -> str:
+    if standing.last is None:
+        return ''
+    path = page_path(out, standing.last)
+    return quote(path.relative_to(out).as_posix()) if path.exists() else ''
+
+
+def _chart(standing: Standing) -> dict[str, Any]:
+    """Return the nights of a robot: errors, and how strongly each joint seems changed."""
+
+    def times(of: Iterable[Row | Change]) -> list[str]:
+        return [each.time.isoformat(timespec='seconds') for each in of]
+
+    nights = standing.watched.nights[-MOST_NIGHTS:]
+    joints = list(nights[0].strength) if nights else []
+    verified = standing.verified[-MOST_NIGHTS:]
+    return {
+        'serial': standing.robot.serial,
+        'tolerance': standing.robot.tolerance,
+        'time': times(night.row for night in nights),
+        'rms': [night.row.rms_mm for night in nights],
+        'changes': times(standing.watched.changes),
+        'verified': {
+            'time': times(verified),
+            'rms': [row.rms_mm for row in verified],
+            'sums': standing.drift.sums[-MOST_NIGHTS:].round(3).T.tolist(),
+        },
+        'joints': {
+            joint: [round(night.strength[joint], 2) for night in nights] for joint in joints
+        },
+    }

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from calib_ros.files.rows import Row
+from calib_ros.files.history import Row
 from calib_ros.identification.changes import (
     Columns,
     Explanation,

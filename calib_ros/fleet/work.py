@@ -14,9 +14,16 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
-from calib_ros.files.history import is_local
-from calib_ros.files.loading import Loaded, of_bag, of_table, replayed, table
-from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
+from calib_ros.files.history import (
+    Filing,
+    Row,
+    content_hash,
+    digest,
+    identified,
+    is_local,
+    measured_at,
+)
+from calib_ros.files.loading import of_bag, of_table, replayed, table
 from calib_ros.fleet.plant import Robot
 from calib_ros.report.page import Origin, input_of, render
 from calib_ros.report.poses import poses_of
@@ -107,8 +114,13 @@ def _outcome(task: Task) -> Outcome:
         content = content_hash([each.sha256 for each in inputs], source.session)
         if content in task.known and not task.page:
             return Outcome()
-        loaded = _loaded(path, task)
-        problem, result = loaded.problem, loaded.identified(robot.settings.model)
+        chain, settings = robot.chain, robot.settings
+        if path.suffix in TABLES:
+            sessions = (source.session,) if source.session else ()
+            loaded = of_table(table(path, chain, settings, sessions), chain, settings)
+        else:
+            loaded = of_bag(*replayed(path, chain, settings), robot.largest_loss)
+        problem, result = loaded.problem, loaded.identified(settings.model)
         about = Filing(
             robot.serial,
             measured_at((*problem.sets, *problem.judging), source.modified),
@@ -120,7 +132,7 @@ def _outcome(task: Task) -> Outcome:
         row = identified(result, about, loaded.warnings)
         if not task.page:
             return Outcome(row)
-        configuration = configuration_yaml(robot.chain.name, robot.settings)
+        configuration = configuration_yaml(chain.name, settings)
         origin = Origin(inputs, serial=robot.serial, settings=configuration)
         wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
         poses = poses_of(problem, result, loaded.lines)
@@ -139,14 +151,6 @@ def fetched(url: str) -> Iterator[Path]:
         target = Path(folder) / PurePosixPath(path).name
         files.get(path, str(target), recursive=_is_folder(files, path))
         yield target
-
-
-def _loaded(path: Path, task: Task) -> Loaded:
-    chain, settings = task.robot.chain, task.robot.settings
-    if path.suffix in TABLES:
-        sessions = (task.source.session,) if task.source.session else ()
-        return of_table(table(path, chain, settings, sessions), chain, settings)
-    return of_bag(*replayed(path, chain, settings), task.robot.largest_loss)
 
 
 def _file_system(url: str) -> tuple[Any, str]:

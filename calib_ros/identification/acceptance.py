@@ -123,7 +123,7 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
     elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'drift of the measuring device alone could explain the improvement: time-shifted '
+            'a slow drift of the measuring device could explain the improvement: time-shifted '
             f'residuals are explained just as well in {100.0 * found.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )

@@ -16,7 +16,10 @@ from importlib import resources
 
 from calib_ros.identification.reasons import Reason, Rule
 
-AGAIN = 'Then identify again, on the measurements so far and the new ones.'
+AGAIN = (
+    'Then identify again. Use the measurements so far with the new ones; if something was loose, '
+    'only the new ones.'
+)
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,8 @@ class Advice:
     again: str = AGAIN
 
 
+ENOUGH = 30
+"""Different poses that are worth judging: as many as an arm of six joints has parameters."""
 SPREAD = 'spread over the whole workspace, with every joint moved through most of its range'
 
 
@@ -80,15 +85,43 @@ BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
 }
 """What each cause brings by itself; the first cause that is there counts."""
 
-NOISY = 10.0
-"""Ratio of what is left to the stated noise that an arm's own errors rarely reach."""
+COARSE = (
+    'The measurements scatter {:.0f} times as much as stated for the device: before you measure '
+    'more, check that the target sits firmly, that the arm stood still, that clocks agree, and '
+    'the units.'
+)
+"""What to check first where the measurements are far too coarse."""
+FEW = 'Only {} different poses were measured: too few to tell anything about the arm.'
+LEFT = (
+    'What is left is as if the device had a noise of {:.2g} mm in each direction; {:.2g} mm are '
+    'set (sigma_position).'
+)
 
 
-def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
-    """Return the refusals in plain words, those of one rule together, and last what follows.
+@dataclass(frozen=True)
+class Situation:
+    """What was measured: different poses, what is left over the noise stated, that noise [m]."""
 
-    `left` is the ratio of what is left after the correction to the stated noise.
-    """
+    poses: int = ENOUGH
+    left: float = 1.0
+    sigma: float | None = None
+
+    def said_of(self, one: Advice) -> Advice:
+        """Return the advice on a correction that does not show to help, as is right here."""
+        if self.left >= 10.0:  # an arm's own errors rarely make it so much
+            steps = (each for each in one.steps if 'stood still' not in each)
+            return replace(one, steps=(COARSE.format(self.left), *steps))
+        if self.poses < ENOUGH:
+            more = rules()[Rule.CONFIGURATIONS].steps
+            return replace(one, meaning=FEW.format(self.poses), steps=more)
+        if self.sigma is None:
+            return one
+        left = LEFT.format(1e3 * self.left * self.sigma, 1e3 * self.sigma)
+        return replace(one, meaning=f'{one.meaning} {left}')
+
+
+def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Advice, ...]:
+    """Return the refusals in plain words, those of one rule together, and last what follows."""
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
@@ -100,20 +133,8 @@ def advice(reasons: Sequence[Reason], left: float = 1.0) -> tuple[Advice, ...]:
             following.setdefault(cause, []).extend(texts)
             continue
         one = replace(rules()[rule], refusal='; '.join(texts))
-        if left >= NOISY and rule in {Rule.GAIN, Rule.REGION}:
-            steps = (each for each in one.steps if 'stood still' not in each)
-            one = replace(one, steps=(_coarse(left), *steps))
-        told.append(one)
+        told.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
     for cause, texts in following.items():
-        meaning = f'Mend that first: "{rules()[cause].heading}".'
+        meaning = f'Correct that first: "{rules()[cause].heading}".'
         told.append(Advice('What probably follows from it', meaning, (), '; '.join(texts)))
     return tuple(told)
-
-
-def _coarse(left: float) -> str:
-    """Return what to check before more is measured, where the measurements are far too coarse."""
-    return (
-        f'The measurements scatter {left:.0f} times as much as stated for the device: before you '
-        'measure more, check that the target sits firmly, that the arm stood still, that clocks '
-        'agree, and the units.'
-    )

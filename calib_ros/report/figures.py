@@ -11,27 +11,24 @@ import numpy as np
 from scipy import special
 
 from calib_ros.apply.workspace import Survey, rms_map
-from calib_ros.escapes import one_line
 from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report.poses import Poses
+from calib_ros.report.poses import Poses, numbers, unit_of
+from calib_ros.texts import one_line
 
 Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
+DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
+DOTTED = {'color': LIMIT, 'dash': 'dot'}
 QUANTILES = 400
 """Points of a curve that stands for any number of poses."""
+REVERSED = {'autorange': 'reversed', 'automargin': True}
+"""A vertical axis with the first row on top."""
 ROUND = ('eccentricity', 'gear')
 """Groups of effects that go round with a joint."""
-
-
-def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
-    """Return an array as lists with so many significant digits; None for NaN."""
-    flat = [None if x != x else float(f'{x:.{digits}g}') for x in values.ravel().tolist()]
-    shaped: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
-    return shaped
 
 
 def label(name: str) -> str:
@@ -54,6 +51,11 @@ def _margin(left: int, top: int, bottom: int) -> dict[str, int]:
     return {'l': left, 'r': 16, 't': top, 'b': bottom}
 
 
+def _heat_map(x: list[Any], y: list[Any], z: list[Any], hover: str, look: Figure) -> Figure:
+    hover += '<extra></extra>'
+    return {'type': 'heatmap', 'x': x, 'y': y, 'z': z, 'hovertemplate': hover, **look}
+
+
 def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> Figure:
     points = {'x': numbers(x), 'y': numbers(y)}
     return {'type': 'scatter', 'mode': mode, 'name': name, **points, **more}
@@ -64,16 +66,11 @@ def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figur
     share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
     data = [
         _curve('lines', name, np.quantile(errors, share), 100.0 * share, line=line)
-        for name, errors, line in (
-            ('before', before_mm, {'color': BEFORE, 'dash': 'dash'}),
-            ('after', after_mm, {'color': AFTER, 'dash': 'solid'}),
-        )
+        for name, errors, line in (('before', before_mm, DASHED), ('after', after_mm, SOLID))
     ]
-    layout = {
-        'xaxis': axis('position error [mm]', rangemode='tozero'),
-        'yaxis': axis(f'{things} with at most this error [%]', range=[0, 100]),
-    }
-    return {'data': data, 'layout': layout}
+    across = axis('position error [mm]', rangemode='tozero')
+    up = axis(f'{things} with at most this error [%]', range=[0, 100])
+    return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
 
 def against_noise(poses: Poses) -> Figure:
@@ -88,18 +85,15 @@ def against_noise(poses: Poses) -> Figure:
         z = z[np.isfinite(z)]
         if not z.size:
             continue
-        share = (np.arange(min(QUANTILES, z.size)) + 0.5) / min(QUANTILES, z.size)
+        count = min(QUANTILES, z.size)
+        share = (np.arange(count) + 0.5) / count
         marker = {'color': colour, 'symbol': symbol, 'size': 5}
         x, y = special.ndtri(share), np.quantile(z, share)
         data.append(_curve('markers', name, x, y, marker=marker))
     ends = np.array([-3.0, 3.0])
-    line = {'color': LIMIT, 'dash': 'dot'}
-    data.append(_curve('lines', 'noise as stated', ends, ends, line=line))
-    layout = {
-        'xaxis': axis('expected of pure noise [sigma]'),
-        'yaxis': axis('measured [stated sigma]'),
-    }
-    return {'data': data, 'layout': layout}
+    data.append(_curve('lines', 'noise as stated', ends, ends, line=DOTTED))
+    across, up = axis('expected of pure noise [sigma]'), axis('measured [stated sigma]')
+    return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
 
 def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> Figure | None:
@@ -132,7 +126,7 @@ def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> F
     shape = {'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1}
     layout = {
         'xaxis': axis(f'offset from nominal [{unit}]', range=[-reach, reach]),
-        'yaxis': {'autorange': 'reversed', 'automargin': True},
+        'yaxis': REVERSED,
         'shapes': [shape | each for each in lines],
         'margin': _margin(170, 30, 50),
         'showlegend': True,
@@ -144,26 +138,12 @@ def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
     """Return the correlations of fitted parameters (P, P) as a heat map."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     labels = list(map(label, names))
-    mesh = {
-        'type': 'heatmap',
-        'x': labels,
-        'y': labels,
-        'z': numbers(covariance / np.outer(scale, scale), 3),
-        **scale_of('correlation', 'RdBu', zmin=-1, zmax=1),
-        'hovertemplate': '%{y} and %{x}: %{z:.2f}<extra></extra>',
-    }
+    values = numbers(covariance / np.outer(scale, scale), 3)
+    colours = scale_of('correlation', 'RdBu', zmin=-1, zmax=1)
+    mesh = _heat_map(labels, labels, values, '%{y} and %{x}: %{z:.2f}', colours)
     small = {'tickfont': {'size': 10}, 'automargin': True}
-    layout = {
-        'xaxis': small,
-        'yaxis': {'autorange': 'reversed', **small},
-        'margin': _margin(130, 20, 90),
-    }
+    layout = {'xaxis': small, 'yaxis': REVERSED | small, 'margin': _margin(130, 20, 90)}
     return {'data': [mesh], 'layout': layout}
-
-
-def unit_of(joint: Joint) -> tuple[float, str, int]:
-    """Return how joint values are shown: factor, unit and decimals."""
-    return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
 
 
 def coverage(
@@ -183,19 +163,11 @@ def coverage(
         used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
         share = 100.0 * float(np.mean(counts[k] > 0))
         rows.append((joint.name, ends, used, f'{share:.0f} %'))
-    mesh = {
-        'type': 'heatmap',
-        'x': numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4),
-        'y': labels,
-        'z': numbers(np.where(counts > 0, counts, np.nan)),
-        **scale_of('poses'),
-        'hovertemplate': '%{y}<br>%{z} poses<extra></extra>',
-    }
-    layout = {
-        'xaxis': axis('place in the range of the joint [%]', range=[0, 100]),
-        'yaxis': {'autorange': 'reversed', 'automargin': True},
-        'margin': _margin(130, 20, 50),
-    }
+    x = numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4)
+    z = numbers(np.where(counts > 0, counts, np.nan))
+    mesh = _heat_map(x, labels, z, '%{y}<br>%{z} poses', scale_of('poses'))
+    across = axis('place in the range of the joint [%]', range=[0, 100])
+    layout = {'xaxis': across, 'yaxis': REVERSED, 'margin': _margin(130, 20, 50)}
     return {'data': [mesh], 'layout': layout}, tuple(rows)
 
 
@@ -214,19 +186,11 @@ def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
     error = np.array([added[owners == name].sum(axis=0) for name in names])
     error[(q < low[:, np.newaxis]) | (q > high[:, np.newaxis])] = np.nan
     largest = float(np.nanmax(np.abs(error)))
-    mesh = {
-        'type': 'heatmap',
-        'x': numbers(np.degrees(q)),
-        'y': list(map(label, names)),
-        'z': numbers(error, 3),
-        **scale_of('mrad', 'RdBu', zmin=-largest, zmax=largest),
-        'hovertemplate': '%{y} at %{x}°: %{z:.3f} mrad<extra></extra>',
-    }
-    layout = {
-        'xaxis': axis('joint value [°]'),
-        'yaxis': {'autorange': 'reversed', 'automargin': True},
-        'margin': _margin(130, 20, 50),
-    }
+    colours = scale_of('mrad', 'RdBu', zmin=-largest, zmax=largest)
+    x, y, z = numbers(np.degrees(q)), list(map(label, names)), numbers(error, 3)
+    mesh = _heat_map(x, y, z, '%{y} at %{x}°: %{z:.3f} mrad', colours)
+    across = axis('joint value [°]')
+    layout = {'xaxis': across, 'yaxis': REVERSED, 'margin': _margin(130, 20, 50)}
     return {'data': [mesh], 'layout': layout}
 
 
@@ -240,18 +204,11 @@ def error_map(survey: Survey) -> Figure:
     for k, (label, errors) in enumerate(parts.items()):
         end = str(k + 1) if k else ''
         radius, height, rms = rms_map(np.hypot(x, y), z, 1e3 * errors)
-        data.append(
-            {
-                'type': 'heatmap',
-                'x': numbers(0.5 * (radius[1:] + radius[:-1])),
-                'y': numbers(0.5 * (height[1:] + height[:-1])),
-                'z': numbers(rms.T, 3),
-                'xaxis': f'x{end}',
-                'yaxis': f'y{end}',
-                **scale_of('RMS [mm]', zmin=0, zmax=largest, showscale=k == 0),
-                'hovertemplate': 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm<extra></extra>',
-            }
-        )
+        across, up = (numbers(0.5 * (edges[1:] + edges[:-1])) for edges in (radius, height))
+        look = scale_of('RMS [mm]', zmin=0, zmax=largest, showscale=k == 0)
+        look |= {'xaxis': f'x{end}', 'yaxis': f'y{end}'}
+        hover = 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm'
+        data.append(_heat_map(across, up, numbers(rms.T, 3), hover, look))
         below = label.removesuffix(' by the calibration').replace(' to ', '<br>to ')
         layout[f'xaxis{end}'] = axis(f'radius [m]<br>{below}')
         layout[f'yaxis{end}'] = {} if k else axis('height [m]')
@@ -263,10 +220,7 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
     """Return the error that 1, 2, ... K planned poses promise [m], and so many random ones."""
     count = np.arange(1.0, len(accuracy) + 1)
     data = []
-    for name, errors, line in (
-        ('planned', accuracy, {'color': AFTER, 'dash': 'solid'}),
-        ('at random', at_random, {'color': BEFORE, 'dash': 'dash'}),
-    ):
+    for name, errors, line in (('planned', accuracy, SOLID), ('at random', at_random, DASHED)):
         known = np.isfinite(errors)
         data.append(_curve('lines+markers', name, count[known], 1e3 * errors[known], line=line))
     layout: Figure = {
@@ -274,9 +228,8 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
         'yaxis': axis('predicted RMS error [mm]', type='log', dtick='D2'),
     }
     if wanted_mm is not None:
-        dotted = {'color': LIMIT, 'dash': 'dot'}
         at = {'x0': 0, 'x1': 1, 'y0': wanted_mm, 'y1': wanted_mm}
-        layout['shapes'] = [{'type': 'line', 'xref': 'paper', **at, 'line': dotted}]
+        layout['shapes'] = [{'type': 'line', 'xref': 'paper', **at, 'line': DOTTED}]
     return {'data': data, 'layout': layout}
 
 
@@ -290,7 +243,5 @@ def space(*data: Figure) -> Figure:
     """Return a figure in space, all axes in one scale."""
     axes = {f'{name}axis': axis(f'{name} [m]') for name in 'xyz'}
     margin = {'l': 0, 'r': 0, 't': 30, 'b': 0}
-    return {
-        'data': list(data),
-        'layout': {'scene': {'aspectmode': 'data', **axes}, 'margin': margin},
-    }
+    layout = {'scene': {'aspectmode': 'data', **axes}, 'margin': margin}
+    return {'data': list(data), 'layout': layout}

@@ -1,24 +1,25 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A report as one HTML file that needs nothing else: no network, no files beside it.
+"""A report as HTML, as PDF and in Markdown: each one file that needs nothing else, no network.
 
 jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
-None where they are not installed. All text of others is escaped by the template.
+None where they are not installed. All text of others is escaped.
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import calib_ros
-from calib_ros.escapes import one_line
 from calib_ros.report.advice import Advice
+from calib_ros.shown import some
+from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
@@ -62,6 +63,11 @@ class Section:
     said: tuple[str, ...] = ()
 
 
+def section(name: str, title: str, *text: str, **more: Any) -> Section:
+    """Return a section with those paragraphs of text that are not empty."""
+    return Section(name, title, tuple(filter(None, text)), **more)
+
+
 @dataclass(frozen=True)
 class Input:
     """A file that was read."""
@@ -75,7 +81,7 @@ class Input:
 class Origin:
     """Whence a result comes: what only the one who started it knows; empty where not told.
 
-    With the configuration in `settings` the same is done again.
+    With the configuration in `settings` the same is done again, by the `command` if it was one.
     """
 
     inputs: tuple[Input, ...] = ()
@@ -83,6 +89,7 @@ class Origin:
     serial: str = ''
     device: str = ''
     settings: str = ''
+    command: str = ''
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values, without the settings, which have a file of their own."""
@@ -106,6 +113,11 @@ class Report:
     sections: tuple[Section, ...] = ()
     origin: Origin = Origin()
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
+
+    @property
+    def of(self) -> str:
+        """Return the names of what was read."""
+        return ', '.join(some([*dict.fromkeys(x.name.split('/')[0] for x in self.origin.inputs)]))
 
     @property
     def shown(self) -> tuple[Section, ...]:
@@ -200,21 +212,70 @@ def _shown(value: object) -> object:
     return value
 
 
+def markdown(report: Report, samples: Mapping[str, Any]) -> str:
+    """Return the words and tables of a report, to be kept with a calibration.
+
+    `samples` is what became of the input.
+    """
+    verdict = report.verdict
+    lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.robot)}', '']
+    lines += [f'**{in_markdown(verdict.heading)}**', '']
+    lines += _paragraphs(verdict.gain, *verdict.text)
+    for reason in report.advice:
+        lines += _section(reason.heading, reason.meaning, f'What was found: {reason.refusal}')
+        lines += _listed(reason.steps)
+    for each in (report.accuracy, *report.sections):
+        if each is None:
+            continue
+        text = each.text if each.rows or each.figure is None else ()
+        if text or each.said:
+            lines += _section(each.title, *text, *each.said)
+        if each.rows:
+            head, rest = '|' + '---|' * len(each.head), map(_row, each.rows)
+            lines += [_row(each.head), head, *rest, '']
+    told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
+    told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
+    for title, points in (
+        ('What to do next', report.steps),
+        ('Please note', report.remarks),
+        ('Identity', [f'{name}: {value}' for name, value in told]),
+    ):
+        lines += [*_section(title), *_listed(points)] if points else []
+    return '\n'.join(lines)
+
+
+def _section(title: str, *text: str) -> list[str]:
+    return [f'## {in_markdown(title)}', '', *_paragraphs(*text)]
+
+
+def _paragraphs(*text: str) -> list[str]:
+    return [line for each in text if each for line in (in_markdown(each), '')]
+
+
+def _listed(points: Iterable[str]) -> list[str]:
+    return [*(f'- {in_markdown(each)}' for each in points), '']
+
+
+def _row(cells: Iterable[str]) -> str:
+    return f'| {" | ".join(each if _is_number(each) else in_markdown(each) for each in cells)} |'
+
+
+def _is_number(cell: str) -> bool:
+    return cell.lstrip('+-').replace('.', '', 1).isdecimal()
+
+
 def input_of(path: Path) -> tuple[Input, ...]:
     """Return a file, or those of a folder such as a bag, with size and hash."""
     files = sorted(each for each in path.rglob('*') if each.is_file()) if path.is_dir() else [path]
-    return tuple(
-        Input(str(each.relative_to(path.parent)), each.stat().st_size, _sha256(each))
-        for each in files
-    )
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open('rb') as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
+    found = []
+    for each in files:
+        digest = hashlib.sha256()
+        with each.open('rb') as file:
+            while block := file.read(1 << 20):
+                digest.update(block)
+        name, size = str(each.relative_to(path.parent)), each.stat().st_size
+        found.append(Input(name, size, digest.hexdigest()))
+    return tuple(found)
 
 
 def inputs_of(paths: Sequence[Path | None]) -> tuple[Input, ...]:

@@ -16,10 +16,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calib_ros.apply.workspace import Placements, Survey, rms_map
-from calib_ros.escapes import one_line
 from calib_ros.identification.identification import Identification
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE
+from calib_ros.texts import one_line
 
 INCH, MARGIN = 0.0254, 0.01
 """In metres: an inch, and what is left free around a board."""
@@ -34,10 +34,7 @@ def before_after_png(result: Identification) -> bytes:
     )
     figure = _figure(10.0, 3.8)
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
-    for name, errors, colour in (
-        ('before', before, BEFORE),
-        ('after', after, AFTER),
-    ):
+    for name, errors, colour in (('before', before, BEFORE), ('after', after, AFTER)):
         rms = np.sqrt(np.mean(errors**2))
         left.plot(errors, '.', color=colour, markersize=4, alpha=0.7, rasterized=True)
         left.axhline(rms, color=colour, label=f'{name}: RMS {rms:.3f} mm, max {errors.max():.3f}')
@@ -56,16 +53,6 @@ def before_after_png(result: Identification) -> bytes:
     return _png(figure)
 
 
-def draw_histogram(axes: Axes, errors_mm: FloatArray, label: str) -> None:
-    """Draw how often an error comes, with its 50th and 95th percentile."""
-    axes.hist(errors_mm, bins=60, color=AFTER, alpha=0.7)
-    for share, style in ((0.5, '-'), (0.95, '--')):
-        value = float(np.quantile(errors_mm, share))
-        axes.axvline(value, color='black', linestyle=style, label=f'{share:.0%}: {value:.3f} mm')
-    axes.set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
-    axes.legend(frameon=False)
-
-
 def workspace_png(survey: Survey) -> bytes:
     """Return the figure of a survey: what the calibration removes and, if known, what remains."""
     rows = list(survey.parts.items())[:2]
@@ -75,7 +62,13 @@ def workspace_png(survey: Survey) -> bytes:
     figure = _figure(13.0, 4.0 * len(rows))
     grid = figure.subplots(len(rows), 3, squeeze=False)
     for axes, (label, errors) in zip(grid, rows, strict=True):
-        draw_histogram(axes[0], 1e3 * errors, label)
+        axes[0].hist(1e3 * errors, bins=60, color=AFTER, alpha=0.7)
+        for share, style in ((0.5, '-'), (0.95, '--')):
+            value = 1e3 * float(np.quantile(errors, share))
+            name = f'{share:.0%}: {value:.3f} mm'
+            axes[0].axvline(value, color='black', linestyle=style, label=name)
+        axes[0].set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
+        axes[0].legend(frameon=False)
         axes[1].set_title('all directions')
         axes[2].set_title(f'height {low:.2f} to {high:.2f} m')
         for place, pair, part, labels in (
@@ -136,7 +129,6 @@ def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> 
 
 
 def _figure(width: float, height: float) -> Figure:
-    """Return an empty figure of a size [inches]."""
     figure = Figure(figsize=(width, height), layout='constrained')
     FigureCanvasAgg(figure)
     return figure

@@ -2,14 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """What was measured, pose by pose: where, how far off before and after, and whence.
 
+It becomes a table, and what a page shows: single poses, above SINGLE bins, cells and quantiles.
+
 Positions and errors are in the frame of the arm's base, which sets measured by several devices
 share. Errors are measured minus predicted, of the judged poses by a fit that did not know them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,14 +22,26 @@ from calib_ros.identification.identification import Identification
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Comparison
-from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
+from calib_ros.texts import one_line
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted; left out to judge; left out at a fitted configuration."""
+SINGLE = 20_000
+"""Poses that are shown one by one; of more so many, evenly spread, give the quantiles."""
+WORST = 300
+"""Poses of the largest errors, and outliers, that are listed of more."""
+BANDS = 60
+"""Parts of the session, and of each joint's values, whose quantiles are shown."""
+CELLS = 24
+"""Cells along the longest edge of the workspace."""
+SHARES = (0.05, 0.5, 0.95)
+ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
 WHEN = ('before', 'after')
 NAMELESS: Mapping[int, str] = {}
 
@@ -93,12 +108,9 @@ class Poses:
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
         """Return some of the poses by a mask or by indices."""
-        arrays = {
-            name: getattr(self, name)[rows]
-            for name in self.__dataclass_fields__
-            if name not in ('tools', 'lines', 'images')
-        }
-        return Poses(**arrays, tools=self.tools, lines=self.lines, images=self.images)
+        of_all = ('tools', 'lines', 'images')
+        names = (each.name for each in fields(self) if each.name not in of_all)
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def table(self, told: Told = nobody) -> str:
         """Return a CSV: a row for each pose, in metres and radians."""
@@ -123,52 +135,51 @@ class Poses:
         return '\n'.join(parts) + '\n'
 
 
-def _parts(
+def _poses(
     chain: Chain,
     sigmas: tuple[float, float],
-    sets: Sequence[Observations],
-    comparison: Comparison,
-    role: NDArray[np.str_],
-    sizes: FloatArray,
-) -> Iterator[dict[str, NDArray[Any]]]:
-    """Yield the arrays of each set, with its residuals as `compare` has them."""
-    first = 0
-    for each in sets:
-        rows = slice(first, first + len(each))
-        base = chain.frame(each.base).matrix
-        turn = base[:3, :3]
-        reached = chain.forward(each.joints, each.approach, each.base, each.tool)
-        along = np.eye(3) if each.distances is not None else turn
-        before, after = comparison.before, comparison.after
-        sigma = np.tile(sigmas, (len(each), 1))
-        if each.covariance is not None:
-            variances = np.diagonal(each.covariances(sigmas), axis1=1, axis2=2)
-            sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
-        yield {
-            'joints': each.joints,
-            'stamps_ns': each.stamps_ns,
-            'position': (reached[:, :3, 3] - base[:3, 3]) @ turn,
-            'before': before.position[rows] @ along,
-            'after': after.position[rows] @ along,
-            'turned_before': before.orientation[rows] @ turn,
-            'turned_after': after.orientation[rows] @ turn,
-            'sigma': sigma,
-            'role': role[rows],
-            'outlier': ~comparison.judged[rows],
-            'size': sizes[rows],
-            'corner': np.full(len(each), each.pixels is not None),
-            'tools': chain.frame(each.tool).matrix[np.newaxis],
-        }
-        first += len(each)
-
-
-def _joined(
-    parts: Sequence[dict[str, NDArray[Any]]], lines: bool, images: Mapping[int, str]
+    of: Sequence[tuple[Sequence[Observations], Comparison, NDArray[np.str_], FloatArray]],
+    lines: bool,
+    images: Mapping[int, str],
 ) -> Poses:
-    """Return all parts in the order of their stamps."""
+    """Return poses in the order of their stamps.
+
+    They are those of sets, of each of which the comparison has the residuals, with the roles (N,)
+    and sizes (N,).
+    """
+    parts: list[dict[str, NDArray[Any]]] = []
+    for sets, comparison, role, sizes in of:
+        first, before, after = 0, comparison.before, comparison.after
+        for each in sets:
+            rows = slice(first, first + len(each))
+            first = rows.stop
+            base = chain.frame(each.base).matrix
+            turn = base[:3, :3]
+            reached = chain.forward(each.joints, each.approach, each.base, each.tool)
+            along = np.eye(3) if each.distances is not None else turn
+            sigma = np.tile(sigmas, (len(each), 1))
+            if each.covariance is not None:
+                variances = np.diagonal(each.covariances(sigmas), axis1=1, axis2=2)
+                sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
+            part = {
+                'joints': each.joints,
+                'stamps_ns': each.stamps_ns,
+                'position': (reached[:, :3, 3] - base[:3, 3]) @ turn,
+                'before': before.position[rows] @ along,
+                'after': after.position[rows] @ along,
+                'turned_before': before.orientation[rows] @ turn,
+                'turned_after': after.orientation[rows] @ turn,
+                'sigma': sigma,
+                'role': role[rows],
+                'outlier': ~comparison.judged[rows],
+                'size': sizes[rows],
+                'corner': np.full(len(each), each.pixels is not None),
+                'set': np.full(len(each), len(parts)),
+                'tools': chain.frame(each.tool).matrix[np.newaxis],
+            }
+            parts.append(part)
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tools = arrays.pop('tools')
-    arrays['set'] = np.repeat(np.arange(len(parts)), [len(part['joints']) for part in parts])
     order = np.argsort(arrays['stamps_ns'], kind='stable')
     ordered = {name: array[order] for name, array in arrays.items()}
     return Poses(**ordered, tools=tools, lines=lines, images=images)
@@ -181,19 +192,17 @@ def poses_of(
     images: Mapping[int, str] = NAMELESS,
 ) -> Poses:
     """Return all poses of an identification, those to judge on by what did not know them."""
-    known = (result.chain, (problem.sigma_position, problem.sigma_orientation))
     sizes = np.concatenate(result.distances)
-    fitted, judged = result.fitted, result.validation
+    judged = result.validation
     if judged is None or judged.repeated is not None:
-        role = np.full(len(sizes), FITTED)
-        parts = [*_parts(*known, problem.sets, fitted, role, sizes)]
+        of = [(problem.sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
     else:  # each was left out once
-        parts = [*_parts(*known, problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
+        of = [(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
     if judged is not None and judged.repeated is not None:
-        unknown = np.full(len(judged.judged), np.nan)
         role = np.where(judged.repeated, REPEATED, JUDGED)
-        parts += _parts(*known, problem.judging, judged, role, unknown)
-    return _joined(parts, lines, images)
+        of.append((problem.judging, judged, role, np.full(len(role), np.nan)))
+    sigmas = (problem.sigma_position, problem.sigma_orientation)
+    return _poses(result.chain, sigmas, of, lines, images)
 
 
 def poses_to_verify(
@@ -201,6 +210,146 @@ def poses_to_verify(
 ) -> Poses:
     """Return the poses of new measurements, which all judge."""
     count = len(comparison.judged)
-    role, sizes = np.full(count, JUDGED), np.full(count, np.nan)
+    of = [(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
-    return _joined([*_parts(chain, sigmas, sets, comparison, role, sizes)], lines, NAMELESS)
+    return _poses(chain, sigmas, of, lines, NAMELESS)
+
+
+def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
+    """Return an array as lists with so many significant digits; None for NaN."""
+    flat = [None if x != x else float(f'{x:.{digits}g}') for x in values.ravel().tolist()]
+    shaped: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
+    return shaped
+
+
+def unit_of(joint: Joint) -> tuple[float, str, int]:
+    """Return how joint values are shown: factor, unit and decimals."""
+    return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
+
+
+def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
+    """Return the poses as plain values; errors in mm and mrad, positions in m."""
+    many = len(poses) > SINGLE
+    rows = _worst(poses) if many else np.arange(len(poses))
+    shown = poses.select(rows)
+    kinds = [['length', 'position error [mm]']]
+    kinds += [[axis, f'position error along {axis} [mm]'] for axis in 'xyz']
+    kinds += [['angle', 'orientation error [mrad]']] if poses.oriented else []
+    before = 1e3 * np.linalg.norm(poses.before[poses.judged], axis=1)
+    arrays = {
+        'joints': shown.joints,
+        'position': shown.position,
+        'before': 1e3 * shown.before,
+        'after': 1e3 * shown.after,
+        'turned_before': _values(shown, 'angle', 'before'),
+        'turned_after': _values(shown, 'angle', 'after'),
+        'size': shown.size,
+    }
+    return {
+        'joints': [one_line(name) for name in chain.joint_names],
+        'show': [list(unit_of(joint)) for joint in chain.joints],
+        'convention': str(chain.convention),
+        'table': [
+            [float(getattr(j, k)) for k in DH_KINDS] + [j.sign, j.type != 'revolute']
+            for j in chain.joints
+        ],
+        'tools': poses.tools.tolist(),
+        'reach': float(np.linalg.norm(poses.position, axis=1).max()),
+        'largest': float(np.quantile(before, 0.98)) if before.size else 1.0,
+        'total': len(poses),
+        'oriented': poses.oriented,
+        'kinds': kinds,
+        'number': (rows + 1).tolist() if many else None,
+        'lines': poses.lines,
+        'things': poses.things,
+        'images': [poses.source(row) if poses.corner[row] else '' for row in rows.tolist()]
+        if poses.images
+        else [],
+        'stamps': _packed(shown.stamps_ns, '<i8'),
+        'roles': list(ROLES.values()),
+        'role': [list(ROLES).index(role) for role in shown.role.tolist()],
+        'outlier': shown.outlier.astype(int).tolist(),
+        'set': shown.set.tolist(),
+        'arrays': {name: _packed(values, '<f4') for name, values in arrays.items()},
+        'bins': _bins(chain, poses, [kind for kind, _ in kinds]) if many else None,
+        'cells': _cells(poses) if many else None,
+    }
+
+
+def _packed(values: NDArray[Any], kind: str) -> str:
+    return base64.b64encode(values.astype(kind).tobytes()).decode()
+
+
+def _worst(poses: Poses) -> NDArray[np.intp]:
+    """Return the rows of the largest errors after, and of the largest outliers, in order."""
+    error = np.linalg.norm(poses.after, axis=1)
+    good = np.argsort(np.where(poses.outlier, -1.0, error))[-WORST:]
+    gross = np.argsort(np.where(poses.outlier, error, -1.0))[-WORST:]
+    return np.union1d(good[~poses.outlier[good]], gross[poses.outlier[gross]])
+
+
+def _values(poses: Poses, kind: str, when: str) -> FloatArray:
+    if kind == 'angle':
+        return 1e3 * np.asarray(np.linalg.norm(getattr(poses, f'turned_{when}'), axis=1))
+    errors = 1e3 * getattr(poses, when)
+    if kind == 'length':
+        return np.asarray(np.linalg.norm(errors, axis=1))
+    return np.asarray(errors[:, 'xyz'.index(kind)])
+
+
+def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
+    """Return quantiles of each kind of error over the session and over each joint's values."""
+    good = np.flatnonzero(~poses.outlier)
+    good = good[:: 1 + len(good) // SINGLE]
+    axes = {'session': good + 1.0}
+    for k, joint in enumerate(chain.joints):
+        axes[f'joint{k}'] = unit_of(joint)[0] * poses.joints[good, k]
+    chosen = poses.select(good)
+    errors = {kind: {when: _values(chosen, kind, when) for when in WHEN} for kind in kinds}
+    found: dict[str, Any] = {}
+    for key, values in axes.items():
+        edges = np.linspace(values.min(), values.max(), BANDS + 1)
+        place = np.clip(np.searchsorted(edges, values, 'right') - 1, 0, BANDS - 1)
+        middle = numbers(0.5 * (edges[1:] + edges[:-1]))
+        found[key] = {
+            kind: {'x': middle}
+            | {when: _quantiles(each, place) for when, each in errors[kind].items()}
+            for kind in kinds
+        }
+    return found
+
+
+def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
+    """Return the SHARES (3, B) of values (N,) in the parts (N,) 0 ... B - 1; None for none."""
+    known = ~np.isnan(values)
+    values, place = values[known], place[known]
+    ordered = values[np.lexsort((values, place))]
+    count = np.bincount(place, minlength=BANDS)
+    first = np.cumsum(count) - count
+    ranks = np.round(np.outer(SHARES, np.maximum(count - 1, 0))).astype(int)
+    table = np.full(ranks.shape, np.nan)
+    table[:, count > 0] = ordered[(first + ranks)[:, count > 0]]
+    return numbers(table, 4)
+
+
+def _cells(poses: Poses) -> dict[str, Any]:
+    """Return cubes of the workspace: how many poses, where, their RMS and mean errors."""
+    good = poses.select(~poses.outlier)
+    low = good.position.min(axis=0)
+    edge = max(float(np.ptp(good.position, axis=0).max()) / CELLS, 1e-9)
+    cell = ((good.position - low) / edge).astype(int)
+    number = cell @ (1, CELLS + 1, (CELLS + 1) ** 2)
+    _, index, count = np.unique(number, return_inverse=True, return_counts=True)
+
+    def mean(values: FloatArray) -> FloatArray:
+        columns = np.atleast_2d(values.T)
+        sums = [np.bincount(index, column, len(count)) for column in columns]
+        return np.stack(sums, axis=1) / count[:, np.newaxis]
+
+    found: dict[str, Any] = {'count': count.tolist(), 'position': numbers(mean(good.position), 4)}
+    for when in WHEN:
+        errors = 1e3 * getattr(good, when)
+        squares = mean((errors**2).sum(axis=1))[:, 0]
+        found[f'rms_{when}'] = numbers(np.sqrt(squares), 4)
+        found[f'mean_{when}'] = numbers(mean(errors), 4)
+    return found

@@ -19,21 +19,10 @@ from calib_ros.identification.reasons import Rule
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
-from calib_ros.report import figures, words
-from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, advice
-from calib_ros.report.explorer import explorer
-from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.poses import Poses
-from calib_ros.report.sections import (
-    INTERVAL,
-    ISO_9283,
-    accuracy_section,
-    coverage,
-    distribution,
-    gain,
-    identity_of,
-    limits_of,
-)
+from calib_ros.report import figures, sections, words
+from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, Situation, advice
+from calib_ros.report.page import Origin, Report, Section, Verdict, section
+from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
 
 NOT_YET = (
@@ -43,6 +32,8 @@ NOT_YET = (
 UNPROVEN = (
     'These poses were all used to compute the correction: a small error "after" proves nothing.'
 )
+CAUSES = {Rule.MISTAKE, Rule.MOVED, Rule.ENCODER}
+"""What names its cause, so that it is said first."""
 SURVEYED = 4000
 """Random poses of the error map."""
 
@@ -58,28 +49,25 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
-    limits = limits_of(judged, 1, CONFIDENT)
+    limits = sections.limits_of(judged, 1, CONFIDENT)
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
         verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
-        accuracy=accuracy_section(
+        accuracy=sections.accuracy_section(
             'Accuracy before and after' if result.accepted else 'Accuracy of what was tried',
-            (
-                *(() if result.validation else (UNPROVEN,)),
-                f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
-                'RMS (root mean square) is the usual size of the error over poses like these.',
-                ISO_9283,
-            ),
             judged,
             poses.things,
-            judged.figures_of_all[1] if judged.outliers else None,
+            '' if result.validation else UNPROVEN,
+            f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
+            'RMS (root mean square) is the usual size of the error over poses like these.',
+            with_outliers=judged.figures_of_all[1] if judged.outliers else None,
         ),
-        picture=distribution(poses),
+        picture=sections.distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
-        identity=identity_of(
+        identity=sections.identity_of(
             result.chain,
             origin,
             poses,
@@ -93,9 +81,7 @@ def identification_report(
 
 
 def _verdict(
-    result: Identification,
-    reasons: Sequence[Advice],
-    tolerance: float | None,
+    result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> Verdict:
     if not result.accepted:
         return _refused(result, reasons)
@@ -106,7 +92,7 @@ def _verdict(
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
     heading = 'Accepted' + (f', {within}' if within else '')
-    return Verdict('open' if 'not' in within else 'good', heading, text, gain(judged))
+    return Verdict('open' if 'not' in within else 'good', heading, text, sections.gain(judged))
 
 
 def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
@@ -114,7 +100,7 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
-    lower, upper = limits_of(judged, 1, CONFIDENT)
+    lower, upper = sections.limits_of(judged, 1, CONFIDENT)
     if upper <= tolerance:
         return f'and {wanted}'
     if lower > tolerance:
@@ -130,10 +116,13 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     """
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = limits_of(judged, 0, INTERVAL)
+        lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
-    return advice(result.refusals, noise)
+    poses = len(np.unique(result.fitted.after.configurations))
+    return advice(
+        result.refusals, Situation(poses, noise, result.noise.given.get('sigma_position'))
+    )
 
 
 def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
@@ -143,18 +132,18 @@ def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
         return Verdict('info', heading, (GOOD_ARM.meaning, tried, *_left(result)))
     whys = '. '.join(each.heading for each in reasons if each.steps)
-    found = [f'What was found: {x}.' for x in result.refusals if x.rule is Rule.MISTAKE]
+    found = [f'What was found: {x}.' for x in result.refusals if x.rule in CAUSES]
     heading = 'Not accepted: the robot stays as it was'
     return Verdict('bad', heading, (f'Why: {whys}.', *found, tried, *_left(result)))
 
 
 def _left(result: Identification) -> Iterator[str]:
-    """Yield in figures that a correction brought nothing."""
-    if result.validation is not None and any(each.rule is Rule.GAIN for each in result.refusals):
+    rules = {each.rule for each in result.refusals}
+    if result.validation is not None and Rule.GAIN in rules and Rule.MISTAKE not in rules:
         before, after = result.validation.figures
         yield (
-            f'The RMS error was {before.rms_mm:.3f} mm; with the best correction found it '
-            f'would be {after.rms_mm:.3f} mm.'
+            f'On poses not used to compute it, the RMS error is {before.rms_mm:.3f} mm without '
+            f'the correction and {after.rms_mm:.3f} mm with it.'
         )
 
 
@@ -164,14 +153,11 @@ def _steps(
     limits: tuple[float, float],
     tolerance: float | None,
 ) -> tuple[str, ...]:
-    """Return what to do with a result."""
     if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
         return ()
     if not result.accepted:
-        return (
-            'Follow the steps above, those of the first reason first.',
-            reasons[0].again,
-        )
+        first = 'Follow the steps above, those of the first reason first.'
+        return (*((first,) if len(reasons) > 1 else ()), reasons[0].again)
     found = []
     if tolerance is not None and limits[0] > tolerance:
         if not result.chain.effects:
@@ -199,16 +185,12 @@ def _steps(
 
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterator[Section]:
-    """Return the sections below the poses."""
-    yield Section(
+    yield section(
         'noise',
         'What is left against the noise of the device',
-        (
-            'If nothing but the stated noise of the measuring device were left, all dots '
-            'would lie on the dotted line. A steeper line: more is left, or the stated noise '
-            'is too small.',
-        ),
-        figures.against_noise(poses),
+        'If nothing but the stated noise of the measuring device were left, all dots would lie on '
+        'the dotted line. A steeper line: more is left, or the stated noise is too small.',
+        figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
             words.neighbours_in_words(result.noise),
@@ -221,26 +203,39 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
     yield _parameters(result)
     yield _correlations(result)
     yield _determined(result)
-    yield coverage(result.chain, poses.joints, 'How far each joint was moved')
+    yield sections.coverage(result.chain, poses.joints, 'How far each joint was moved')
     if result.verdicts:
         yield _effects(result)
-    yield from _drives(result, poses)
+    drives = figures.drives(result.chain, poses.joints)
+    if drives is not None:
+        yield section(
+            'drives',
+            'Errors of the drives',
+            'What eccentricities and gears add to each joint value, over the values that were '
+            'measured. Narrow stripes come from gears, wide ones from eccentricities.',
+            figure=drives,
+            height=100 + 45 * len(drives['data'][0]['y']),
+        )
     if result.accepted:
-        yield _map(result)
+        found = survey(Calibration.of(result), SURVEYED, np.random.default_rng(0))
+        yield section(
+            'map',
+            'The error over the workspace',
+            f'At {SURVEYED:,} random poses, by the distance from the axis of the base and the '
+            'height above it. More is expected to remain far from the poses measured.',
+            figure=figures.error_map(found),
+        )
 
 
 def _effects(result: Identification) -> Section:
-    """Return what each effect beyond geometry brings, in the order in which they were added."""
     used = {True: 'yes', False: 'no'}
-    return Section(
+    return section(
         'effects',
         'Errors beyond geometry',
-        (
-            'By how much each effect, on top of those used above it, changes the RMS position '
-            'error of poses left out. Used are those that help by more than chance.',
-            f'They are compared on {COMPARED:,} poses at most. The model chosen is fitted to all '
-            'poses and does better: its error stands at the top.',
-        ),
+        'By how much each effect, on top of those used above it, changes the RMS position error '
+        'of poses left out. Used are those that help by more than chance.',
+        f'They are compared on {COMPARED:,} poses at most. The model chosen is fitted to all '
+        'poses and does better: its error stands at the top.',
         head=('effect', 'changes the error by', 'used'),
         rows=tuple(
             (v.what, f'{100.0 * (v.rms_mm_after / v.rms_mm_before - 1.0):+.1f} %', used[v.pays])
@@ -249,35 +244,16 @@ def _effects(result: Identification) -> Section:
     )
 
 
-def _drives(result: Identification, poses: Poses) -> Iterator[Section]:
-    """Return what the drives of the joints add to their values."""
-    figure = figures.drives(result.chain, poses.joints)
-    if figure is not None:
-        yield Section(
-            'drives',
-            'Errors of the drives',
-            (
-                'What eccentricities and gears add to each joint value, over the values that '
-                'were measured. Narrow stripes come from gears, wide ones from eccentricities.',
-            ),
-            figure,
-            height=100 + 45 * len(figure['data'][0]['y']),
-        )
-
-
 def _outliers(poses: Poses, most: int = 50) -> Section:
-    """Return the outliers of the fit, the largest first, by line or stamp."""
     rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
     rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
     more = f' The {most} largest are shown.' if len(rows) > most else ''
-    return Section(
+    return section(
         'outliers',
         f'Outliers: {len(rows)} {poses.things} carry no or little weight',
-        (
-            'They differ from all the others by more than errors of this arm and device do. '
-            f'Measure them again, or look what happened there.{more}',
-        ),
+        'They differ from all the others by more than errors of this arm and device do. '
+        f'Measure them again, or look what happened there.{more}',
         head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
@@ -288,29 +264,22 @@ def _outliers(poses: Poses, most: int = 50) -> Section:
 
 def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
     """Return the offsets of the geometry with their intervals, lengths and angles apart."""
-    effects = {name for name, _ in result.chain.effects}
-    own = [
-        p
-        for p in result.parameters
-        if p.name.unit in ('m', 'rad')
-        and not result.chain.owns_frame(p.name)
-        and p.name not in effects
-    ]
+    others = dict(result.chain.effects)
+    own = [p for p in result.parameters if p.name.unit in ('m', 'rad') and p.name not in others]
+    own = [p for p in own if not result.chain.owns_frame(p.name)]
     for name, unit, limit in (
         ('lengths', 'mm', problem.largest_length),
         ('angles', 'mrad', problem.largest_angle),
     ):
         figure = figures.forest(own, unit == 'mm', limit)
         if figure is not None:
-            yield Section(
+            yield section(
                 name,
                 f'{name.capitalize()} found',
-                (
-                    'Offsets from the nominal table with their 95 % intervals. An interval '
-                    'that holds zero: the nominal value may be right. Limit of common sense: '
-                    f'±{1e3 * limit:g} {unit}.',
-                ),
-                figure,
+                'Offsets from the nominal table with their 95 % intervals. An interval that holds '
+                'zero: the nominal value may be right. Limit of common sense: '
+                f'±{1e3 * limit:g} {unit}.',
+                figure=figure,
                 height=110 + 24 * len(figure['data'][0]['y']),
             )
 
@@ -328,17 +297,15 @@ def _parameters(result: Identification) -> Section:
         forms = zip(found, ('+.4f', '.4f', '.4f'), strict=True)
         numbers = ['' if x is None else f'{scale * x:{form}}' for x, form in forms]
         rows.append((p.name, f'{p.value:.9f} {unit}', *numbers, small, p.status))
-    return Section(
+    more = f'; the {unlisted} harmonics of gears are in result.json' if unlisted else ''
+    return section(
         'parameters',
         'All parameters',
-        (
-            'Kept nominal are those of status "gauge" (by the build of the arm they show only '
-            'together with others), "not excited" (the poses do not determine them) and "fixed" '
-            '(held on request). Base and tool are placed by the fit: they have no offset.',
-            f'{result.rank} are fitted'
-            + (f'; the {unlisted} harmonics of gears are in result.json.' if unlisted else '.'),
-            *words.priors_in_words(result),
-        ),
+        'Kept nominal are those of status "gauge" (by the build of the arm they show only '
+        'together with others), "not excited" (the poses do not determine them) and "fixed" '
+        '(held on request). Base and tool are placed by the fit: they have no offset.',
+        f'{result.rank} are fitted{more}.',
+        *words.priors_in_words(result),
         head=('parameter', 'value', 'offset', 'std', '± (95 %)', 'unit', 'status'),
         rows=tuple(rows),
     )
@@ -347,16 +314,13 @@ def _parameters(result: Identification) -> Section:
 def _determined(result: Identification) -> Section:
     """Return how well the arm is known, and what no measurement at these poses can tell."""
     sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
-    text = (
-        f'Expected error of positions predicted over the whole joint range: '
+    return section(
+        'determined',
+        'What the poses determine',
+        'Expected error of positions predicted over the whole joint range: '
         f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm at most.',
         f'Observability: {words.observability_in_words(result)}.',
         weak and f'Weakly determined (std above {1e3 * words.WEAK:g} mm or mrad): {weak}.',
-    )
-    return Section(
-        'determined',
-        'What the poses determine',
-        tuple(filter(None, text)),
         head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
         rows=tuple(
             (name, ', '.join(some(partners)) or 'no measured pose depends on it')
@@ -366,35 +330,17 @@ def _determined(result: Identification) -> Section:
 
 
 def _correlations(result: Identification) -> Section:
-    """Return which parameters were found together rather than each."""
     strong = [f'{a} and {b} ({value:+.2f})' for a, b, value in result.correlated()]
     beyond = dict(result.chain.effects)
     shown = [k for k, name in enumerate(result.names) if name not in beyond]
-    return Section(
+    names, covariance = [result.names[k] for k in shown], result.covariance[np.ix_(shown, shown)]
+    return section(
         'correlations',
         'Which parameters stand in for each other',
-        (
-            'Two parameters of strong colour change together: the poses tell their '
-            'combination better than each alone. Predictions of the arm are not harmed.',
-            f'Strongest: {", ".join(some(strong))}.' if strong else 'None is above 0.9.',
-            *(('Effects beyond geometry are not drawn.',) if beyond else ()),
-        ),
-        figures.correlations(
-            [result.names[k] for k in shown], result.covariance[np.ix_(shown, shown)]
-        ),
+        'Two parameters of strong colour change together: the poses tell their combination '
+        'better than each alone. Predictions of the arm are not harmed.',
+        f'Strongest: {", ".join(some(strong))}.' if strong else 'None is above 0.9.',
+        'Effects beyond geometry are not drawn.' if beyond else '',
+        figure=figures.correlations(names, covariance),
         height=max(360, 140 + 15 * len(shown)),
-    )
-
-
-def _map(result: Identification) -> Section:
-    """Return the error map over the workspace."""
-    found = survey(Calibration.of(result), SURVEYED, np.random.default_rng(0))
-    return Section(
-        'map',
-        'The error over the workspace',
-        (
-            f'At {SURVEYED:,} random poses, by the distance from the axis of the base and the '
-            'height above it. More is expected to remain far from the poses measured.',
-        ),
-        figures.error_map(found),
     )

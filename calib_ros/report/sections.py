@@ -11,13 +11,13 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
-from calib_ros.files.rows import is_time
+from calib_ros.files.history import is_time
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures
-from calib_ros.report.page import Origin, Section
+from calib_ros.report.page import Origin, Section, section
 from calib_ros.report.poses import Poses
 
 INTERVAL = 0.5 + 0.5 * CONFIDENT
@@ -28,13 +28,8 @@ ISO_9283 = (
     'repeatability is part of the figure.'
 )
 LABELS = (
-    'RMS [mm]',
-    '95 % interval',
-    'mean [mm]',
-    'largest [mm]',
-    'mean + 3 sigma [mm]',
-    'RMS [mrad]',
-    'RMS [px]',
+    *('RMS [mm]', '95 % interval of it', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
+    *('RMS [mrad]', 'RMS [px]'),
 )
 """Rows of the table of accuracy below its head and count."""
 
@@ -49,7 +44,6 @@ def gain(which: Comparison, intervals: bool = True) -> str:
 
 
 def _between(limits: tuple[float, float]) -> str:
-    """Return limits [m] in mm; nothing where they are not known."""
     return f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if np.isfinite(limits[1]) else ''
 
 
@@ -62,9 +56,9 @@ def limits_of(which: Comparison, when: int, confidence: float) -> tuple[float, f
 
 def accuracy_section(
     title: str,
-    text: tuple[str, ...],
     judged: Comparison,
     things: str,
+    *text: str,
     with_outliers: ErrorFigures | None = None,
     intervals: bool = True,
 ) -> Section:
@@ -77,7 +71,7 @@ def accuracy_section(
         columns.append(_column('after, with outliers', with_outliers))
     labels = ('', things, *LABELS)
     head, *rows = (row for row in zip(labels, *columns, strict=True) if any(row[1:]))
-    return Section('accuracy', title, text, head=head, rows=tuple(rows))
+    return section('accuracy', title, *text, ISO_9283, head=head, rows=tuple(rows))
 
 
 def _column(
@@ -99,6 +93,8 @@ def identity_of(
     corrected: str = '',
 ) -> tuple[tuple[str, str], ...]:
     """Return what the result is of, by whom and when; what is not told is left out."""
+    software = f'calib_ros {calib_ros.__version__}, Python {platform.python_version()}, '
+    software += f'numpy {np.__version__}'
     rows = [
         ('Robot', chain.name),
         ('Serial number', origin.serial),
@@ -109,18 +105,13 @@ def identity_of(
         *(((poses.things.capitalize(), f'{len(poses):,}'),) if poses else ()),
         judged,
         ('Report made', datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC')),
-        (
-            'Software',
-            f'calib_ros {calib_ros.__version__}, Python {platform.python_version()}, '
-            f'numpy {np.__version__}',
-        ),
+        ('Software', software),
         ('Corrected table, SHA-256', corrected),
     ]
     return tuple((label, value) for label, value in rows if value)
 
 
 def _measured(poses: Poses | None) -> str:
-    """Return when it was measured, where the stamps tell."""
     if poses is None or not len(poses) or poses.lines or not is_time(poses.stamps_ns[0]):
         return ''
     first, last = (
@@ -136,11 +127,12 @@ def distribution(poses: Poses) -> Section:
     before, after = (
         1e3 * np.linalg.norm(each[chosen], axis=1) for each in (poses.before, poses.after)
     )
-    return Section(
+    return section(
         'cumulated',
         f'How many {poses.things} are within an error',
-        ('Outliers are left out. The further left a curve, the better.',),
-        figures.cumulated(before, after, poses.things),
+        ('' if chosen.all() else 'Outliers are left out. ')
+        + 'The further left a curve, the better.',
+        figure=figures.cumulated(before, after, poses.things),
         height=400,
     )
 
@@ -148,12 +140,12 @@ def distribution(poses: Poses) -> Section:
 def coverage(chain: Chain, joints: FloatArray, title: str) -> Section:
     """Return how far joint values (N, n) reach in the range of each joint."""
     figure, rows = figures.coverage(chain, joints)
-    return Section(
+    return section(
         'coverage',
         title,
-        ('Errors show only where a joint was: blank parts of its range hold no poses.',),
-        figure,
-        ('joint', 'range', 'poses from, to', 'parts with poses'),
-        rows,
-        100 + 45 * len(rows),
+        'Errors show only where a joint was: blank parts of its range hold no poses.',
+        figure=figure,
+        head=('joint', 'range', 'poses from, to', 'parts with poses'),
+        rows=rows,
+        height=100 + 45 * len(rows),
     )

@@ -22,7 +22,7 @@ from calib_ros.identification.validation import Comparison, ErrorFigures, Parame
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray, to_quat
+from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 from calib_ros.texts import dump_yaml
@@ -47,11 +47,10 @@ def summary(
     text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
-    if result.outliers and numbers is None:
-        text += f'; {_counted(result.outliers)} no weight, see the report'
-    elif numbers is not None and result.outliers:
-        named = _outliers_in_words(result.outliers, numbers)
-        text += f'; {_counted(result.outliers)} no weight: {named}'
+    if count := len(result.outliers):
+        text += '; 1 outlier carries' if count == 1 else f'; {count} outliers carry'
+        where = ', see the report' if numbers is None else f': {_named(result.outliers, numbers)}'
+        text += f' no weight{where}'
     if result.region is not None:
         text += f'; {result.region.in_words()}'
     text = '; '.join((text, *notes(result)))
@@ -96,17 +95,13 @@ def notes(result: Identification) -> list[str]:
     return found
 
 
-def _counted(outliers: Sequence[Outlier]) -> str:
-    return '1 outlier carries' if len(outliers) == 1 else f'{len(outliers)} outliers carry'
-
-
-def _outliers_in_words(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
+def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
     """Return the numbers and stamps [s] of outliers, the largest first."""
+    seconds = {each: divmod(each.stamp_ns, 10**9) for each in outliers}
     largest = sorted(outliers, key=lambda each: -each.size)
-    words = [
-        f'pose {numbers[each]} ({each.stamp_ns // 10**9}.{each.stamp_ns % 10**9:09d})'
-        for each in largest
-    ]
+    words = (
+        f'pose {numbers[each]} ({seconds[each][0]}.{seconds[each][1]:09d})' for each in largest
+    )
     return ', '.join(some([*dict.fromkeys(words)]))
 
 
@@ -181,19 +176,20 @@ def _lost(calibration: Calibration, text: str) -> str:
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
     """Return the result as one JSON document; `samples` is what became of the input."""
 
-    def comparison(which: Comparison | None) -> dict[str, Any] | None:
-        if which is None:
-            return None
-        before, after = which.figures
-        with_outliers = which.figures_of_all[1]
-        return {
-            'before': asdict(before),
-            'after': asdict(after),
-            'outliers': which.outliers,
-            'after_with_outliers': asdict(with_outliers),
-        }
+    def comparison(which: Comparison) -> dict[str, Any]:
+        before, after = map(asdict, which.figures)
+        with_outliers = asdict(which.figures_of_all[1])
+        found = {'before': before, 'after': after, 'outliers': which.outliers}
+        return found | {'after_with_outliers': with_outliers}
 
-    validation = comparison(result.validation)
+    def parameter(p: ParameterRow) -> dict[str, Any]:
+        found = {'value': p.value, 'offset': p.offset, 'std': p.std}
+        found['half_width_95'] = p.half_width(0.95)
+        return found | {'unit': p.name.unit, 'status': p.status}
+
+    judged = result.validation
+    by = {'by': result.validated_by}
+    lower = [row[: k + 1] for k, row in enumerate(result.covariance.tolist())]
     return {
         'converged': result.converged,
         'accepted': result.accepted,
@@ -205,15 +201,18 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'not_excited': list(result.not_excited),
         'weakly_determined': list(weakly_determined(result)),
         'held_near_nominal': list(result.weak),
-        'parameters': {p.name: _parameter(p) for p in result.parameters},
+        'parameters': {p.name: parameter(p) for p in result.parameters},
         'fitted': comparison(result.fitted),
-        'validation': None if validation is None else {'by': result.validated_by, **validation},
+        'validation': None if judged is None else by | comparison(judged),
         'before_is': BEFORE,
         'noise_in_sigma': asdict(result.noise),
         'chance_of_gain': result.chance,
         'outliers': [asdict(outlier) for outlier in result.outliers],
         'gauges': result.gauges,
-        'covariance': {'names': list(result.names), 'lower': _lower(result.covariance)},
+        'covariance': {
+            'names': list(result.names),
+            'lower': [[float(f'{x:.9e}') for x in row] for row in lower],
+        },
         'correlated': [list(pair) for pair in result.correlated()],
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),
@@ -230,22 +229,6 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'python': platform.python_version(),
             'numpy': np.__version__,
         },
-    }
-
-
-def _lower(square: FloatArray) -> list[list[float]]:
-    """Return the lower triangle (P, P) of a symmetric matrix row by row, in ten digits."""
-    return [[float(f'{x:.9e}') for x in row[: k + 1]] for k, row in enumerate(square.tolist())]
-
-
-def _parameter(p: ParameterRow) -> dict[str, Any]:
-    return {
-        'value': p.value,
-        'offset': p.offset,
-        'std': p.std,
-        'half_width_95': p.half_width(0.95),
-        'unit': p.name.unit,
-        'status': p.status,
     }
 
 
@@ -273,16 +256,11 @@ def scatter_in_words(noise: Noise) -> str:
         return f'{text}: nothing but that noise (chi-squared test).'
     if noise.position < 1.0:
         return f'{text}: the device is better than stated.'
-    return (
-        f'{text}: the device is worse than stated, or the model lacks an effect. The intervals '
-        'allow for it.'
-    )
+    text += ': the device is worse than stated, or the arm has errors that this model lacks.'
+    return f'{text} The intervals are wider for it.'
 
 
-NEIGHBOURS = {
-    'successive': 'measured in succession',
-    'near': 'near each other in joint space',
-}
+NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other in joint space'}
 
 
 def neighbours_in_words(noise: Noise) -> str:
@@ -292,7 +270,7 @@ def neighbours_in_words(noise: Noise) -> str:
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
     text = (
         f'The errors of poses {" and ".join(parts)} are alike (correlation in brackets): the '
-        'device drifts, or the model lacks an effect.'
+        'device drifts, or the arm has errors that this model lacks.'
     )
     if (times := f'{noise.widened:.2f}') != '1.00':
         text += f' So standard deviations are {times} times those of independent errors.'

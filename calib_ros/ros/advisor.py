@@ -34,7 +34,7 @@ from calib_ros.apply.planning import choose
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError
-from calib_ros.files.trajectories import RATES, trajectory_program
+from calib_ros.files.programs import RATES, trajectory_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import STILL
 from calib_ros.identification.observations import SOME_POSES

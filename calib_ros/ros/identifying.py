@@ -15,9 +15,9 @@ from visualization_msgs.msg import MarkerArray
 
 from calib_ros.errors import LONGEST, CalibrationError, ConfigError, shortened
 from calib_ros.files.archive import Archive
-from calib_ros.files.history import History
-from calib_ros.files.rows import (
+from calib_ros.files.history import (
     Filing,
+    History,
     Row,
     identified,
     judged,

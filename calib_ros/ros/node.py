@@ -31,7 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 from calib_ros.errors import CalibrationError
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
-from calib_ros.files.waypoints import read_joints
+from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since

@@ -14,8 +14,7 @@ from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
-from calib_ros.files.trajectories import read_program
-from calib_ros.files.waypoints import joints_csv
+from calib_ros.files.programs import joints_csv, read_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.records import nominal_document

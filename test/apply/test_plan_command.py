@@ -12,7 +12,7 @@ from calib_ros.apply import simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.planning import choose
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.waypoints import joints_csv, read_joints
+from calib_ros.files.programs import joints_csv, read_joints
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.se3 import invert
 

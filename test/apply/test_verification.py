@@ -16,7 +16,7 @@ from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.layouts import joint_columns
-from calib_ros.files.waypoints import csv_of, joints_csv, read_joints
+from calib_ros.files.programs import csv_of, joints_csv, read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.validation import Residuals

@@ -11,7 +11,7 @@ from calib_ros.apply import simulation, workspace
 from calib_ros.apply.workspace import regions, survey
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.files.waypoints import csv_of, read_joints, read_poses
+from calib_ros.files.programs import csv_of, read_joints, read_poses
 from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.kinematics.chain import Frame

@@ -11,9 +11,9 @@ import yaml
 from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.apply import simulation
+from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
-from calib_ros.cli.results import RESULT_FILES
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 

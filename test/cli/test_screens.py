@@ -25,9 +25,8 @@ import pytest
 from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.cli import screen
-from calib_ros.cli.command import TEXTS
 from calib_ros.cli.commands import examples_of
-from calib_ros.cli.main import _parser, main
+from calib_ros.cli.main import TEXTS, _parser, main
 from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
 from calib_ros.files import bags

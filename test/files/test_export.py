@@ -13,7 +13,7 @@ from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.cli.main import main
 from calib_ros.files import export
 from calib_ros.files.export import ExportError, converted, exports, forward_of, kinematics_yaml
-from calib_ros.files.waypoints import joints_csv
+from calib_ros.files.programs import joints_csv
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import (
     calibration_record,

@@ -12,8 +12,7 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.history import History
-from calib_ros.files.rows import Filing, Row, identified, measured_at, settings_hash
+from calib_ros.files.history import Filing, History, Row, identified, measured_at, settings_hash
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain

@@ -14,7 +14,7 @@ from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
 from calib_ros.files import tables
-from calib_ros.files.journal import Journal
+from calib_ros.files.archive import Journal
 from calib_ros.files.tables import read_journal, read_table, table_text
 from calib_ros.kinematics import se3
 from calib_ros.sampling.sample import Sample
@@ -265,7 +265,7 @@ WRITER = """
 import sys
 from pathlib import Path
 import numpy as np
-from calib_ros.files.journal import Journal
+from calib_ros.files.archive import Journal
 from calib_ros.sampling.sample import Sample
 journal = Journal(Path(sys.argv[1]), 3)
 for number in range(1, 10**7):

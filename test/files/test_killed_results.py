@@ -16,8 +16,8 @@ from killed import KILLED, every_kill, forked, status_of, tree
 from measured import measured, rows_of, write_csv
 from rosbags.rosbag2 import Writer
 
-from calib_ros.cli import given, identify, main, results
-from calib_ros.cli.results import Identified
+from calib_ros.cli import given, identify, main
+from calib_ros.cli.identify import Identified
 from calib_ros.files.bags import replay
 from calib_ros.files.loading import Loaded
 from calib_ros.files.recording import Recording, write_bag
@@ -117,9 +117,9 @@ def identified(monkeypatch):
         return Identified(loaded, result, origin)
 
     monkeypatch.setattr(plots, 'before_after_png', lambda result: repr(result.names).encode())
-    monkeypatch.setattr(results, 'identification_report', lambda *of: of[1])
-    monkeypatch.setattr(given, 'render', lambda result: f'page of {result.names}')
-    monkeypatch.setattr(results, 'markdown', lambda result, samples: f'{samples} {result.names}')
+    monkeypatch.setattr(identify, 'identification_report', lambda *of: of[1])
+    monkeypatch.setattr(given.page, 'render', lambda result: f'page of {result.names}')
+    monkeypatch.setattr(identify, 'markdown', lambda result, samples: f'{samples} {result.names}')
     monkeypatch.setattr(
         calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
     )

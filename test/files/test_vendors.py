@@ -207,7 +207,7 @@ def test_the_hash_is_that_of_the_robot_or_of_the_numbers():
 
 def test_a_file_that_differs_is_refused(monkeypatch):
     nominal = load_chain('ur10e')
-    monkeypatch.setattr(vendors, 'xyz_rpy', lambda matrix: pose())
+    monkeypatch.setattr(vendors.export, 'xyz_rpy', lambda matrix: pose())
     with pytest.raises(ExportError, match=r'ur_kinematics\.yaml, read back, differs'):
         vendor_files(nominal, nominal)
 

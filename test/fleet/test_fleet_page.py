@@ -8,7 +8,7 @@ import numpy as np
 import plants
 
 from calib_ros.apply.confidence import drift
-from calib_ros.files.rows import Row
+from calib_ros.files.history import Row
 from calib_ros.fleet.plant import Measured, Robot
 from calib_ros.fleet.standing import Standing, counts
 from calib_ros.fleet.watch import Change, Night, Watched

@@ -5,8 +5,7 @@ import pytest
 from distributed import LocalCluster
 
 from calib_ros.errors import ConfigError
-from calib_ros.files.history import History
-from calib_ros.files.rows import Row
+from calib_ros.files.history import History, Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, LostError, run

@@ -10,7 +10,7 @@ import plants
 import pytest
 
 from calib_ros.apply import simulation
-from calib_ros.files.rows import Filing, identified
+from calib_ros.files.history import Filing, identified
 from calib_ros.fleet.watch import watch
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem

@@ -152,7 +152,7 @@ def detections(path):
 
 @target('.csv')
 def journal(path):
-    from calib_ros.files.journal import Journal
+    from calib_ros.files.archive import Journal
     from calib_ros.files.tables import read_journal
 
     samples, _ = read_journal(path, len(ARM.joints))
@@ -164,7 +164,7 @@ def journal(path):
 
 @target('.csv')
 def waypoints(path):
-    from calib_ros.files.waypoints import read_joints, read_poses
+    from calib_ros.files.programs import read_joints, read_poses
 
     for read in (lambda: read_joints(path, ARM), lambda: read_poses(path)):
         with contextlib.suppress(CalibrationError):
@@ -182,7 +182,7 @@ def program_yaml(path):
 
 
 def _program(path):
-    from calib_ros.files.trajectories import read_program
+    from calib_ros.files.programs import read_program
 
     read = read_program(path, ARM.joint_names)
     read.text_with(read.program)

@@ -17,8 +17,8 @@ from measured import write_csv
 
 from calib_ros.apply.simulation import Cell, drive, faulty, random_frame
 from calib_ros.cli.main import main
+from calib_ros.files.archive import Journal
 from calib_ros.files.bags import replay
-from calib_ros.files.journal import Journal
 from calib_ros.identification.validation import residuals
 from calib_ros.kinematics import se3
 from calib_ros.sampling.session import CalibrationSession

@@ -12,21 +12,20 @@ import pytest
 from hypothesis import given, strategies as st
 from measured import measured
 
-from calib_ros.escapes import from_cell, in_markdown, one_line, to_cell
+from calib_ros.files.archive import Journal
 from calib_ros.files.export import exports
-from calib_ros.files.journal import Journal
 from calib_ros.files.tables import read_journal
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report import reports
-from calib_ros.report.markdown import markdown
-from calib_ros.report.page import Origin
+from calib_ros.report.page import Origin, markdown
 from calib_ros.report.plots import before_after_png
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.sampling.sample import Sample
+from calib_ros.texts import from_cell, in_markdown, one_line, to_cell
 
 HOSTILE = (
     *("=cmd|' /C calc'!A0", '+1', '-1+1', '@SUM(1)', '\t=1', '\r=1', "'=1", "''@x", 'a,=1\n=2'),

@@ -24,13 +24,12 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
-from calib_ros.report import advice, explorer
-from calib_ros.report.maps import workspace_report
+from calib_ros.report import advice
+from calib_ros.report.applied import verification_report, workspace_report
 from calib_ros.report.page import Input, Origin, Report, Verdict, render
 from calib_ros.report.plots import drawing
-from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
+from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
-from calib_ros.report.verified import verification_report
 
 EMPTY = Report('kind', 'robot', Verdict('info', 'heading'), identity=(('a', 'b'),))
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
@@ -167,10 +166,30 @@ def test_every_refusal_is_told_in_plain_words(rule):
 
 @pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])
 def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
-    (usual,) = advice.advice([Reason(rule, 'little gain')], 2.0)
-    (coarse,) = advice.advice([Reason(rule, 'little gain')], 47.6)
+    (usual,) = advice.advice([Reason(rule, 'little gain')], advice.Situation(left=2.0))
+    (coarse,) = advice.advice([Reason(rule, 'little gain')], advice.Situation(left=47.6))
     assert '48 times' in coarse.steps[0]
     assert coarse.steps[1:] == tuple(each for each in usual.steps if 'stood still' not in each)
+
+
+def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
+    refused = [Reason(Rule.GAIN, 'little gain')]
+    (few,) = advice.advice(refused, advice.Situation(poses=14, left=2.5, sigma=1e-4))
+    assert few.meaning.startswith('Only 14 different poses')
+    assert few.steps == advice.rules()[Rule.CONFIGURATIONS].steps
+    (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
+    assert 'a noise of 0.46 mm in each direction; 0.1 mm are set' in enough.meaning
+
+
+def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
+    problem, result = solved
+    origin = Origin(
+        (Input('cell/a.mcap', 1, 'a'), Input('cell/metadata.yaml', 1, 'b')), command='c <d>'
+    )
+    report = replace(report_of(problem, result), origin=origin)
+    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('identify again',))
+    assert report.of == 'cell'
+    assert 'c &lt;d&gt;' in render(refused)
 
 
 @pytest.mark.parametrize(('share', 'count', 'state'), [(0.0, 60, 'info'), (0.5, 8, 'bad')])
@@ -189,7 +208,8 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
 
 def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
     rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.OUTLIERS)
-    told = advice.advice([Reason(rule, rule.name) for rule in rules], 1000.0)
+    here = advice.Situation(left=1000.0)
+    told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
     assert [bool(each.steps) for each in told] == [True, True, False]
     assert told[-1].refusal == 'LARGEST_ERROR; GAIN'
     assert told[0].heading in told[-1].meaning
@@ -276,8 +296,8 @@ def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     problem, result = solved
     poses = poses_of(problem, result)
-    monkeypatch.setattr(explorer, 'SINGLE', 30)
-    shown = explorer.explorer(result.chain, poses)
+    monkeypatch.setattr('calib_ros.report.poses.SINGLE', 30)
+    shown = explorer(result.chain, poses)
     good = ~poses.outlier
     assert sum(shown['cells']['count']) == good.sum()
     squares = np.square(shown['cells']['rms_after']) * shown['cells']['count']
@@ -299,12 +319,12 @@ def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
     many = replace(
         many, stamps_ns=np.arange(count), after=many.after + rng.normal(0, 1e-5, (count, 3))
     )
-    shown = explorer.explorer(result.chain, many)
-    assert len(shown['role']) <= 2 * explorer.WORST
+    shown = explorer(result.chain, many)
+    assert len(shown['role']) <= 2 * WORST
     report = replace(report_of(*solved), explorer=shown)
     assert len(render(report).encode()) < 8e6
-    most = one.select(rng.integers(0, len(one), explorer.SINGLE))
-    report = replace(report, explorer=explorer.explorer(result.chain, most))
+    most = one.select(rng.integers(0, len(one), SINGLE))
+    report = replace(report, explorer=explorer(result.chain, most))
     assert len(render(report).encode()) < 8e6
 
 

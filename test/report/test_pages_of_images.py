@@ -11,7 +11,7 @@ from pages import Page
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
 from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
-from calib_ros.files.waypoints import csv_of
+from calib_ros.files.programs import csv_of
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.texts import csv_text, dump_yaml
 

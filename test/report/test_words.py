@@ -7,7 +7,7 @@ import pytest
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import in_words, verify
-from calib_ros.files.rows import Filing, verified
+from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import Recalibration
 from calib_ros.identification.validation import ErrorFigures

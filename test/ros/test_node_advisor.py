@@ -14,7 +14,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.errors import InputError
-from calib_ros.files.waypoints import joints_csv
+from calib_ros.files.programs import joints_csv
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain

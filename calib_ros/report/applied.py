@@ -1,23 +1,56 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages of a workspace and of a plan say."""
+"""What the pages of a verification, of a workspace and of a plan say."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import astuple, replace
 
 import numpy as np
 
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import Placements, Spread, Survey, in_base, regions
+from calib_ros.apply.verification import Verification, remarks
+from calib_ros.apply.workspace import Placements, Sector, Spread, Survey, in_base, regions
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report import figures
-from calib_ros.report.page import Origin, Report, Section, Verdict
-from calib_ros.report.sections import coverage, identity_of
+from calib_ros.report import figures, sections
+from calib_ros.report.advice import SPREAD
+from calib_ros.report.page import Origin, Report, Section, Verdict, section
+from calib_ros.report.poses import Poses, explorer, numbers, unit_of
+
+MOVED = (
+    'Check that the measuring device, the target and the robot stand as they did for the '
+    'calibration; if not, use --new-base or --new-tool.'
+)
+TOLERANCE = 'Give --tolerance with the RMS error [mm] that your task allows: PASS or FAIL.'
+STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
+    'PASS': (
+        Verdict('good', 'PASS: the arm is within the tolerance'),
+        ('Keep this page with the calibration. Verify again after a collision or repair.',),
+    ),
+    'FAIL': (
+        Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
+        (
+            MOVED,
+            'Check that the correction is active in the controller (--commanded tells).',
+            'Calibrate again with new poses; try --model auto.',
+        ),
+    ),
+    'UNDECIDED': (
+        Verdict('open', 'UNDECIDED: too few measurements to tell'),
+        (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
+    ),
+    'does not hold': (
+        Verdict('bad', 'The calibration does not hold any more'),
+        (MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
+    ),
+    'holds': (Verdict('good', 'The calibration holds: the error is as it was'), (TOLERANCE,)),
+    'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
+}
+"""Verdicts, and what to do next."""
 
 
 def workspace_report(
@@ -46,18 +79,14 @@ def workspace_report(
             head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
-        identity=identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
+        identity=sections.identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
         origin=origin,
     )
 
 
 def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
-    """Return where most is removed, and where what remains is known least."""
-    titles = (
-        'Where the most is removed by the calibration',
-        'Where that is most uncertain',
-    )
+    titles = ('Where the most is removed by the calibration', 'Where that is most uncertain')
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
         shown = sectors if len(sectors) <= most else (*sectors[:most], sectors[-1])
@@ -66,36 +95,30 @@ def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
             title,
             (f'The {most} regions of the largest errors, and that of the least.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
-            rows=tuple(
-                (
-                    each.words,
-                    str(each.poses),
-                    f'{1e3 * each.rms:.4f}',
-                    *(f'{low:.2f} to {high:.2f}' for low, high in (each.radius, each.height)),
-                )
-                for each in shown
-            ),
+            rows=tuple(map(_region, shown)),
         )
 
 
+def _region(found: Sector) -> tuple[str, ...]:
+    spans = (f'{low:.2f} to {high:.2f}' for low, high in (found.radius, found.height))
+    return (found.words, str(found.poses), f'{1e3 * found.rms:.4f}', *spans)
+
+
 def _placed(placed: Placements) -> Section:
-    """Return the placements of a task in space."""
     reached = ~np.isnan(placed.errors)
     best = placed.positions[placed.best]
     where = ', '.join(f'{value:.3f}' for value in best)
-    values = figures.numbers(1e3 * placed.errors[reached])
+    values = numbers(1e3 * placed.errors[reached])
     colours = {'size': 4, 'color': values, **figures.scale_of('expected error [mm]')}
     cloud = figures.in_space(
         placed.positions[reached], 'expected error [mm]', marker=colours, showlegend=False
     )
     mark = {'size': 8, 'color': '#b3261e', 'symbol': 'diamond'}
-    return Section(
+    place = figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
+    return section(
         'placements',
         'Where to put the task',
-        (),
-        figures.space(
-            cloud, figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
-        ),
+        figure=figures.space(cloud, place),
         height=560,
         said=(
             f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
@@ -118,9 +141,9 @@ def plan_report(
 
     `found` is None for the test poses of ISO 9283.
     """
-    sections = [
+    shown = [
         _visit(chain, joints),
-        coverage(chain, joints, 'How far each joint will move'),
+        sections.coverage(chain, joints, 'How far each joint will move'),
         _listed(chain, joints),
     ]
     verdict = Verdict('info', 'Poses to go', (f'{len(joints)} poses.',))
@@ -131,7 +154,7 @@ def plan_report(
     if found is not None:
         curve = figures.predictions(found.accuracy, found.at_random, wanted_mm)
         about = 'From measurement noise alone; errors of the model come on top.'
-        sections.insert(0, Section('promise', 'What the poses promise', (about,), curve))
+        shown.insert(0, Section('promise', 'What the poses promise', (about,), curve))
         known = bool(np.isfinite(found.accuracy[-1]))
         if known:
             predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
@@ -149,14 +172,13 @@ def plan_report(
         verdict=verdict,
         remarks=tuple(x for x in words.splitlines() if not x.startswith((' ', 'predicted'))),
         steps=steps,
-        identity=identity_of(chain, origin),
-        sections=tuple(sections),
+        identity=sections.identity_of(chain, origin),
+        sections=tuple(shown),
         origin=origin,
     )
 
 
 def _visit(chain: Chain, joints: FloatArray) -> Section:
-    """Return the way of the target through poses (K, n)."""
     order = list(range(1, len(joints) + 1))
     path = figures.in_space(
         in_base(chain, joints)[:, :3, 3],
@@ -172,8 +194,7 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
 
 
 def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
-    """Return the joint values of poses (K, n)."""
-    show = [figures.unit_of(joint) for joint in chain.joints]
+    show = [unit_of(joint) for joint in chain.joints]
     more = f' The first {most} are shown.' if len(joints) > most else ''
     return Section(
         'poses',
@@ -183,5 +204,57 @@ def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
         rows=tuple(
             (str(k + 1), *(f'{s[0] * q:.{s[2]}f}' for s, q in zip(show, row, strict=True)))
             for k, row in enumerate(joints[:most].tolist())
+        ),
+    )
+
+
+def verification_report(
+    chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
+) -> Report:
+    """Return the report of a verification of a calibrated chain."""
+    share = f'{100.0 * found.confidence:g} %'
+    text = [
+        f'The RMS position error over poses like these is between {1e3 * found.lower:.3f} mm and '
+        f'{1e3 * found.upper:.3f} mm; each limit holds with {share} confidence.'
+    ]
+    if found.tolerance is not None:
+        text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
+    state, steps = STANDINGS[found.verdict]
+    return Report(
+        kind='Verification of a calibrated arm',
+        robot=chain.name,
+        verdict=replace(
+            state, text=tuple(text), gain=sections.gain(found.comparison, intervals=False)
+        ),
+        accuracy=sections.accuracy_section(
+            'Accuracy before and after the correction',
+            found.comparison,
+            poses.things,
+            intervals=False,
+        ),
+        picture=sections.distribution(poses),
+        steps=steps,
+        remarks=(*warnings, *remarks(found)),
+        identity=sections.identity_of(
+            chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)
+        ),
+        explorer=explorer(chain, poses),
+        sections=(
+            *((_by_configuration(found),) if found.each else ()),
+            sections.coverage(chain, poses.joints, 'How far each joint was moved'),
+        ),
+        origin=origin,
+    )
+
+
+def _by_configuration(found: Verification) -> Section:
+    return section(
+        'configurations',
+        'Pose by pose (ISO 9283)',
+        'AP: position accuracy, of the mean of all cycles. RP: repeatability, mean + 3 sigma.',
+        head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
+        rows=tuple(
+            (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in values))
+            for k, (cycles, *values) in enumerate(map(astuple, found.each), 1)
         ),
     )

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""`calib_ros compare | compensate | export`: what is done with calibrations."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import fields
+from pathlib import Path
+
+from calib_ros.apply.compensation import Compensator, in_words
+from calib_ros.apply.program import compensate_program
+from calib_ros.atomic import write_file
+from calib_ros.cli import options as common
+from calib_ros.cli.given import calibration_of
+from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.screen import Screen
+from calib_ros.errors import InputError
+from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
+from calib_ros.files.programs import read_joints, read_program
+from calib_ros.files.vendors import VENDOR_FILES, vendor_files
+from calib_ros.identification.difference import difference
+from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
+from calib_ros.kinematics.urdf import corrected_urdf
+from calib_ros.settings import Limits
+from calib_ros.shown import NAMED
+from calib_ros.texts import dump_json
+
+
+def _compare(options: argparse.Namespace, screen: Screen) -> int:
+    pair = [calibration_of(path, 'compare') for path in (options.first, options.second)]
+    with screen.work('comparing'):
+        found = difference(*pair)
+    if options.json:
+        screen.data(dump_json(found.document()))
+    else:
+        screen.title(found.in_words(), found.same)
+        if not found.same:
+            screen.table(found.rows())
+    return 0 if found.same else common.NOT_ACCEPTED
+
+
+def _compensate(options: argparse.Namespace, screen: Screen) -> int:
+    refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
+    common.refuse_existing(options, options.out)
+    if options.out.exists() and options.out.samefile(options.program):
+        raise InputError(
+            '--out is the program itself: keep it, a program compensated twice is wrong'
+        )
+    nominal = load_chain(options.chain)
+    arm = calibration_of(options.calibration, 'compensate', nominal)
+    limits = {item.name: getattr(options, item.name) for item in fields(Limits)}
+    compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
+    with screen.work(f'correcting {options.program.name}') as work:
+        source = read_program(options.program, nominal.joint_names)
+        corrected, result = compensate_program(compensator, source.program, work)
+    if result.refusals:
+        screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
+        for refusal in result.refusals[:NAMED]:
+            screen.warn(refusal.reason, source.places[refusal.sample])
+        if more := result.refusals[NAMED:]:
+            screen.warn(f'and {len(more)} more, up to {source.places[more[-1].sample]}', 'refused')
+        return common.NOT_ACCEPTED
+    write_file(options.out, source.text_with(corrected), overwrite=options.force)
+    screen.say(f'wrote {options.out}: {in_words(compensator, result)}')
+    words, warning = arm.knowledge(result.joints, result.orientation_before)
+    if words:
+        screen.say(words)
+    if warning:
+        screen.warn(warning)
+    return 0
+
+
+def _export(options: argparse.Namespace, screen: Screen) -> int:
+    nominal = load_chain(options.chain)
+    calibration = calibration_of(options.calibration, 'export', nominal)
+    chain, origin = calibration.chain, calibration.record
+    measured = None if options.measured is None else read_joints(options.measured, chain)
+    found = exports(chain, nominal, measured, origin)
+    links = {'base_link': options.base_link, 'tip_link': options.tip_link}
+    urdf = ''
+    if options.urdf is not None:
+        urdf = read_text(options.urdf)
+        text = corrected_urdf(urdf, chain, **links) + urdf_foot(chain)
+        found = (*found, Export(f'{options.urdf.stem}{CORRECTED_URDF}', text, 0.0))
+    elif Path(options.chain).suffix in URDF_SUFFIXES:
+        urdf = read_text(Path(options.chain))
+    found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
+    with common.results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
+        contents |= {each.name: each.content for each in found}
+    for each in found:
+        exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
+        screen.say(f'{options.out / each.name}: {exact}')
+    return 0

@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses to go to: tables of joint values or poses (CSV), and JointTrajectory messages (YAML).
+
+Joint values are in q1 ... qn, or in columns with the joints' names [rad or m], poses in x y z [m]
+and qx qy qz qw. What of a program is no joint value, velocity or acceleration of the arm is
+written as it was read.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib_ros.apply.program import Program
+from calib_ros.errors import InputError
+from calib_ros.files.columns import Columns, check_quaternions
+from calib_ros.files.csv_columns import columns_of, read_columns, with_rows
+from calib_ros.files.layouts import POSITION, QUATERNION, joint_columns
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.inverse import limits
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
+from calib_ros.values import parse_numbers
+
+POSE = (*POSITION, *QUATERNION)
+RATES = ('positions', 'velocities', 'accelerations')
+"""What a point of a JointTrajectory holds that a correction changes."""
+
+
+def read_joints(path: Path, chain: Chain) -> FloatArray:
+    """Read joint values (N, n) [rad or m] of a chain from a CSV.
+
+    A value over 1e-3 beyond the limits of its joint is refused.
+    """
+    found = read_columns(path, ())
+    names = _header_of(found, chain.joint_names)
+    values = found.block(names)
+    lower, upper = limits(chain)
+    beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
+    for k, i in np.argwhere(beyond)[:1].tolist():
+        raise InputError(
+            f'{found.where(k, names[i])} {values[k, i]:.6g} is beyond the limits of '
+            f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
+        )
+    return values
+
+
+def _header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns that hold the joint values: q1 ... qn, or the names of the joints."""
+    names = joint_columns(len(joints))
+    if set(joints) <= set(found.header) and not set(names) <= set(found.header):
+        names = tuple(joints)
+    more = f'q{len(joints) + 1}'
+    if more in with_rows(found, names).header:
+        raise InputError(
+            f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
+        )
+    return names
+
+
+def read_poses(path: Path) -> FloatArray:
+    """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
+    found = read_columns(path, POSE)
+    numbers = found.block(POSE)
+    check_quaternions(found, numbers[:, 3:])
+    return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
+
+
+def joints_csv(joints: FloatArray) -> str:
+    """Return the CSV text of joint values (N, n), as `read_joints` reads it."""
+    return csv_of(joint_columns(joints.shape[1]), joints)
+
+
+def csv_of(columns: Sequence[str], values: FloatArray) -> str:
+    """Return the CSV text of values (N, C); NaN is left empty."""
+    cells = (['' if x != x else f'{x:.9f}' for x in row] for row in values.tolist())
+    return csv_text([columns, *cells])
+
+
+@dataclass(frozen=True, eq=False)
+class ProgramFile:
+    """A program, where each of its samples stands in the file, and how to write it again."""
+
+    program: Program
+    places: tuple[str, ...]
+    text_with: Callable[[Program], str]
+
+
+def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
+    """Read a program for an arm with the named joints: CSV, or YAML by the file's suffix.
+
+    CSV: joint values in q1 ... qn, or in columns with the joints' names; s1 ... sn, if present,
+    are the signs of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic
+    echo` prints it.
+    """
+    suffix = path.suffix.lower()
+    if suffix == '.csv':
+        return _read_csv(read_text(path, LARGEST_TABLE, InputError), path, joints)
+    if suffix in ('.yaml', '.yml'):
+        return _read_yaml(read_text(path, LARGEST_TEXT, InputError), str(path))
+    raise InputError(f'{path} must be a table (.csv with q1 ... qn) or a JointTrajectory (.yaml)')
+
+
+def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
+    found = columns_of(path, text.encode())
+    names = _header_of(found, joints)
+    signs = joint_columns(len(joints), 's')
+    approach = np.sign(found.block(signs)) if set(signs) <= set(found.header) else None
+
+    def text_with(corrected: Program) -> str:
+        header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
+        at = [found.header.index(name) for name in names]
+        for row, values in zip(rows, corrected.positions.tolist(), strict=True):
+            for k, value in zip(at, values, strict=True):
+                row[k] = repr(value)
+        return csv_text([header, *rows])
+
+    program = Program(tuple(joints), found.block(names), approach=approach)
+    return ProgramFile(program, tuple(f'line {line}' for line in found.lines), text_with)
+
+
+def _read_yaml(text: str, where: str) -> ProgramFile:
+    message = parse_yaml(text, where, InputError)
+    names = message.get('joint_names') if isinstance(message, dict) else None
+    points = message.get('points') if isinstance(message, dict) else None
+    if not isinstance(names, list) or not isinstance(points, list) or not points:
+        raise InputError(
+            f'{where} must be a trajectory_msgs/JointTrajectory with joint_names and points'
+        )
+    for k, point in enumerate(points):
+        if not isinstance(point, dict):
+            raise InputError(
+                f'{where}, point {k + 1} must be a mapping, not {point!r}; a message that was cut '
+                'short is printed as a whole by ros2 topic echo --full-length'
+            )
+
+    def text_with(corrected: Program) -> str:
+        arrays = {
+            key: array.tolist() for key in RATES if (array := getattr(corrected, key)) is not None
+        }
+        new = [
+            point | {key: rows[k] for key, rows in arrays.items()}
+            for k, point in enumerate(points)
+        ]
+        return dump_yaml(message | {'points': new})
+
+    places = tuple(f'point {k + 1}' for k in range(len(points)))
+    return ProgramFile(trajectory_program(names, points, where), places, text_with)
+
+
+def trajectory_program(
+    names: Sequence[object], points: Sequence[Mapping[str, Any]], where: str
+) -> Program:
+    """Return the program of a JointTrajectory: joint names, and points with lists of numbers.
+
+    Velocities and accelerations are those of all points or of none.
+    """
+
+    def values(key: str) -> FloatArray | None:
+        given = [point.get(key) or [] for point in points]
+        if not any(given):
+            return None
+        rows = [
+            parse_numbers(row, len(names), f'{where}, point {k + 1}: {key}', InputError)
+            for k, row in enumerate(given)
+        ]
+        return np.array(rows)
+
+    positions, *rates = map(values, RATES)
+    if positions is None:
+        raise InputError(f'{where} has no positions')
+    return Program(tuple(map(str, names)), positions, *rates)
