@@ -26,13 +26,11 @@ import numpy as np
 import calib_ros
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification import records
-from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import ALIKE
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.region import Region, region_of_record
-from calib_ros.identification.samples import BLOCK
+from calib_ros.identification.region import Region, region_of_record, sigma_of
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
@@ -74,7 +72,7 @@ class Calibration(Shown):
         Which session, device or target each frame is of (`sampling.sample.Frames`), if known.
     record : mapping
         Where the numbers come from, as the file says it, but for the covariance and the rows.
-    rows : Fingerprint or None
+    rows : records.Fingerprint or None
         Of the measurements that were fitted, if they are known.
 
     """
@@ -90,7 +88,7 @@ class Calibration(Shown):
     world_frame: str = ''
     owners: Mapping[str, records.Owner] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)
-    rows: Fingerprint | None = None
+    rows: records.Fingerprint | None = None
 
     @classmethod
     def of(
@@ -102,10 +100,9 @@ class Calibration(Shown):
     ) -> Calibration:
         """Return that of an identification; `origin` tells of its samples, those `fitted`."""
         before, after = (result.validation or result.fitted).figures
-        region, noise = result.region, result.noise
+        region, noise, owners = result.region, result.noise, owners or {}
         record = {
-            'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-            'software': f'calib_ros {calib_ros.__version__}',
+            **made(),
             'accepted': result.accepted,
             'world_frame': result.world_frame,
             'samples': len(result.fitted.judged),
@@ -115,25 +112,23 @@ class Calibration(Shown):
             'rms_mm_after': round(after.rms_mm, 6),
             'noise_in_sigma': asdict(noise) | {'shared': list(noise.shared)},
             'not_identifiable': list(result.unidentifiable),
-            'table_sha256': table_hash(result.chain),
-            'nominal': records.nominal_document(result.before) | frames_document(result.before),
-            'frames': records.owners_document(owners or {}),
-            'region': None if region is None else region.document(),
+            **about(result.chain, result.before, region),
+            'frames': records.owners_document(owners),
             **(origin or {}),
         }
         return cls(
-            result.chain,
-            result.before,
-            result.names,
-            result.covariance,
-            result.uncertainty.overall,
-            1e-3 * after.rms_mm,
-            noise,
-            region,
-            result.world_frame,
-            owners or {},
-            record,
-            Fingerprint.of(fitted) if fitted else None,
+            chain=result.chain,
+            before=result.before,
+            names=result.names,
+            covariance=result.covariance,
+            freedom=result.uncertainty.overall,
+            residual=1e-3 * after.rms_mm,
+            noise=noise,
+            region=region,
+            world_frame=result.world_frame,
+            owners=owners,
+            record=record,
+            rows=records.Fingerprint.of(fitted) if fitted else None,
         )
 
     def dump(self) -> str:
@@ -163,7 +158,7 @@ class Calibration(Shown):
         """
         if self.region is not None:
             return self.region.sigma(joints)
-        return self._sigma(joints, slice(0, 3))
+        return self._sigma(joints, slice(3))
 
     def sigma_turned(self, joints: FloatArray) -> FloatArray:
         """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
@@ -172,13 +167,7 @@ class Calibration(Shown):
     def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
         if self.covariance is None:
             return np.full(len(joints), np.nan)
-        model = ErrorModel(self.chain, self.names)
-        squares = np.empty(len(joints))
-        for first in range(0, len(joints), BLOCK):
-            part = slice(first, first + BLOCK)
-            rows = model.jacobian(joints[part])[:, components]
-            squares[part] = np.einsum('ncp,pq,ncq->n', rows, self.covariance, rows, optimize=True)
-        return np.sqrt(np.maximum(squares, 0.0))
+        return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
 
     def remaining(self, joints: FloatArray) -> FloatArray:
         """Return the error (N,) [m] expected to remain at (N, n); NaN if not known."""
@@ -230,6 +219,21 @@ class Calibration(Shown):
             'hold near the measured target only. Measure orientations as well, or a target '
             'further off the last axis'
         )
+
+
+def made() -> dict[str, str]:
+    """Return when and by what a calibration is made, for its record."""
+    now = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    return {'created': now, 'software': f'calib_ros {calib_ros.__version__}'}
+
+
+def about(chain: Chain, before: Chain, region: Region | None) -> dict[str, Any]:
+    """Return of what arms a calibration is, and where it holds, for its record."""
+    return {
+        'table_sha256': table_hash(chain),
+        'nominal': records.nominal_document(before) | frames_document(before),
+        'region': None if region is None else region.document(),
+    }
 
 
 def calibration_file(path: str | os.PathLike[str]) -> Path:
@@ -288,5 +292,5 @@ def parse_calibration(
         about.get('world_frame', ''),
         records.owners_of(about, where),
         {key: value for key, value in about.items() if key not in ('covariance', 'rows')},
-        Fingerprint.of_record(about, where),
+        records.Fingerprint.of_record(about, where),
     )

@@ -9,8 +9,8 @@ few parameters that may have changed are searched for (`changes.py`). The differ
 positions, in the best frames, is a quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
 Unmodelled effects appear in both calibrations, and differently if other poses were measured; so do
-smooth errors of a device that was moved (`device.py`). Covariances of noise do not include them;
-expected squares of errors do (`region.py`). A difference that is significant only by the former is
+smooth errors of a device that was moved (`considered.py`). Only expected squares of errors include
+them (`region.py`). A difference that is significant only by the covariances of the noise is
 reported as such. If a calibration held DH parameters at nominal, its fitted parameters contain
 part of their errors, so its expected squares replace its covariance.
 """
@@ -139,16 +139,14 @@ def difference(first: Calibration, second: Calibration) -> Difference:
             f'the joints {", ".join(arms[0].joint_names)} ({arms[0].convention}) and '
             f'{", ".join(arms[1].joint_names)} ({arms[1].convention}) are of other robots'
         )
-    for number, each in enumerate((first, second)):
-        if each.covariance is None:
-            raise InputError(
-                f'calibration {number + 1} does not hold the covariance of its parameters: '
-                'identify it again with this version'
-            )
     names, chain, change, left = _in_parameters_of(first, second)
     square, lacking = np.zeros((2, len(names), len(names)))
-    for each in (first, second):
-        assert each.covariance is not None
+    for number, each in enumerate((first, second), 1):
+        if each.covariance is None:
+            raise InputError(
+                f'calibration {number} does not hold the covariance of its parameters: '
+                'identify it again with this version'
+            )
         own = whole = _in_names(each.chain, names, each.names, each.covariance)
         region = each.region
         if region is not None:
@@ -160,18 +158,15 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         lacking += whole
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
-    told = _told(names, change, lacking)
-    beyond = _chance(told, freedom)
     told = _told(names, change, square)
-    chance = _chance(told, freedom)
+    chance, beyond = _chance(told, freedom), _chance(_told(names, change, lacking), freedom)
     changed: list[tuple[Explanation, ...]] = []
     while len(changed) < MOST_CHANGES and (reasons := reasons_of(told, columns, freedom)):
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
     predicted = _predicted(chain, names)
-    draws = np.random.default_rng(0).multivariate_normal(
-        change, square, 10 * SOME_POSES, method='eigh'
-    )
+    rng = np.random.default_rng(0)
+    draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
     squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)
     return Difference(
         names,

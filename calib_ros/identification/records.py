@@ -1,19 +1,25 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a calibration in its file: the key `calibration` of a chain file."""
+"""The record of a calibration in its file: the key `calibration` of a chain file.
+
+A few hundred numbers in it identify the measurements that were fitted. Each row has a hash. The
+smallest `KEPT` hashes are a random sample of the rows. A further row with a hash up to the largest
+kept one is either among them or was not fitted (Broder 1997).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
@@ -24,6 +30,12 @@ from calib_ros.values import parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, whether a camera on the flange measured, whether it is a socket; device or target."""
+OWNER = ('session', 'eye_in_hand', 'socket', 'label')
+Hashes: TypeAlias = NDArray[np.uint64]
+KEPT = 256
+"""Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept."""
+GRID = 1.618e-6
+"""Values [rad, m or px] in one cell are equal; no decimal number is near the edge of a cell."""
 
 
 def packed(square: FloatArray) -> list[str]:
@@ -34,20 +46,28 @@ def packed(square: FloatArray) -> list[str]:
     return [' '.join(f'{x:.9e}' for x in row[: k + 1]) for k, row in enumerate(root)]
 
 
-def unpacked(rows: Sequence[str], size: int) -> FloatArray:
-    """Return the matrix (P, P) of rows that `packed` made.
+def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
+    """Return the matrix (P, K) of rows of numbers, to the diagonal of a `triangular` one.
 
     Raises
     ------
     ValueError
-        When they are not those of one of that size.
+        When they are not so many, of other lengths, or not finite.
 
     """
-    root = np.zeros((size, size))
-    for k, row in enumerate(rows):
-        root[k, : k + 1] = [float(part) for part in row.split()]
-    if len(rows) != size or not np.isfinite(root).all():
-        raise ValueError(f'{len(rows)} rows of finite numbers for {size} names')
+    numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
+    widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
+    matrix = np.zeros((count, max(widths, default=0)))
+    for row, given, width in zip(matrix, numbers, widths, strict=True):
+        row[:width] = given
+    if not np.isfinite(matrix).all():
+        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
+    return matrix
+
+
+def unpacked(rows: Sequence[str], size: int) -> FloatArray:
+    """Return the matrix (P, P) of rows that `packed` made."""
+    root = parse_rows(rows, size, triangular=True)
     return np.asarray(root @ root.T)
 
 
@@ -182,12 +202,8 @@ def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: st
     start = replace(
         nominal, base=chain.frame('base'), tool=chain.frame('tool'), frames=chain.frames
     )
-    names = [
-        name
-        for frame in ('base', 'tool')
-        if not start.frame(frame).fixed
-        for name in parameters_of(frame)
-    ]
+    free = [end for end in ('base', 'tool') if not start.frame(end).fixed]
+    names = [name for end in free for name in parameters_of(end)]
     return likened(start, names, chain, joints)[0] if names else start
 
 
@@ -216,27 +232,18 @@ def noise_of(record: Mapping[str, Any], where: str) -> Noise | None:
     known = dictionary(record.get('noise_in_sigma'), f'{where}: calibration.noise_in_sigma')
     if not known:
         return None
+    sizes = ('position', 'successive', 'near', 'widened', 'size')
     try:
-        turned = known['orientation']
+        turned, given = known['orientation'], dictionary(known.get('given'), 'given')
         return Noise(
-            parse_number(known['position'], 'position'),
-            None if turned is None else parse_number(turned, 'orientation'),
-            bool(known['consistent']),
-            parse_number(known['successive'], 'successive'),
-            parse_number(known['near'], 'near'),
-            tuple(map(str, known['shared'])),
-            parse_number(known['widened'], 'widened'),
-            parse_number(known['size'], 'size'),
-            {
-                str(name): parse_number(sigma, f'given: {name}')
-                for name, sigma in dictionary(known.get('given'), 'given').items()
-            },
+            **{key: parse_number(known[key], key) for key in sizes},
+            orientation=None if turned is None else parse_number(turned, 'orientation'),
+            consistent=bool(known['consistent']),
+            shared=tuple(map(str, known['shared'])),
+            given={str(n): parse_number(sigma, f'given: {n}') for n, sigma in given.items()},
         )
     except (ConfigError, KeyError, TypeError) as err:
         raise damaged('noise_in_sigma', where, err) from err
-
-
-OWNER = ('session', 'eye_in_hand', 'socket', 'label')
 
 
 def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
@@ -262,3 +269,79 @@ def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
     """Return the error that says which part of a record is not as it was written."""
     kind = '' if err is None else f' ({type(err).__name__})'
     return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
+
+
+def hashes(sets: Sequence[Observations]) -> Hashes:
+    """Return a hash (N,) of the joint values and the measurement of each row."""
+    found = [np.zeros(0, dtype=np.uint64)]
+    for each in sets:
+        measured = each.positions
+        if each.pixels is not None:
+            measured = np.concatenate([each.pixels, each.points], axis=1)
+        elif each.distances is not None:
+            measured = each.distances[:, np.newaxis]
+        cells = np.round(np.concatenate([each.joints, measured], axis=1) / GRID)
+        mixed = np.zeros(len(each), dtype=np.uint64)
+        for column in cells.astype(np.int64).view(np.uint64).T:  # Fibonacci hashing, folded
+            mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)
+            mixed ^= mixed >> np.uint64(29)
+        found.append(mixed)
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Fingerprint:
+    """The least hashes of `count` rows, in ascending order."""
+
+    count: int
+    least: Hashes
+
+    @classmethod
+    def of(cls, sets: Sequence[Observations], earlier: Fingerprint | None = None) -> Fingerprint:
+        """Return that of rows, and of those fitted earlier."""
+        new = hashes(sets)
+        if earlier is None:
+            return cls(len(new), np.unique(new)[:KEPT])
+        if not earlier.complete:
+            new = new[new <= earlier.least.max(initial=0)]
+        both = np.union1d(earlier.least, new)[:KEPT]
+        return cls(earlier.count + sum(map(len, sets)), both)
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any], where: str) -> Fingerprint | None:
+        """Return what the record of a calibration says, if it does."""
+        if 'rows' not in record:
+            return None
+        try:
+            least = np.frombuffer(bytes.fromhex(record['rows']['least']), '>u8')
+            return cls(int(record['rows']['count']), least.astype(np.uint64))
+        except (KeyError, TypeError, ValueError) as err:
+            what = f'{where}: calibration.rows is not as it was written'
+            raise ConfigError(f'{what}: {err}') from err
+
+    @property
+    def complete(self) -> bool:
+        """Tell whether the hashes are those of all rows."""
+        return self.count <= len(self.least)
+
+    def document(self) -> dict[str, Any]:
+        """Return it for the record of a calibration."""
+        return {'count': self.count, 'least': self.least.astype('>u8').tobytes().hex()}
+
+    def share(self, sets: Sequence[Observations]) -> float:
+        """Return the share of rows that were fitted, as far as it shows."""
+        rows = hashes(sets)
+        if not self.complete:
+            rows = rows[rows <= self.least.max(initial=0)]
+        return float(np.isin(rows, self.least).mean()) if rows.size else 0.0
+
+
+def reused_in_words(share: float) -> str:
+    """Return a warning about measurements of which such a share was fitted; empty for none."""
+    if not share:
+        return ''
+    which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'
+    return (
+        f'{which} are the measurements that the calibration was fitted to, so they prove nothing '
+        'about other poses: measure new ones'
+    )

@@ -30,7 +30,7 @@ from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.records import damaged, packed, unpacked
+from calib_ros.identification.records import damaged, packed, parse_rows, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -68,10 +68,7 @@ class Region(Shown):
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
         model = ErrorModel(self.chain, self.names, self.base, self.tool)
-        starts = range(0, len(joints), BLOCK)
-        parts = [joints[first : first + BLOCK] for first in starts]
-        lengths = [_length(model.jacobian(part)[:, :3], self.square) for part in parts]
-        return np.concatenate(lengths) if lengths else np.zeros(0)
+        return sigma_of(model, self.square, joints)
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
         """Tell (N,) at which joint values (N, n) the calibration may be used."""
@@ -107,6 +104,22 @@ class Region(Shown):
         }
 
 
+def sigma_of(
+    model: ErrorModel, square: FloatArray, joints: FloatArray, components: slice = np.s_[:3]
+) -> FloatArray:
+    """Return the expected size (N,) of some components of errors of poses at (N, n).
+
+    `square` (P, P) are the expected squares of the errors of the model's parameters.
+    """
+    found = np.empty(len(joints))
+    for first in range(0, len(joints), BLOCK):
+        part = slice(first, first + BLOCK)
+        rows = model.jacobian(joints[part])[:, components]
+        flat = rows.reshape(-1, rows.shape[2])
+        found[part] = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+    return np.sqrt(np.maximum(found, 0.0))
+
+
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
     """Return the region of a calibrated chain from its record; None where it names none.
 
@@ -129,7 +142,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             chain,
             names,
             unpacked(document['root'], len(names)),
-            _rows(document.get('device', [''] * len(names)), len(names)),
+            parse_rows(document.get('device', [''] * len(names)), len(names)),
             np.inf if limit is None else float(limit),
             float(document['share']),
             str(document['base']),
@@ -148,21 +161,6 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
                 f'frame in {where}: calibration.region', frame, chain.frame_names
             )
     return region
-
-
-def _rows(rows: Sequence[str], count: int) -> FloatArray:
-    """Return the matrix (P, K) of rows of numbers.
-
-    Raises
-    ------
-    ValueError
-        When they are not so many, of different lengths, or not finite.
-
-    """
-    matrix = np.array([[float(part) for part in row.split()] for row in rows]).reshape(count, -1)
-    if len(rows) != count or not np.isfinite(matrix).all():
-        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
-    return matrix
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
@@ -200,13 +198,6 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         ends.base,
         ends.tool,
     )
-
-
-def _length(rows: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the roots (N,) of the expected squared lengths of J x, J (N, 3, P)."""
-    flat = rows.reshape(-1, rows.shape[2])
-    squares = ((flat @ square) * flat).sum(axis=1).reshape(-1, 3).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 class _Judge:

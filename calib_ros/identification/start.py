@@ -26,12 +26,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import DEGENERATE, excited, structurally_independent
-from calib_ros.identification.leastsquares import (
-    System,
-    factor_of,
-    minimise,
-    normal_equations,
-)
+from calib_ros.identification.leastsquares import System, factor_of, minimise, normal_equations
 from calib_ros.identification.levels import TELLING
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
@@ -63,34 +58,27 @@ def start_frames(
     """
     found: set[str] = set()
     for observations in sets:
-        ends = {'base': observations.base, 'tool': observations.tool}
-        frames = {}
-        for key, name in ends.items():
-            frames[key] = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}[name]
-            if name in found:
-                frames[key] = replace(chain.frame(name), fixed=True)
-        view = replace(chain, base=frames['base'], tool=frames['tool'])
+        known = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}
+        known |= {name: replace(chain.frame(name), fixed=True) for name in found}
+        base, tool = observations.base, observations.tool
+        view = replace(chain, base=known[base], tool=known[tool])
         alone = replace(observations, base='base', tool='tool')
-        if observations.pixels is not None:
+        if alone.pixels is not None:
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
             share = -(-(int(alone.images[-1]) + 1) // SOME_POSES)
             alone = board_poses(alone.select(alone.images % share == 0), lens)
-        view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
-        for key, name in ends.items():
+        view = _start_one(view, alone, (sigma_position, sigma_orientation), loss)
+        for key, name in (('base', base), ('tool', tool)):
             frame = replace(view.frame(key), fixed=chain.frame(name).fixed)
             chain = chain.with_frame(name, frame)
-        found |= set(ends.values())
+        found |= {base, tool}
     return chain
 
 
 def _start_one(
-    chain: Chain,
-    observations: Observations,
-    sigma_position: float,
-    sigma_orientation: float,
-    loss: str,
+    chain: Chain, observations: Observations, sigmas: tuple[float, float], loss: str
 ) -> Chain:
-    """Return the chain with frames for one set of observations."""
+    """Return the chain with frames for one set of observations; sigmas [m, rad]."""
     oriented = bool(observations.oriented.any()) and observations.distances is None
     names = [
         name
@@ -102,39 +90,45 @@ def _start_one(
     if not names:
         return chain
     if observations.socket:
-        return _in_socket(chain, observations)
+        return next(closed_forms(chain, observations))
     subset = observations.spread()
-    system = System((Samples(subset, sigma_position, sigma_orientation),))
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
-    determined: tuple[str, ...] = ()
-    if subset.plane:
-        best, least = chain, np.inf
-        for start in _on_plane(chain, arm, subset):
-            determined = excited(factor_of(start, names, system), names)
-            fitted = robust_fit(start, determined, system, loss).fit.chain
-            height = float(np.median(np.abs(residual_arrays(fitted, subset)[0])))
-            if height < least:
-                best, least = fitted, height
-        return best
-    if subset.distances is not None:
-        start = _trilaterated(chain, arm, subset, loss != 'none')
+    system = System((Samples(subset, *sigmas),))
+    if subset.distances is not None and not subset.plane:
+        start = _trilaterated(chain, _flange(chain, subset), subset, loss != 'none')
         return robust_fit(start, names, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
-    best, best_error = chain, np.inf
-    cube = Rotation.create_group('O').as_matrix()
-    for candidates in (_closed_form(chain, arm, subset), cube):
-        for rotation in candidates:
-            start = _complete(chain, arm, subset, rotation)
+    determined: tuple[str, ...] = ()
+    best, least = chain, np.inf
+    for starts in _starts(chain, subset):
+        for start in starts:
             normal = normal_equations(start, names, system)
-            determined = determined or excited(factor_of(start, names, system, normal), names)
-            known = normal if len(determined) == len(names) else None
-            fitted = minimise(start, determined, system, tolerance=1e-3, normal=known).chain
-            error = _typical_error(fitted, subset)
-            if error < best_error:
-                best, best_error = fitted, error
-        if best_error <= GOOD * spread:
+            told = excited(factor_of(start, names, system, normal), names)
+            known = normal if len(told) == len(names) else None
+            fitted = minimise(start, told, system, tolerance=1e-3, normal=known).chain
+            # the median, which gross errors do not touch
+            error = np.median(np.linalg.norm(residual_arrays(fitted, subset)[0], axis=1))
+            if error < least:
+                best, least, determined = fitted, error, told
+        if least <= GOOD * spread:
             break
     return robust_fit(best, determined, system, loss).fit.chain
+
+
+def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
+    """Yield starts to polish, and further ones if none of those is good."""
+    arm = _flange(chain, observations)
+    if observations.plane:
+        yield _on_plane(chain, arm, observations)
+        return
+    yield closed_forms(chain, observations)
+    cube = Rotation.create_group('O').as_matrix()
+    yield (_complete(chain, arm, observations, rotation) for rotation in cube)
+
+
+def _flange(chain: Chain, observations: Observations) -> FloatArray:
+    """Return the poses (N, 4, 4) of the bare arm."""
+    arm = replace(chain, base=Frame(), tool=Frame())
+    return arm.forward(observations.joints, observations.approach)
 
 
 def likened(
@@ -159,35 +153,9 @@ def likened(
 
 def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:
     """Yield the chain with base and tool for poses, positions or a socket, in closed form."""
-    if observations.socket:
-        yield _in_socket(chain, observations)
-        return
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
+    arm = _flange(chain, observations)
     for rotation in _closed_form(chain, arm, observations):
         yield _complete(chain, arm, observations, rotation)
-
-
-def _in_socket(chain: Chain, observations: Observations) -> Chain:
-    """Return the chain with its base moved, not turned, so that the tool stays at the origin.
-
-    0 = b + p_K + R_K t is linear in b and the tool's offset t.
-    """
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
-    tool, base = chain.frame('tool'), chain.frame('base')
-    tool_matrix, base_matrix = tool.matrix.copy(), np.eye(4)
-    if not tool.fixed:
-        turned = arm[:, :3, :3]
-        tool_matrix[:3, 3] += _shortest(turned, -(arm @ tool.matrix)[:, :3, 3], True)
-    base_matrix[:3, 3] = -(arm @ tool_matrix)[:, :3, 3].mean(axis=0)
-    return replace(
-        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
-    )
-
-
-def _typical_error(chain: Chain, observations: Observations) -> float:
-    """Return the median distance [m], which gross errors do not touch."""
-    predicted = chain.forward(observations.joints, observations.approach)[:, :3, 3]
-    return float(np.median(np.linalg.norm(observations.positions - predicted, axis=1)))
 
 
 def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
@@ -251,6 +219,9 @@ def _closed_form(
     chain: Chain, arm: FloatArray, observations: Observations
 ) -> Iterator[FloatArray]:
     """Yield rotations of the base (3, 3) from what is given and from closed forms."""
+    if observations.socket:
+        yield np.eye(3)  # the world's axes are the base's
+        return
     if chain.base is not None:
         yield chain.base.matrix[:3, :3]
         if chain.base.fixed:
