@@ -259,9 +259,8 @@ def parse_calibration(
     all that calib_ros writes, and must not speak against a nominal chain that is given; nor may
     the numbers be further from it than `largest_length` and `largest_angle` of the settings allow.
     Without settings the identification has judged that, if it records the numbers of this chain.
-    Without a nominal chain that of the record is taken. What a file of before does not tell is
-    not known, but for the frames of the nominal chain: these are fitted to the corrected one, over
-    the whole range of the joints.
+    Without a nominal chain that of the record is taken; without its frames those that bring it
+    closest to the corrected one.
 
     Raises
     ------
@@ -273,24 +272,23 @@ def parse_calibration(
     chain = parse_chain(text, where)
     if nominal is not None:
         records.check_joints(chain, nominal, where)
-    about = records.parse_record(text, where)
-    if nominal is None:
-        nominal = records.nominal_of(about, chain, where)
-    records.check_nominal(chain, about, nominal, where, settings)
-    before = records.before_of(about, nominal, chain, where)
-    names, covariance, freedom = records.covariance_of(about, chain, where)
-    residual = about.get('rms_mm_after')
+    record = records.Record.parse(text, where)
+    nominal = nominal or record.nominal(chain)
+    record.check(chain, nominal, settings)
+    content = record.content
+    names, covariance, freedom = record.covariance(chain)
+    residual = content.get('rms_mm_after')
     return Calibration(
-        chain,
-        before,
-        names,
-        covariance,
-        freedom,
-        None if residual is None else 1e-3 * residual,
-        records.noise_of(about, where),
-        region_of_record(about, chain, where),
-        about.get('world_frame', ''),
-        records.owners_of(about, where),
-        {key: value for key, value in about.items() if key not in ('covariance', 'rows')},
-        records.Fingerprint.of_record(about, where),
+        chain=chain,
+        before=record.before(nominal, chain),
+        names=names,
+        covariance=covariance,
+        freedom=freedom,
+        residual=None if residual is None else 1e-3 * residual,
+        noise=record.noise(),
+        region=region_of_record(content, chain, where),
+        world_frame=content.get('world_frame', ''),
+        owners=record.owners(),
+        record={key: value for key, value in content.items() if key not in ('covariance', 'rows')},
+        rows=records.Fingerprint.of_record(content, where),
     )

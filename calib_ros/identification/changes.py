@@ -9,16 +9,16 @@ are marginalised first:
 
     A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
-An explanation states x = G z: one parameter has changed, or all parameters of a joint (a bent
-link), or a frame (the device or the target was moved). Its gain in chi-squared,
+An explanation states x = G z: one parameter has changed, or all of a joint (a bent link) or of a
+frame (the device or the target was moved). It gains of chi-squared, with as many degrees of
+freedom as z,
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
-has as many degrees of freedom as z. A change is claimed if chance, over all explanations tried,
-reaches the gain in at most FALSE of the cases (Bonferroni). Explanations are compared by their
-evidence with z ~ N(0, S), S the typical size of changes, which penalises additional parameters
-(Occam's razor; MacKay 1992). Explanations whose share of the evidence exceeds 1 - CONFIDENT
-cannot be distinguished from the best one.
+A change is claimed if chance, over all explanations tried, gains as much in at most FALSE of the
+cases (Bonferroni). Explanations are compared by their evidence with z ~ N(0, S), S the typical
+size of changes, which penalises additional parameters (MacKay 1992). Those whose share of it
+exceeds 1 - CONFIDENT cannot be distinguished from the best one.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
+from calib_ros.identification.identifiability import followed
 from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
@@ -257,9 +258,7 @@ def gauged(
     rows[:, 3:] *= LEVER
     flat = rows.reshape(-1, len(columns))
     known, wanted = flat[:, : len(fitted)], flat[:, [columns.index(name) for name in others]]
-    scale = np.linalg.norm(known, axis=0)
-    scale[scale == 0.0] = 1.0  # what moves nothing
-    taken = linalg.lstsq(known / scale, wanted, cond=1e-9)[0] / scale[:, np.newaxis]
+    taken = followed(known, wanted)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
     left = np.linalg.norm(wanted - known @ taken, axis=0) / size
     return taken[[fitted.index(name) for name in names]], left

@@ -163,11 +163,16 @@ def growth(
     every = tuple(dict.fromkeys((*names, *lengths)))
     rows = ErrorModel(chain, every, *ends).jacobian(joints)[:, : 6 if oriented else 3]
     rows = rows.reshape(-1, len(every))
-    reach = np.linalg.norm(rows[:, : len(names)], axis=0)
-    reach[reach == 0.0] = 1.0
     seen = rows[:, [every.index(n) for n in lengths]] @ [*lengths.values()]
-    found = np.linalg.lstsq(rows[:, : len(names)] / reach, seen, rcond=1e-10)[0]
-    return np.asarray(found / reach)
+    return followed(rows[:, : len(names)], seen[:, np.newaxis])[:, 0]
+
+
+def followed(columns: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return the changes (P, K) of parameters with columns (R, P) nearest to `wanted` (R, K)."""
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0  # what moves nothing
+    found = np.linalg.lstsq(columns / scale, wanted, rcond=1e-9)[0]
+    return np.asarray(found / scale[:, np.newaxis])
 
 
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:

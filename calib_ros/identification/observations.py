@@ -46,12 +46,10 @@ class Observations(Shown):
     ----------
     stamps_ns : (N,) int64
     joints : (N, n) [rad or m]
-    positions : (N, 3) [m]
+    positions, rotations : (N, 3) [m], (N, 3, 3)
         Of the target in the measuring device's frame, the world.
-    rotations : (N, 3, 3)
-        Of the target in the world; the identity where none was measured.
     oriented : (N,) bool
-        True where the orientation was measured.
+        True where the orientation was measured; elsewhere the rotation is the identity.
     covariance : (N, 6, 6), optional
         Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
         PoseWithCovariance; NaN rows where the measurement brought none.
@@ -170,8 +168,8 @@ class Observations(Shown):
     @classmethod
     def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
         """Make observations (N) of a point at the tool that touched one plane."""
-        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         heights = np.zeros(len(joints))
+        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
     def select(self, mask: NDArray[np.generic] | slice) -> Observations:
@@ -248,18 +246,15 @@ class Observations(Shown):
         """
         if self.velocity is None or delay is None:
             return self
-        more = np.full((len(self), 1), delay)
-        if self.delay is not None:
-            more -= self.delay[:, np.newaxis]
+        delays = np.full(len(self), float(delay))
+        more = (delays if self.delay is None else delays - self.delay)[:, np.newaxis]
         if not more.any():
             return self
         velocity, joints = self.velocity, self.joints - more * self.velocity
         if self.acceleration is not None:
             joints = joints + 0.5 * more**2 * self.acceleration
             velocity = velocity - more * self.acceleration
-        return replace(
-            self, joints=joints, velocity=velocity, delay=np.full(len(self), float(delay))
-        )
+        return replace(self, joints=joints, velocity=velocity, delay=delays)
 
     @property
     def camera(self) -> str:
@@ -269,11 +264,10 @@ class Observations(Shown):
     @cached_property
     def images(self) -> NDArray[np.intp]:
         """Return (N,) the number of the image that each row of pixels is from."""
-        if not len(self):
-            return np.zeros(0, dtype=np.intp)
-        other = np.diff(self.stamps_ns) != 0
-        other |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
-        return np.concatenate([[0], np.cumsum(other)]).astype(np.intp)
+        other = np.zeros(len(self), dtype=np.intp)
+        other[1:] = np.diff(self.stamps_ns) != 0
+        other[1:] |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
+        return np.cumsum(other)
 
     @cached_property
     def configurations(self) -> NDArray[np.intp]:

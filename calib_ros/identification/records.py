@@ -71,55 +71,17 @@ def unpacked(rows: Sequence[str], size: int) -> FloatArray:
     return np.asarray(root @ root.T)
 
 
-def parse_record(text: str, where: str) -> dict[str, Any]:
-    """Return what a calibration says of where it comes from.
-
-    Raises
-    ------
-    ConfigError
-        When it says nothing, was not accepted, or could not be judged or published.
-
-    """
-    record = calibration_record(text)
-    if not record:
-        raise ConfigError(
-            f'{where} is a chain, but no calibration: it does not say where its numbers come '
-            'from (key "calibration"); give the calibration.yaml of calib_ros identify'
-        )
-    if record.get('accepted') is False:
-        raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
-    rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
-    number = isinstance(rms, int | float) and not isinstance(rms, bool)
-    if not number or not 0.0 <= rms < math.inf:
-        raise ConfigError(f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}')
-    if not isinstance(frame, str):
-        raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
-    return record
-
-
 def nominal_document(nominal: Chain) -> dict[str, Any]:
     """Return the numbers of the chain that a calibration belongs to, row by row."""
     rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
     effects = {name: float(value) for name, value in nominal.effects if value}
-    return {'convention': nominal.convention, 'joints': rows} | (
-        {'effects': effects} if effects else {}
-    )
+    more = {'effects': effects} if effects else {}
+    return {'convention': nominal.convention, 'joints': rows, **more}
 
 
-def nominal_of(record: Mapping[str, Any], chain: Chain, where: str) -> Chain:
-    """Return the nominal chain of a corrected one, by its record."""
-    known = _known(record, where)
-    if known.get('convention') != chain.convention:
-        raise ConfigError(f'{where} does not hold its nominal chain: give that with --chain')
-    joints = []
-    for joint, row in zip(chain.joints, _rows(known, chain, where).values(), strict=True):
-        a, alpha, d, theta, beta = row.values()
-        joints.append(replace(joint, a=a, alpha=alpha, d=d, theta=theta, beta=beta))
-    effects = dictionary(known.get('effects'), f'{where}: calibration.nominal.effects')
-    values = {
-        name: parse_number(value, f'{where}: nominal {name}') for name, value in effects.items()
-    }
-    return replace(chain, joints=tuple(joints), effects=()).with_effect_values(values)
+def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
+    """Return which session, device or target each frame is of, as plain values."""
+    return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
 
 
 def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
@@ -134,48 +96,149 @@ def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
         )
 
 
-def check_nominal(
-    chain: Chain,
-    record: Mapping[str, Any],
-    nominal: Chain,
-    where: str,
-    settings: Settings | None = None,
-) -> None:
-    """Refuse a calibration that is not one of a nominal chain (`parse_calibration`)."""
-    known = _known(record, where)
-    told = known.get('convention') == nominal.convention  # else there is nothing to compare
-    for name, row in (_rows(known, nominal, where) if told else {}).items():
-        for kind, value in row.items():
-            wanted = nominal.value(f'{name}.{kind}')
-            if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits are written
-                raise ConfigError(
-                    f'{where} was identified from another nominal chain, with {name}.{kind} '
-                    f'{value:.9g} and not {wanted:.9g}: give that one, or identify again'
-                )
-    limits = settings or Settings()
-    length, angle = limits.largest_length, limits.largest_angle
-    if told and settings is None:
-        length = angle = math.inf
-    differing = _differing(chain, nominal, length, angle)
-    if differing:
-        raise ConfigError(
-            f'{where} is not the calibration of this robot: {", ".join(differing)} differ from '
-            f'chain "{nominal.name}" by more than largest_length and largest_angle allow'
-        )
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What a calibration says of itself; `where` names it in errors."""
 
+    content: Mapping[str, Any]
+    where: str
 
-def _known(record: Mapping[str, Any], where: str) -> dict[str, Any]:
-    return dictionary(record.get('nominal'), f'{where}: calibration.nominal')
+    @classmethod
+    def parse(cls, text: str, where: str) -> Record:
+        """Return the record in the text of a calibration.
 
+        Raises
+        ------
+        ConfigError
+            When it says nothing, was not accepted, or could not be judged or published.
 
-def _rows(known: Mapping[str, Any], chain: Chain, where: str) -> dict[str, dict[str, float]]:
-    """Return the recorded nominal numbers by joint and kind."""
-    rows = dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
-    found = {}
-    for name in chain.joint_names:
-        row = parse_numbers(rows.get(name), len(DH_KINDS), f'{where}: nominal {name}')
-        found[name] = dict(zip(DH_KINDS, row.tolist(), strict=True))
-    return found
+        """
+        record = calibration_record(text)
+        if not record:
+            raise ConfigError(
+                f'{where} is a chain, but no calibration: it does not say where its numbers come '
+                'from (key "calibration"); give the calibration.yaml of calib_ros identify'
+            )
+        if record.get('accepted') is False:
+            raise ConfigError(
+                f'{where} was not accepted: identify again, from more or better poses'
+            )
+        rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
+        number = isinstance(rms, int | float) and not isinstance(rms, bool)
+        if not number or not 0.0 <= rms < math.inf:
+            raise ConfigError(
+                f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}'
+            )
+        if not isinstance(frame, str):
+            raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
+        return cls(record, where)
+
+    def _part(self, key: str) -> dict[str, Any]:
+        return dictionary(self.content.get(key), f'{self.where}: calibration.{key}')
+
+    def _rows(self, chain: Chain) -> dict[str, dict[str, Any]]:
+        """Return the recorded nominal numbers by joint and kind."""
+        where = f'{self.where}: calibration.nominal.joints'
+        rows = dictionary(self._part('nominal').get('joints'), where)
+        found = {}
+        for name in chain.joint_names:
+            row = parse_numbers(rows.get(name), len(DH_KINDS), f'{self.where}: nominal {name}')
+            found[name] = dict(zip(DH_KINDS, row.tolist(), strict=True))
+        return found
+
+    def nominal(self, chain: Chain) -> Chain:
+        """Return the nominal chain of a corrected one."""
+        known, where = self._part('nominal'), self.where
+        if known.get('convention') != chain.convention:
+            raise ConfigError(f'{where} does not hold its nominal chain: give that with --chain')
+        rows = self._rows(chain)
+        joints = tuple(replace(joint, **rows[joint.name]) for joint in chain.joints)
+        effects = dictionary(known.get('effects'), f'{where}: calibration.nominal.effects')
+        values = {n: parse_number(x, f'{where}: nominal {n}') for n, x in effects.items()}
+        return replace(chain, joints=joints, effects=()).with_effect_values(values)
+
+    def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
+        """Refuse a calibration that is not one of a nominal chain (`parse_calibration`)."""
+        # else there is nothing to compare
+        told = self._part('nominal').get('convention') == nominal.convention
+        for name, row in (self._rows(nominal) if told else {}).items():
+            for kind, value in row.items():
+                wanted = nominal.value(f'{name}.{kind}')
+                if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits written
+                    raise ConfigError(
+                        f'{self.where} was identified from another nominal chain, with '
+                        f'{name}.{kind} {value:.9g} and not {wanted:.9g}: give that one, or '
+                        'identify again'
+                    )
+        limits = settings or Settings()
+        length, angle = limits.largest_length, limits.largest_angle
+        if told and settings is None:
+            length = angle = math.inf
+        if differing := _differing(chain, nominal, length, angle):
+            raise ConfigError(
+                f'{self.where} is not the calibration of this robot: {", ".join(differing)} '
+                f'differ from chain "{nominal.name}" by more than largest_length and '
+                'largest_angle allow'
+            )
+
+    def before(self, nominal: Chain, chain: Chain) -> Chain:
+        """Return the nominal chain in its recorded frames, else those closest to the other one."""
+        known = self._part('nominal')
+        if {'base', 'tool'} & set(known):
+            return replace(nominal, **parse_frames(known, f'{self.where}: calibration.nominal'))
+        joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
+        base, tool = chain.frame('base'), chain.frame('tool')
+        start = replace(nominal, base=base, tool=tool, frames=chain.frames)
+        free = [end for end in ('base', 'tool') if not start.frame(end).fixed]
+        names = [name for end in free for name in parameters_of(end)]
+        return likened(start, names, chain, joints)[0] if names else start
+
+    def covariance(self, chain: Chain) -> tuple[tuple[str, ...], FloatArray | None, float]:
+        """Return the fitted parameters, their covariance (P, P) and its degrees of freedom."""
+        known = self._part('covariance')
+        if not known:
+            return (), None, math.inf
+        try:
+            names = tuple(known['names'])
+            square = unpacked(known['root'], len(names))
+            freedom = math.inf if known['freedom'] is None else float(known['freedom'])
+            if not set(names) <= set(chain.parameter_names) or len(set(names)) < len(names):
+                raise ValueError('names of another chain')
+            if not (np.diag(square) > 0.0).all() or not freedom > 0.0:
+                raise ValueError('no covariance')
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
+            raise damaged('covariance', self.where, err) from err
+        return names, square, freedom
+
+    def noise(self) -> Noise | None:
+        """Return the noise of the measurements, if it is recorded."""
+        known = self._part('noise_in_sigma')
+        if not known:
+            return None
+        sizes = ('position', 'successive', 'near', 'widened', 'size')
+        try:
+            turned, given = known['orientation'], dictionary(known.get('given'), 'given')
+            return Noise(
+                **{key: parse_number(known[key], key) for key in sizes},
+                orientation=None if turned is None else parse_number(turned, 'orientation'),
+                consistent=bool(known['consistent']),
+                shared=tuple(map(str, known['shared'])),
+                given={str(n): parse_number(sigma, f'given: {n}') for n, sigma in given.items()},
+            )
+        except (ConfigError, KeyError, TypeError) as err:
+            raise damaged('noise_in_sigma', self.where, err) from err
+
+    def owners(self) -> dict[str, Owner]:
+        """Return which session, device or target each frame is of, where that is recorded."""
+        found = {}
+        for name, row in self._part('frames').items():
+            parts = dictionary(row, f'{self.where}: calibration.frames.{name}')
+            session, eye, socket, label = (parts.get(key) for key in OWNER)
+            told = isinstance(session, str) and isinstance(label, str)
+            if not (told and isinstance(eye, bool) and isinstance(socket, bool)):
+                raise damaged(f'frames.{name}', self.where)
+            found[name] = (str(session), bool(eye), bool(socket), str(label))
+        return found
 
 
 def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
@@ -191,78 +254,6 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
             if abs(chain.value(name) - nominal.value(name)) > limit:
                 names.append(name)
     return names
-
-
-def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: str) -> Chain:
-    """Return the nominal chain in its recorded frames, else in those closest to the other one."""
-    known = _known(record, where)
-    if {'base', 'tool'} & set(known):
-        return replace(nominal, **parse_frames(known, f'{where}: calibration.nominal'))
-    joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
-    start = replace(
-        nominal, base=chain.frame('base'), tool=chain.frame('tool'), frames=chain.frames
-    )
-    free = [end for end in ('base', 'tool') if not start.frame(end).fixed]
-    names = [name for end in free for name in parameters_of(end)]
-    return likened(start, names, chain, joints)[0] if names else start
-
-
-def covariance_of(
-    record: Mapping[str, Any], chain: Chain, where: str
-) -> tuple[tuple[str, ...], FloatArray | None, float]:
-    """Return the fitted parameters, their covariance (P, P) and its degrees of freedom."""
-    known = dictionary(record.get('covariance'), f'{where}: calibration.covariance')
-    if not known:
-        return (), None, math.inf
-    try:
-        names = tuple(known['names'])
-        square = unpacked(known['root'], len(names))
-        freedom = math.inf if known['freedom'] is None else float(known['freedom'])
-        if not set(names) <= set(chain.parameter_names) or len(set(names)) < len(names):
-            raise ValueError('names of another chain')
-        if not (np.diag(square) > 0.0).all() or not freedom > 0.0:
-            raise ValueError('no covariance')
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
-        raise damaged('covariance', where, err) from err
-    return names, square, freedom
-
-
-def noise_of(record: Mapping[str, Any], where: str) -> Noise | None:
-    """Return the noise of the measurements, if it is recorded."""
-    known = dictionary(record.get('noise_in_sigma'), f'{where}: calibration.noise_in_sigma')
-    if not known:
-        return None
-    sizes = ('position', 'successive', 'near', 'widened', 'size')
-    try:
-        turned, given = known['orientation'], dictionary(known.get('given'), 'given')
-        return Noise(
-            **{key: parse_number(known[key], key) for key in sizes},
-            orientation=None if turned is None else parse_number(turned, 'orientation'),
-            consistent=bool(known['consistent']),
-            shared=tuple(map(str, known['shared'])),
-            given={str(n): parse_number(sigma, f'given: {n}') for n, sigma in given.items()},
-        )
-    except (ConfigError, KeyError, TypeError) as err:
-        raise damaged('noise_in_sigma', where, err) from err
-
-
-def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
-    """Return which session, device or target each frame is of, as plain values."""
-    return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
-
-
-def owners_of(record: Mapping[str, Any], where: str) -> dict[str, Owner]:
-    """Return which session, device or target each frame is of, where that is recorded."""
-    known = dictionary(record.get('frames'), f'{where}: calibration.frames')
-    owners = {}
-    for name, row in known.items():
-        parts = dictionary(row, f'{where}: calibration.frames.{name}')
-        session, eye, socket, label = (parts.get(key) for key in OWNER)
-        told = isinstance(session, str) and isinstance(label, str)
-        if not (told and isinstance(eye, bool) and isinstance(socket, bool)):
-            raise damaged(f'frames.{name}', where)
-        owners[name] = (str(session), bool(eye), bool(socket), str(label))
-    return owners
 
 
 def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:

@@ -52,23 +52,28 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     found = resect(rows, lens)
     _require_fit(rows, found.rms)
     first = np.flatnonzero(np.diff(rows.images, prepend=-1))
-    alone = replace(rows, pixels=None, points=None, on_flange=False).select(first)
     seen = replace(
-        alone,
+        replace(rows, pixels=None, points=None, on_flange=False).select(first),
         positions=found.poses[:, :3, 3],
         rotations=found.poses[:, :3, :3],
-        oriented=np.ones(len(alone), dtype=bool),
+        oriented=np.ones(len(first), dtype=bool),
     )
     return seen.inverted() if observations.on_flange else seen
+
+
+def _per_image(rows: FloatArray, index: NDArray[np.intp]) -> FloatArray:
+    """Return the means (M, ...) of rows (N, ...) over each image."""
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    counts = np.diff(begins, append=len(index)).reshape(-1, *[1] * (rows.ndim - 1))
+    return np.asarray(np.add.reduceat(rows, begins) / counts)
 
 
 def _require_fit(observations: Observations, rms: FloatArray) -> None:
     """Raise unless a pose of the board explains most of where most images show its points."""
     assert observations.pixels is not None
     index, pixels = observations.images, observations.pixels
-    count = np.bincount(index)[:, np.newaxis]
-    centre = np.stack([np.bincount(index, row) for row in pixels.T], axis=1) / count
-    spread = np.sqrt(np.bincount(index, ((pixels - centre[index]) ** 2).sum(axis=1)) / count[:, 0])
+    beside_the_centre = pixels - _per_image(pixels, index)[index]
+    spread = np.sqrt(_per_image((beside_the_centre**2).sum(axis=1), index))
     beside = ~(rms < NEARER * spread)
     if 2 * beside.sum() > len(rms):
         raise InputError(
@@ -150,14 +155,12 @@ def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray
     """Return (M,) which images show enough points that are not in line, nor are there."""
     assert observations.points is not None
     assert observations.pixels is not None
-    count = np.bincount(index)
-    told = count >= 4
-    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    told = np.bincount(index) >= 4
     for places in (observations.points, observations.pixels):
-        mean = np.stack([np.bincount(index, row) for row in places.T], axis=1)
-        rest = places - (mean / count[:, np.newaxis])[index]
-        outer = rest[:, :, np.newaxis] * rest[:, np.newaxis]
-        spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins))
+        rest = places - _per_image(places, index)[index]
+        spread = np.linalg.eigvalsh(
+            _per_image(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
+        )
         told &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
     return np.asarray(told)
 
@@ -166,10 +169,9 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
     """Return poses (M, 4, 4) from points (N, 2) [m] of the plane and rays (N, 2)."""
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     scale = np.sqrt((plane**2).sum(axis=1).mean())
-    count = np.bincount(index)[:, np.newaxis]
-    centre = np.add.reduceat(rays, begins) / count
+    centre = _per_image(rays, index)
     near = rays - centre[index]
-    size = np.sqrt(np.add.reduceat((near**2).sum(axis=1), begins)[:, np.newaxis] / count)
+    size = np.sqrt(_per_image((near**2).sum(axis=1, keepdims=True), index))
     near = near / size[index]
     point = np.ones((3, len(plane)))
     point[:2] = plane.T / scale
@@ -185,12 +187,9 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
     matrix *= np.sign(matrix[:, 2, 2])[:, np.newaxis, np.newaxis]  # in front of the camera
     length = np.linalg.norm(matrix[:, :, :2], axis=1).mean(axis=1)
     matrix /= np.maximum(length, 1e-300)[:, np.newaxis, np.newaxis]
-    rotation = np.empty_like(matrix)
-    rotation[:, :, :2] = matrix[:, :, :2]
-    rotation[:, :, 2] = np.cross(matrix[:, :, 0], matrix[:, :, 1])
-    left, _, right = np.linalg.svd(rotation)
-    left[:, :, -1] *= np.linalg.det(left @ right)[:, np.newaxis]
-    return se3.transform(left @ right, matrix[:, :, 2])
+    place = matrix[:, :, 2].copy()
+    matrix[:, :, 2] = np.cross(matrix[:, :, 0], matrix[:, :, 1])
+    return se3.transform(se3.nearest_rotation(matrix), place)
 
 
 def _refined(

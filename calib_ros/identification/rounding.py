@@ -16,6 +16,7 @@ with the best variance k of the noise and size s of the arm's errors.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,19 +117,15 @@ def may_be_rounding(
         alike.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
     everything = np.column_stack([*alike, columns, rows[:, -1]])
     everything -= basis @ (basis.T @ everything)
-    width = sum(part.shape[1] for part in alike)
-    freedom = len(rows) - len(frames)
-    found = {
-        (with_rounding, size): _evidence(
-            everything[:, :-1] * np.repeat([with_rounding, size], [width, len(arm)]),
-            everything[:, -1],
-            freedom,
-        )
-        for with_rounding in (0.0, 1.0)
-        for size in RATIOS
-    }
-    healthy = max(found[key] for key in found if key[1] == 0.0)
-    return bool(max(found.values()) - healthy < DECIDED)
+    width, freedom = sum(part.shape[1] for part in alike), len(rows) - len(frames)
+
+    def evidence(rounding: float, size: float) -> float:
+        sizes = np.repeat([rounding, size], [width, len(arm)])
+        return _evidence(everything[:, :-1] * sizes, everything[:, -1], freedom)
+
+    found = {each: evidence(*each) for each in product((0.0, 1.0), RATIOS.tolist())}
+    healthy = max(found[each] for each in found if each[1] == 0.0)
+    return max(found.values()) - healthy < DECIDED
 
 
 def _evidence(columns: FloatArray, values: FloatArray, freedom: int) -> float:
