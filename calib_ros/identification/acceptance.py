@@ -12,8 +12,7 @@
    `largest_length` or `largest_angle`, and at most `largest_error` remains: otherwise it is
    another robot, not a faulty one.
 6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
-7. Nothing moved during the session: no step in time of a frame or a joint's zero explains more
-   than half of the residuals (`steps.py`).
+7. Nothing moved during the session (`steps.py`).
 8. Outliers are not the arm's own behaviour (`misfits.py`), and the error including them does not
    get worse: neither its mean, nor with 99 % confidence its RMS.
 9. Rounding of the joint values does not explain the gain as well (`rounding.py`).

@@ -3,13 +3,13 @@
 """A calibration, saved and loaded whole: a chain file with a record of where it comes from.
 
 What it removes at q is the distance between the nominal arm, in fitted frames, and the calibrated
-one. What remains is predicted by the expected squares C of the parameters' errors and by the RMS
-error r on poses that were not fitted,
+one. What remains is predicted by the expected squares C of the parameters' errors, with J the rows
+of position of the error model, and by the RMS error r on poses that were not fitted,
 
     removed(q) = |p_nominal - p|      sigma(q)^2 = tr J C J^T      remaining(q)^2 = sigma^2 + r^2
 
-with J the rows of position of the error model. An arm that is commanded by its nominal model is
-expected to miss by the root of removed^2 + remaining^2, by its calibrated model by `remaining`.
+The arm is expected to miss by the root of removed^2 + remaining^2 if commanded by its nominal
+model, by `remaining` if by its calibrated one.
 """
 
 from __future__ import annotations

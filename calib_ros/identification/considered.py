@@ -3,18 +3,16 @@
 """Errors that are not fitted but considered: unmodelled effects, and errors of the device.
 
 Effects that an arm may have, and the scale of the device, are columns of the posterior with their
-own sizes (`evidence.py`). The smooth errors of the device, and rounded joint values, have known
-sizes s. Their columns N are eliminated from the products of the other columns A: A^T A becomes
+own sizes (`evidence.py`). Smooth errors of the device, and rounded joint values, have known sizes
+s. Their columns N are eliminated from the products of the other columns A: A^T A becomes
 A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 + s^2 N N^T were the covariance of the
 measurements (Schmidt 1966).
 
-A scale error of the device stretches all lengths alike: positions are linear in all lengths L, so
-its column is the sum of L dp/dL.
-
-Axes that are not square, a lens, and misplaced mirrors or markers distort what is measured. No
-number of poses averages such errors out, held-out poses share them, and arms distort space in a
-similar way. A device that is accurate to its sigma may have all of it in this form: second-order
-polynomials in the measured position, for each coordinate.
+A scale error stretches all lengths L alike; positions are linear in them, so its column is the sum
+of L dp/dL. Axes that are not square, a lens, and misplaced mirrors or markers distort space, as
+arms do. No number of poses averages that out, and held-out poses share it. A device that is
+accurate to its sigma may have all of it in this form: second-order polynomials in the measured
+position, for each coordinate.
 """
 
 from __future__ import annotations

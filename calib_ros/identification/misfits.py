@@ -3,12 +3,9 @@
 """Are the outliers of a robust fit gross errors, or the arm's own behaviour?
 
 Errors of a device occur anywhere, errors of an arm follow its joint values. So outliers are the
-arm's own behaviour if
-
-- a joint hardly moves except in them,
-- all targets seen at a stop are off there, more often than by chance,
-- they follow the values of a joint. Shifted in time against the joint values, as in `drift.py`,
-  outliers of a device do so as well, even if they occur in a row.
+arm's own behaviour if a joint hardly moves except in them; if all targets seen at a stop are off
+there, more often than by chance; or if they follow the values of a joint. Outliers of a device do
+so as well when they are shifted in time against these, as in `drift.py`, even if in a row.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations that were read by another convention than they were written in.
 
-A rotation matrix gives back the angles that it was made of if the order of the axes is known: each
-order is tried. From the angles follows the rotation that was meant. Two triples of angles make the
-same rotation; where one of them is never written as what was meant, it was the other. XYZ stands
-for R = Rx Ry Rz, turns about rotated axes; zyx about fixed ones is the same.
+A rotation matrix gives back the angles that it was made of, in each order of axes that may have
+been read; from these follows the rotation that was meant. Two triples of angles make the same
+rotation; where one of them is never written as what was meant, it was the other. XYZ stands for
+R = Rx Ry Rz, turns about rotated axes; zyx about fixed ones is the same.
 """
 
 from __future__ import annotations

@@ -3,22 +3,22 @@
 """The usual mistakes, tried out: units, conventions, joints, the wrong arm. Never corrected.
 
 If the nominal arm misses the measurements by more than faulty arms do, each suspected mistake is
-undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`).
-The best few are refined by least squares. A mistake is named if undoing it reduces the typical
-error below NEARER times the original and to a level that faulty arms have; mistakes that explain
-nearly as much are named with it. If none does, the positions are tried without the orientations,
-then several mistakes at once.
+undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`);
+the best few are refined by least squares. A mistake is named if undoing it reduces the typical
+error below NEARER times the original and to a level that faulty arms have; so are those that
+explain nearly as much. If none does, the positions are tried without the orientations, then
+several mistakes at once.
 
-The typical error is the median over the samples of the distance and the angle times LEVER, in
-units of the spread of the positions. Mistakes without effect cannot be detected: the zero of the
-first joint is a rotation of the base, that of the last joint one of the tool.
+The typical error is the median over the samples of the distance and the angle times LEVER.
+Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
+that of the last joint one of the tool.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,14 +31,12 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.start import closed_forms
+from calib_ros.identification.start import closed_forms, movable
 from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
-from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
@@ -93,18 +91,14 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     if not result.converged or (not result.refusals and result.coupled):
         return True
     judged = result.validation or result.fitted
-    for each in (judged.before, judged.after, result.fitted.before):
-        turns = each.orientation[~np.isnan(each.orientation[:, 0])]
-        if _rms(each.position) > problem.largest_error or _rms(turns) > problem.largest_angle:
+    for each in (*judged.figures_of_all, result.fitted.figures_of_all[0]):
+        error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
+        if error > problem.largest_error or angle > problem.largest_angle:
             return True
     if judged.outliers > MOST_OUTLIERS * len(judged.judged):
         return True
     limits = problem.largest_length, problem.largest_angle
     return any(each.beyond(*limits) for each in result.parameters)
-
-
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum() / max(len(vectors), 1)))
 
 
 def explained(problem: Problem) -> Explained | None:
@@ -143,29 +137,28 @@ def _of_images(problem: Problem) -> bool:
 
 def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
     """Return the mistakes that explain nearly the most, up to three, if they explain enough."""
-    rough = []
-    for k, each in enumerate(suspects(chain, given.sets, _of_images(problem))):
+    rough, tried = [], []
+    for each in suspects(chain, given.sets, _of_images(problem)):
         few = given.sets
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
         found = _tried(each.chain or chain, each.undone(few))
         if found is not None and found.share < given.share:
-            rough.append((found.share, k, each, found))
-    tried = []
-    for _, k, each, found in sorted(rough, key=lambda one: one[:2])[:POLISHED]:
+            rough.append((found, each))
+    for found, each in sorted(rough, key=lambda one: one[0].share)[:POLISHED]:
         so = _polished(problem, found)
         if so.error <= _largest(problem):  # an arm in mm fits places in mm, and is off by metres
-            tried.append((so.share, k, each, so))
+            tried.append((so.share, so, each))
     if not tried:
         return None
-    tried.sort(key=lambda one: one[:2])
-    best = tried[0][3]
-    if best.error > NEARER * given.error or best.share > NEARER * min(given.share, 1.0):
+    tried.sort(key=lambda one: one[0])
+    least, best, _ = tried[0]
+    if best.error > NEARER * given.error or least > NEARER * min(given.share, 1.0):
         return None
-    named = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
+    named = [each for share, _, each in tried if share <= ALIKE * least]
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
-    named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
+    named += [each for share, _, each in tried if ALIKE * least < share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
     return Explained(tuple(unlike.values())[:3], given.error, best.error)
 
@@ -215,7 +208,7 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
             for each in options:
                 if each.part not in {one.part for one in some}:
                     more = tuple(sorted((*some, each), key=lambda one: one.part != 'measured'))
-                    trial = _tried(chain, _undone(more, few))
+                    trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
                     if trial is not None:  # others may be the same in other words
                         found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:POLISHED]]
@@ -227,12 +220,6 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
         if len(kept[0]) > 1 and so.error <= largest and so.share <= share:
             return Explained((_together(kept[0]),), given.error, so.error)
     return None
-
-
-def _undone(mistakes: Sequence[Suspect], sets: Sets) -> Sets:
-    for each in mistakes:
-        sets = each.undone(sets)
-    return sets
 
 
 def _together(mistakes: Sequence[Suspect]) -> Suspect:
@@ -308,13 +295,8 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
     sigmas = problem.sigma_position, problem.sigma_orientation
     system = System(tuple(Samples(each, *sigmas) for each in sets))
     sockets = {each.base for each in sets if each.socket}
-    names = [
-        name
-        for frame in dict.fromkeys(name for each in sets for name in (each.base, each.tool))
-        if not chain.frame(frame).fixed
-        for name in parameters_of(frame)
-        if name.is_length or frame not in sockets
-    ]
+    every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
+    names = [name for name in every if name.is_length or name.owner not in sockets]
     known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
     return min(trial, _Trial(fitted, sets, trial.spread), key=lambda one: one.error)

@@ -8,8 +8,7 @@ their rows are
     [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
 
 and their products follow from those of G with [G | L | residual]: (6, 16) for an image at most,
-however many points it shows. Gross errors are told point by point, and image by image, by the sum
-over its points.
+however many points it shows. Gross errors are told point by point, and image by image.
 """
 
 from __future__ import annotations
@@ -48,13 +47,6 @@ class _Images:
     twist: FloatArray
     lens: list[int]
     seen: View
-
-    def rows(self, columns: FloatArray, twist: FloatArray) -> FloatArray:
-        """Return rows (P + 1, 2, C) by points or sums over images."""
-        found = np.empty((len(twist) + 1, *columns.shape[1:]))
-        np.einsum('psc,skc->pkc', twist, columns[:6], out=found[:-1])
-        found[[*self.lens, -1]] = columns[6:]
-        return found
 
 
 class PixelSamples(Samples):
@@ -120,19 +112,12 @@ class PixelSamples(Samples):
                 unit = np.zeros((2, len(block.owner)))
                 unit[k] = self.sigmas[0]
                 shifts[block.part, k] = block.seen.at_the_board(unit)
-            rows = block.rows(block.columns, block.twist[:, :, block.owner])
+            rows = np.empty((len(names) + 1, *block.columns[0].shape))
+            twist = block.twist[:, :, block.owner]
+            np.einsum('psc,skc->pkc', twist, block.columns[:6], out=rows[:-1])
+            rows[[*block.lens, -1]] = block.columns[6:]
             yield (rows / self.sigmas[0],)
         self._shifts = shifts
-
-    def sums(
-        self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
-    ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
-        """Yield numbers (n,) of groups (N,) of images and the sums (P + 1, 2, n) of their rows."""
-        for block in self._linearised(chain, names):
-            index = groups[block.part][block.begins]
-            begins = np.flatnonzero(np.diff(index, prepend=-1))
-            rows = block.rows(np.add.reduceat(block.columns, block.begins, axis=2), block.twist)
-            yield index[begins], (np.add.reduceat(rows, begins, axis=2) / self.sigmas[0],)
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
         """Return what weighted residuals (rows,) are at the board, (N, 3) [m].

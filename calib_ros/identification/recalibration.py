@@ -5,9 +5,9 @@
 The earlier parameters x have the covariance C, and each of the arm's parameters has drifted since
 by a growth g per root of a year (a random walk). The residuals r of the new poses at the earlier
 arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ N(0, C + g^2 t). A
-larger change must have a cause: a collision, say, that changed few parameters (`changes.py`).
-These become free, and the estimate is the mean of dx given A and b, relinearised until it
-converges. If two causes cannot be distinguished, both are free.
+larger change must have a cause that changed few parameters (`changes.py`). These become free (if
+two causes cannot be distinguished, those of both), and the estimate is the mean of dx given A and
+b, relinearised until it converges.
 """
 
 from __future__ import annotations
@@ -20,18 +20,9 @@ from typing import Any
 import numpy as np
 
 from calib_ros.errors import InputError
+from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration, about, made
-from calib_ros.identification.changes import (
-    FALSE,
-    MOST_CHANGES,
-    SIZES,
-    Columns,
-    Explanation,
-    Told,
-    reason_in_words,
-    reasons_document,
-    reasons_of,
-)
+from calib_ros.identification.changes import Columns, Explanation, Told
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.leastsquares import (
     System,
@@ -78,14 +69,14 @@ class Recalibration(Shown):
         """Tell whether the result may be used."""
         better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
-        return self.unexplained > FALSE and bool(agrees) and not self.reused
+        return self.unexplained > changes.FALSE and bool(agrees) and not self.reused
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
             'accepted': self.accepted,
             'reused': self.reused,
-            'changed': [reasons_document(each) for each in self.changed],
+            'changed': [changes.reasons_document(each) for each in self.changed],
             'unexplained': self.unexplained,
             'before': asdict(self.before),
             'after': asdict(self.after),
@@ -100,11 +91,11 @@ class Recalibration(Shown):
         if self.accepted:
             said = 'unchanged within what is known, brought up to date'
             if self.changed:
-                said = '; '.join(reason_in_words(each) for each in self.changed)
+                said = '; '.join(changes.reason_in_words(each) for each in self.changed)
             return f'accepted: {said}; {text}'
         if self.reused:
             why = f'{reused_in_words(self.reused)}, and give only those'
-        elif self.unexplained <= FALSE:
+        elif self.unexplained <= changes.FALSE:
             why = 'no few parameters explain what has changed; identify anew'
         elif self.anew:
             why = (
@@ -168,8 +159,8 @@ def recalibrate(
     columns = Columns(arm.chain, arm.names, movable)
     changed: list[tuple[Explanation, ...]] = []
     found = arm.solved(system)
-    while len(changed) < MOST_CHANGES and (
-        reasons := reasons_of(found.told.beside(arm.square), columns, previous.freedom)
+    while len(changed) < changes.MOST_CHANGES and (
+        reasons := changes.reasons_of(found.told.beside(arm.square), columns, previous.freedom)
     ):
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
@@ -228,7 +219,8 @@ class _Arm:
         if (region := previous.region) is not None:
             chain, names, square = region.chain, region.names, region.square
         named = tuple(map(Parameter, names))
-        sizes = [growth * SIZES[n.unit] / SIZES['m'] if n.of_dh else 0.0 for n in named]
+        grown = growth / changes.SIZES['m']  # a year
+        sizes = [grown * changes.SIZES[n.unit] if n.of_dh else 0.0 for n in named]
         wandered = np.diag(np.square(sizes)) * max(years, 0.0)
         return cls(previous, chain, named, square + wandered)
 
@@ -329,7 +321,7 @@ def _updated(
         **about(chain, before, region),
         'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
         'new_samples': sum(map(len, (*problem.sets, *problem.judging))),
-        'changed': [reason_in_words(each) for each in changed],
+        'changed': [changes.reason_in_words(each) for each in changed],
     }
     return replace(
         previous,

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from calib_ros.errors import ConfigError
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.start import likened
+from calib_ros.identification.start import likened, movable
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
-from calib_ros.kinematics.parameter import DH_KINDS, parameters_of
+from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.settings import Settings
 from calib_ros.values import parse_number, parse_numbers
@@ -189,8 +189,7 @@ class Record:
         joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
         base, tool = chain.frame('base'), chain.frame('tool')
         start = replace(nominal, base=base, tool=tool, frames=chain.frames)
-        free = [end for end in ('base', 'tool') if not start.frame(end).fixed]
-        names = [name for end in free for name in parameters_of(end)]
+        names = movable(start, ('base', 'tool'))
         return likened(start, names, chain, joints)[0] if names else start
 
     def covariance(self, chain: Chain) -> tuple[tuple[str, ...], FloatArray | None, float]:

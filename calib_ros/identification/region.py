@@ -3,16 +3,16 @@
 """Where a calibration may be used: where it is known to improve the arm, not only near its poses.
 
 By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C); those of
-the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, the
-errors are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse there if
+the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, it makes
+the arm worse if
 
     |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
 
 The left side is normal, so this *risk* is a value of the normal distribution, or a mean of several
 for different sizes of errors, which are uncertain. The calibration may be used at the measured
-poses if the risk there is below RISK, for these poses alone and together with all poses of the
-joint range that are predicted as well. It may be used further out, in shells of growing standard
-deviation of the predicted position, as long as the risk in each shell is below RISK.
+poses if the risk is below RISK there, and with all poses of the joint range that are predicted as
+well; further out, in shells of growing standard deviation of the predicted position, as long as
+that holds in each shell.
 """
 
 from __future__ import annotations
@@ -136,7 +136,11 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         names = tuple(str(name) for name in document['names'])
         geometric = {n for n in names if chain.owns_frame(n) or Parameter(n).of_dh}
         chain = chain.with_effects([n for n in names if n not in geometric])
+        ends = str(document['base']), str(document['tool'])
         ErrorModel(chain, names)
+        for frame in ends:
+            if frame not in chain.frame_names:
+                raise UnknownNameError('frame', frame, chain.frame_names)
         limit = document['limit']
         region = Region(
             chain,
@@ -145,21 +149,15 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             parse_rows(document.get('device', [''] * len(names)), len(names)),
             np.inf if limit is None else float(limit),
             float(document['share']),
-            str(document['base']),
-            str(document['tool']),
+            *ends,
         )
     except UnknownNameError as err:
-        what = f'parameter in {where}: calibration.region'
+        what = f'{err.what} in {where}: calibration.region'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
         raise damaged('region', where, err) from err
     if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
         raise damaged('region', where)
-    for frame in (region.base, region.tool):
-        if frame not in chain.frame_names:
-            raise UnknownNameError(
-                f'frame in {where}: calibration.region', frame, chain.frame_names
-            )
     return region
 
 

@@ -3,9 +3,9 @@
 """Rounded joint values: does the arm explain the gain, or the rounding?
 
 Values that are multiples of a step are off by up to half a step, identically wherever a joint has
-the same value, as in grids or while other joints move. A model follows that, even on left-out
-poses with the same values. So two explanations of the nominal residuals y, frames projected out,
-are compared by their evidence (the marginal likelihood, Gaussian throughout):
+the same value. A model follows that, even on left-out poses with the same values. So two
+explanations of the nominal residuals y, frames projected out, are compared by their evidence (the
+marginal likelihood, Gaussian throughout):
 
     rounding      y ~ N(0, k I + C C^T)                 C: a column for each value of each joint
     and the arm   y ~ N(0, k I + C C^T + s J J^T)       J: the arm's columns, times usual errors

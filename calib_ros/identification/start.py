@@ -5,21 +5,22 @@
 With the nominal arm K_i = A_1 ... A_n, a measured pose is M_i = T_world_base K_i T_flange_target.
 
 Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading singular vectors
-of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013).
-Positions: a point set registration of the flange positions (Umeyama 1991) that leaves the tool
-out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row.
-Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
-is the shortest one, the base takes the rest, and rotations come from the registration.
-Distances: their squares are linear in the base's position and its square, solved for the better
-half of the samples. A touched plane: n p_K + n R_K t = d is linear in n, n t^T and d, or with the
-tool given it is the plane through the points. Pixels: the pose of the board in each image
-(`resection.py`). Every start is polished by least squares on the frames alone; the best one
-counts. Where none fits (few or degenerate poses), the 24 rotations of a cube are tried as well.
+of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013). Positions: a point set
+registration of the flange positions (Umeyama 1991) that leaves the tool out, and the linear system
+p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row. Translations are linear once R_B is
+known. Where orientations hardly vary, the tool's translation is the shortest one, the base takes
+the rest, and rotations come from the registration.
+Distances: their squares are linear in the base's position and its square. A touched plane:
+n p_K + n R_K t = d is linear in n, n t^T and d, or with the tool given it is the plane through the
+points. Pixels: the pose of the board in each image (`resection.py`).
+
+Every start is polished by least squares on the frames alone; the best one counts. Where none fits
+(few or degenerate poses), the 24 rotations of a cube are tried as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -27,17 +28,15 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import DEGENERATE, excited, structurally_independent
 from calib_ros.identification.leastsquares import System, factor_of, minimise, normal_equations
-from calib_ros.identification.levels import TELLING
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
-from calib_ros.identification.robust import robust_fit
+from calib_ros.identification.robust import robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
-from calib_ros.identification.trimmed import STARTS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 GOOD = 0.03
@@ -80,13 +79,8 @@ def _start_one(
 ) -> Chain:
     """Return the chain with frames for one set of observations; sigmas [m, rad]."""
     oriented = bool(observations.oriented.any()) and observations.distances is None
-    names = [
-        name
-        for key in ('base', 'tool')
-        if not chain.frame(key).fixed
-        for name in parameters_of(key)
-        if oriented or key == 'base' or name.is_length
-    ]
+    every = movable(chain, ('base', 'tool'))
+    names = [name for name in every if oriented or name.owner == 'base' or name.is_length]
     if not names:
         return chain
     if observations.socket:
@@ -94,8 +88,8 @@ def _start_one(
     subset = observations.spread()
     system = System((Samples(subset, *sigmas),))
     if subset.distances is not None and not subset.plane:
-        start = _trilaterated(chain, _flange(chain, subset), subset, loss != 'none')
-        return robust_fit(start, names, system, loss).fit.chain
+        start = _trilaterated(chain, _flange(chain, subset), subset)
+        return thorough_fit(start, names, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     determined: tuple[str, ...] = ()
     best, least = chain, np.inf
@@ -129,6 +123,11 @@ def _flange(chain: Chain, observations: Observations) -> FloatArray:
     """Return the poses (N, 4, 4) of the bare arm."""
     arm = replace(chain, base=Frame(), tool=Frame())
     return arm.forward(observations.joints, observations.approach)
+
+
+def movable(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
+    """Return the parameters of those of some frames that are not fixed."""
+    return [n for each in frames if not chain.frame(each).fixed for n in parameters_of(each)]
 
 
 def likened(
@@ -186,14 +185,11 @@ def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iter
         yield start
 
 
-def _trilaterated(
-    chain: Chain, arm: FloatArray, observations: Observations, robust: bool
-) -> Chain:
+def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
     """Return the chain placed by distances from the world's origin.
 
     L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
-    world, because no distance from its origin tells. Against gross errors it is solved for the
-    half of the samples that fits best, by the least median of many draws (Rousseeuw 1984).
+    world, because no distance from its origin tells.
     """
     if chain.frame('base').fixed:
         return chain
@@ -201,17 +197,8 @@ def _trilaterated(
     points = arm[:, :3, 3] + arm[:, :3, :3] @ chain.frame('tool').matrix[:3, 3]
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
-    chosen = np.arange(len(points))
-    if robust and len(points) > TELLING:
-        order = np.random.default_rng(0).random((STARTS, len(points))).argsort(axis=1)
-        draws = order[:, :TELLING]
-        found = (np.linalg.pinv(columns[draws]) @ wanted[draws, np.newaxis])[:, :3, 0]
-        lengths = np.linalg.norm(points + found[:, np.newaxis], axis=2)
-        misfits = np.abs(lengths - observations.distances)
-        best = misfits[np.argmin(np.median(misfits, axis=1))]
-        chosen = np.argsort(best)[: max(len(points) // 2, TELLING)]
     matrix = np.eye(4)
-    matrix[:3, 3] = np.linalg.lstsq(columns[chosen], wanted[chosen], rcond=None)[0][:3]
+    matrix[:3, 3] = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
     return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
 
 
@@ -235,11 +222,9 @@ def _closed_form(
                 np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
             )
         system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
-        right = np.linalg.svd(system)[2]
-        for sign in (1.0, -1.0):  # the singular vector's sign is open, its determinant is not
-            matrix = sign * right[0].reshape(3, 3, order='F')
-            if np.linalg.det(matrix) > 0.0:
-                yield se3.nearest_rotation(matrix)
+        matrix = np.linalg.svd(system)[2][0].reshape(3, 3, order='F')
+        # the singular vector's sign is open, its determinant is not
+        yield se3.nearest_rotation(np.sign(np.linalg.det(matrix)) * matrix)
     positions = observations.positions - observations.positions.mean(axis=0)
     tool_point = chain.frame('tool').matrix[:3, 3]
     reached = arm[:, :3, 3] + arm[:, :3, :3] @ tool_point
