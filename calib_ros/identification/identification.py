@@ -187,7 +187,7 @@ class Identification(Shown):
         return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
 
     def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
-        """Return the pairs of parameters whose correlation exceeds a threshold."""
+        """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
         return identifiability.correlated(self.covariance, self.names, threshold)
 
     def to_frame(self) -> Any:

@@ -166,67 +166,48 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
 
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
-    ends = sets[0]
+    ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
-    near, far = np.split(judge.sigma, [len(measured)])
-    limit = float(near.max())
-    order = np.argsort(far)
-    own = judge.products([*range(len(measured))])
-    inner = own + judge.products(len(measured) + order[far[order] <= limit])
+    model = ErrorModel(posterior.chain, posterior.names, *ends)
+    near, far = (sigma_of(model, posterior.square, each) for each in (measured, drawn))
+    order, limit = np.argsort(far), float(near.max())
+    judge = _Judge(posterior, *ends, freedom)
+    own, inside = judge.products(measured), far[order] <= limit
+    inner = own + judge.products(drawn[order[inside]])
     if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
         return None
-    shells = len(measured) + order[far[order] > limit]
+    shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
-        added = judge.products(shell)
+        added = judge.products(drawn[shell])
         if not judge.risk(added, inner + added) < RISK:
             break
-        inner = inner + added
-        limit = float(judge.sigma[shell[-1]])
+        inner, limit = inner + added, float(far[shell[-1]])
     share = float(np.mean(far <= limit))
-    return Region(
-        posterior.chain,
-        posterior.names,
-        posterior.square,
-        posterior.device,
-        np.inf if share == 1.0 else limit,
-        share,
-        ends.base,
-        ends.tool,
-    )
+    limit = np.inf if share == 1.0 else limit
+    known = posterior.chain, posterior.names, posterior.square, posterior.device
+    return Region(*known, limit, share, *ends)
 
 
 class _Judge:
     """Tells how probable it is that a calibration makes the arm worse at some poses."""
 
-    def __init__(
-        self, posterior: Posterior, joints: FloatArray, ends: Observations, freedom: float
-    ) -> None:
+    def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
         chain, names = posterior.chain, posterior.names
-        frames = [*parameters_of(ends.base), *parameters_of(ends.tool)[:3]]
-        every = list(dict.fromkeys([*frames, *names]))
-        model = ErrorModel(chain, every, ends.base, ends.tool)
-        shift = model.linearise(np.ascontiguousarray(joints.T))[2]
-        row = dict(zip(every, model.order.tolist(), strict=True))
-        own = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
-        found = shift[[row[name] for name in names]]
-        flat = found.reshape(len(names), -1)
-        squares = ((posterior.square @ flat) * flat).sum(axis=0).reshape(3, -1).sum(axis=0)
-        self.sigma = np.sqrt(np.maximum(squares, 0.0))
-        self._placed = len(frames)
-        self._rows = shift[[row[name] for name in [*frames, *(names[k] for k in own)]]]
-        self._offsets = posterior.offsets[own]
+        arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        frames = [*parameters_of(base), *parameters_of(tool)[:3]]
+        self._placed, self._freedom = len(frames), freedom
+        self._model = ErrorModel(chain, [*frames, *(names[k] for k in arm)], base, tool)
+        self._offsets = posterior.offsets[arm]
         weights, means, covariances = zip(*posterior.doubted, strict=True)
-        self._weights, self._means = np.array(weights), np.array(means)[:, own]
-        self._covariances = np.array(covariances)[:, own][:, :, own]
-        self._freedom = freedom
+        self._weights, self._means = np.array(weights), np.array(means)[:, arm]
+        self._covariances = np.array(covariances)[:, arm][:, :, arm]
 
-    def products(self, which: Sequence[int] | NDArray[np.intp]) -> FloatArray:
-        """Return (K, K) the products of the columns with each other, over some poses."""
-        rows = self._rows[:, :, which].reshape(len(self._rows), -1)
-        return np.asarray(rows @ rows.T)
+    def products(self, joints: FloatArray) -> FloatArray:
+        """Return (K, K) the products of the columns with each other, over poses at (N, n)."""
+        rows = self._model.jacobian(joints)[:, :3].reshape(-1, len(self._model.names))
+        return np.asarray(rows.T @ rows)
 
     def risk(self, which: FloatArray, around: FloatArray) -> float:
         """Return it for some poses, in frames fitted to those around; both by their products."""

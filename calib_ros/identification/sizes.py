@@ -125,18 +125,16 @@ class Evidence:
             return [(1.0, size)]
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
         tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
-        likely = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
-            axis=1
-        )
+        unusual = (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(axis=1)
+        likely = self._of(tried) - 0.5 * unusual
         upper = special.expit(likely[::2] - likely[1::2])
         weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
         return list(zip(weights.tolist(), tried, strict=True))
 
     def _within(self, size: FloatArray) -> FloatArray:
         """Return sizes (G,) no further from the typical ones than any that are looked for."""
-        return self._typical + np.clip(
-            size - self._typical, np.log(LEAST_SIZE), -np.log(LEAST_SIZE)
-        )
+        most = -np.log(LEAST_SIZE)
+        return self._typical + np.clip(size - self._typical, -most, most)
 
     def widen(self, size: FloatArray) -> None:
         """Give offsets the variances that the prior's tails have in the mean, for sizes (G,)."""

@@ -89,7 +89,8 @@ def _start_one(
     system = System((Samples(subset, *sigmas),))
     if subset.distances is not None and not subset.plane:
         start = _trilaterated(chain, _flange(chain, subset), subset)
-        return thorough_fit(start, names, system, loss).fit.chain
+        lengths = [name for name in names if name.is_length]
+        return thorough_fit(start, lengths, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     determined: tuple[str, ...] = ()
     best, least = chain, np.inf
@@ -163,26 +164,28 @@ def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iter
     With the tool as it is given, and with one that is told by the heights alone.
     """
     assert observations.distances is not None
-    base, tool = chain.frame('base'), chain.frame('tool')
+    tool = chain.frame('tool')
     tips = [tool.matrix[:3, 3]]
-    turned = arm[:, :3, :3].reshape(-1, 9)
-    columns = np.column_stack([arm[:, :3, 3], turned, np.ones(len(arm))])
+    columns = np.column_stack([arm[:, :3, 3], arm[:, :3, :3].reshape(-1, 9), np.ones(len(arm))])
     if not tool.fixed and len(columns) > columns.shape[1]:  # one touch more than unknowns
         least = np.linalg.svd(columns, full_matrices=False)[2][-1]
         normal = least[:3]
         tips.append(normal @ least[3:12].reshape(3, 3) / max(float(normal @ normal), 1e-12))
     for tip in tips:
-        matrix = tool.matrix.copy()
-        matrix[:3, 3] = tip
-        start = chain if tool.fixed else replace(chain, tool=replace(tool, matrix=matrix))
-        if not base.fixed:
-            points = arm[:, :3, 3] + arm[:, :3, :3] @ tip
-            axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-            axes[2] = np.cross(axes[0], axes[1])
-            place = se3.transform(axes, -axes @ points.mean(axis=0))
-            place[2, 3] += observations.distances.mean()
-            start = replace(start, base=replace(base, matrix=place))
-        yield start
+        points = arm[:, :3, 3] + arm[:, :3, :3] @ tip
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        axes[2] = np.cross(axes[0], axes[1])
+        place = se3.transform(axes, -axes @ points.mean(axis=0))
+        place[2, 3] += observations.distances.mean()
+        yield _placed(chain, place, se3.transform(tool.matrix[:3, :3], tip))
+
+
+def _placed(chain: Chain, base: FloatArray, tool: FloatArray) -> Chain:
+    """Return the chain with other matrices (4, 4) of those frames that are not fixed."""
+    for key, matrix in (('base', base), ('tool', tool)):
+        if not chain.frame(key).fixed:
+            chain = chain.with_frame(key, replace(chain.frame(key), matrix=matrix))
+    return chain
 
 
 def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
@@ -191,15 +194,13 @@ def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> 
     L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
     world, because no distance from its origin tells.
     """
-    if chain.frame('base').fixed:
-        return chain
     assert observations.distances is not None
-    points = arm[:, :3, 3] + arm[:, :3, :3] @ chain.frame('tool').matrix[:3, 3]
+    tool = chain.frame('tool').matrix
+    points = (arm @ tool)[:, :3, 3]
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
-    matrix = np.eye(4)
-    matrix[:3, 3] = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
-    return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
+    place = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
+    return _placed(chain, se3.transform(np.eye(3), place), tool)
 
 
 def _closed_form(
@@ -226,8 +227,7 @@ def _closed_form(
         # the singular vector's sign is open, its determinant is not
         yield se3.nearest_rotation(np.sign(np.linalg.det(matrix)) * matrix)
     positions = observations.positions - observations.positions.mean(axis=0)
-    tool_point = chain.frame('tool').matrix[:3, 3]
-    reached = arm[:, :3, 3] + arm[:, :3, :3] @ tool_point
+    reached = (arm @ chain.frame('tool').matrix)[:, :3, 3]
     yield se3.nearest_rotation(positions.T @ (reached - reached.mean(axis=0)))
     if len(arm) >= 16 and chain.tool is None:
         columns = np.concatenate([arm[:, :3, :3].reshape(-1, 9), arm[:, :3, 3]], axis=1)
@@ -257,11 +257,8 @@ def _complete(
         shift = _shortest(turned, left, not base.fixed)
         tool_matrix[:3, 3] += shift
         wanted -= turned @ shift
-    if not base.fixed:
-        base_matrix[:3, 3] = wanted.mean(axis=0)
-    return replace(
-        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
-    )
+    base_matrix[:3, 3] = wanted.mean(axis=0)
+    return _placed(chain, base_matrix, tool_matrix)
 
 
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
