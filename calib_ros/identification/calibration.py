@@ -50,45 +50,31 @@ HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expect
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Shown):
-    """A corrected chain, what it was before, and how well it is known.
-
-    Attributes
-    ----------
-    chain, before : Chain
-        The corrected chain, and the nominal one in fitted frames.
-    names, covariance : tuple of str, (P, P)
-        Parameters that were fitted, and their covariance; none when it is not known.
-    freedom : float
-        Degrees of freedom from which the covariance was estimated.
-    residual : float or None
-        RMS position error [m] on poses that were not fitted; None when it is not known.
-    noise : Noise or None
-        Of the measurements, where it is known.
-    region : Region or None
-        Where the calibration may be used; None when it is not known.
-    world_frame : str
-        Frame in which the poses were measured.
-    owners : mapping
-        Which session, device or target each frame is of (`sampling.sample.Frames`), if known.
-    record : mapping
-        Where the numbers come from, as the file says it, but for the covariance and the rows.
-    rows : records.Fingerprint or None
-        Of the measurements that were fitted, if they are known.
-
-    """
+    """A corrected chain, what it was before, and how well it is known; None for what is not."""
 
     chain: Chain
     before: Chain
+    """The nominal chain in fitted frames."""
     names: tuple[str, ...] = ()
+    """Parameters that were fitted, (P,)."""
     covariance: FloatArray | None = None
+    """Theirs, (P, P)."""
     freedom: float = np.inf
+    """Degrees of freedom from which it was estimated."""
     residual: float | None = None
+    """RMS position error [m] on poses that were not fitted."""
     noise: Noise | None = None
+    """Of the measurements."""
     region: Region | None = None
+    """Where the calibration may be used."""
     world_frame: str = ''
+    """Frame in which the poses were measured."""
     owners: Mapping[str, records.Owner] = field(default_factory=dict)
+    """Which session, device or target each frame is of (`sampling.sample.Frames`)."""
     record: Mapping[str, Any] = field(default_factory=dict)
+    """Where the numbers come from, as the file says it, but for the covariance and the rows."""
     rows: records.Fingerprint | None = None
+    """Of the measurements that were fitted."""
 
     @classmethod
     def of(

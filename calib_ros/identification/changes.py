@@ -146,9 +146,8 @@ class Told(Shown):
         scaled = columns * sizes
         inner = np.eye(len(sizes)) + scaled.T @ self.information @ scaled
         seen = scaled.T @ self.vector
-        factor = linalg.cho_factor(inner)
-        volume = 2.0 * float(np.log(np.diag(factor[0])).sum())
-        return 0.5 * (float(seen @ linalg.cho_solve(factor, seen)) - volume)
+        gain = float(seen @ np.linalg.solve(inner, seen))
+        return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
 
 
 def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple[Explanation, ...]:

@@ -55,12 +55,11 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     number = stops(joints)
     standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
     place = np.concatenate(cos_sin(standing), axis=1)  # which knows no turns
-    close, label = _pairs(place, SCATTER), np.arange(len(standing))
+    close = _pairs(place, SCATTER)
     # what stands still is nearer than visits may scatter
     near = close[_still(standing[close[:, 0]] - standing[close[:, 1]])]
-    if len(near):
-        links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
-        _, label = connected_components(links, directed=False)
+    links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
+    _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
     if np.isin(close, first).all(axis=1).any():
         label = _repeats(place[first])[label]

@@ -27,7 +27,7 @@ import numpy as np
 from calib_ros.identification.identifiability import DEGENERATE
 from calib_ros.identification.leastsquares import Normal, System, normal_equations, stacked
 from calib_ros.identification.levels import PRINTED, SCALE
-from calib_ros.identification.observations import SOME_POSES, Observations
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -117,8 +117,8 @@ def _products(chain: Chain, columns: Sequence[str], system: System, by_device: b
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
     wide = []
     for rows, field in zip(system.rows_of(chain, columns), fields, strict=True):
-        bent = np.zeros((len(field), *rows.shape[1:]))
-        bent[:, : field.shape[1]] = field
+        turns = rows.shape[1] - field.shape[1]
+        bent = np.pad(field, ((0, 0), (0, turns), (0, 0)))
         wide.append(np.concatenate([rows[:-1], bent, rows[-1:]]))
     matrix = stacked(wide)
     return np.asarray(matrix.T @ matrix)
@@ -140,7 +140,8 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
     for own in by_device.values():
         mine = [sets[number] for number in own]
         weights = [np.ones(s.count) if s.weights is None else s.weights for s in mine]
-        places = [_place(samples.observations) for samples in mine]
+        shown = [samples.observations for samples in mine]
+        places = [(each.inverted() if each.inverse else each).positions for each in shown]
         waves = _polynomials(np.concatenate(places), np.concatenate(weights))
         ends = np.cumsum([samples.count for samples in mine])[:-1]
         parts = dict(zip(own, np.split(waves, ends, axis=1), strict=True))
@@ -149,13 +150,6 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
             bent = _rows(samples, parts[k]) if k in parts else none
             found[k] = np.concatenate([found[k], bent])
     return found
-
-
-def _place(seen: Observations) -> FloatArray:
-    """Return where the device saw the targets (N, 3) [m], in its own axes."""
-    if not seen.inverse:
-        return seen.positions
-    return np.asarray(-np.einsum('nji,nj->ni', seen.rotations, seen.positions))
 
 
 def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:

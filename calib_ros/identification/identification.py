@@ -55,79 +55,58 @@ __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residua
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Shown):
-    """The result; a poor fit is data in it, not an error.
-
-    Attributes
-    ----------
-    chain, before : Chain
-        The corrected chain and the nominal one, both with fitted frames.
-    parameters : tuple of ParameterRow
-        Every parameter of the model.
-    names, uncertainty : tuple of str, Uncertainty
-        Fitted parameters and their covariance for the noise found in the residuals.
-    fitted, validation : Comparison
-        Residuals on the fitted pairs and on pairs that were not fitted, held out as `validated_by`
-        says. The latter is None when there are too few poses to hold any out.
-    noise : Noise
-    distances : tuple of (N,)
-        Size of the residuals of each set's samples in units of the usual one (`robust.py`).
-    outliers : tuple of Outlier
-        Samples of gross error; they carry no or little weight in the fit.
-    gauges : dict
-        For each parameter that was left out, the fitted ones that it trades against.
-    observability : Observability
-    chance : float or None
-        Probability that errors shared by what was measured in succession, as of a drifting
-        tracker, would let the arm's parameters explain as much. None for a target in sockets.
-    refusals : tuple of Reason
-        Rules of acceptance that failed, in words; none when the result is accepted.
-    posterior : Posterior
-        What is known of the arm, effects that the model leaves out included.
-    region : Region or None
-        Where the calibration may be used; None where it may not be used anywhere.
-    weak : tuple of str
-        Parameters that the poses hardly determine, held near their nominal values by a prior of
-        the size that this arm's errors have.
-    verdicts : tuple of Verdict
-        Where the model was chosen: what paid for itself and what did not.
-    step : Step or None
-        What moved while it was measured (`steps.py`).
-    remarks : tuple of str
-        What is suspicious though the figures are good, and what to do (`suspicions.py`).
-    coupled : bool
-        Whether couplings of the wrist that are not fitted explain most of what is left.
-    images : int
-        How many images of a board were fitted.
-
-    """
+    """The result; a poor fit is data in it, not an error."""
 
     chain: Chain
     before: Chain
+    """The nominal chain. Both have fitted frames."""
     parameters: tuple[ParameterRow, ...]
+    """Every parameter of the model."""
     names: tuple[str, ...]
+    """Fitted parameters, (P,)."""
     uncertainty: identifiability.Uncertainty
+    """Their covariance for the noise found in the residuals."""
     fitted: Comparison
+    """Residuals on the fitted pairs."""
     validation: Comparison | None
+    """Residuals on pairs that were not fitted; None where there are too few poses for that."""
     validated_by: str
+    """How these pairs were held out."""
     noise: Noise
     distances: tuple[FloatArray, ...]
+    """Size (N,) of the residuals of each set's samples, in the usual one (`robust.py`)."""
     outliers: tuple[Outlier, ...]
+    """Samples of gross error; they carry no or little weight in the fit."""
     gauges: dict[str, list[str]]
+    """For each parameter that was left out, the fitted ones that it trades against."""
     observability: identifiability.Observability
     priors: dict[str, float]
+    """Standard deviations [m, rad] that were known before."""
     world_frame: str
     iterations: int
     converged: bool
     chance: float | None
+    """Probability that errors shared by what was measured in succession, as of a drifting tracker,
+    would let the arm's parameters explain as much. None for a target in sockets."""
     refusals: tuple[Reason, ...]
+    """Rules of acceptance that failed, in words; none when the result is accepted."""
     posterior: Posterior
+    """What is known of the arm, effects that the model leaves out included."""
     region: Region | None
+    """Where the calibration may be used; None where it may not be used anywhere."""
     weak: tuple[str, ...] = ()
+    """Parameters that the poses hardly determine, held near their nominal values by a prior of the
+    size that this arm's errors have."""
     verdicts: tuple[effects.Verdict, ...] = ()
+    """Where the model was chosen: what paid for itself and what did not."""
     step: Step | None = None
+    """What moved while it was measured (`steps.py`)."""
     remarks: tuple[str, ...] = ()
+    """What is suspicious though the figures are good, and what to do (`suspicions.py`)."""
     coupled: bool = False
+    """Whether couplings of the wrist that are not fitted explain most of what is left."""
     images: int = 0
+    """How many images of a board were fitted."""
 
     @property
     def accepted(self) -> bool:

@@ -109,7 +109,8 @@ class Problem(Shown):
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
-        for name, sigma in self.sigmas.items():
+        priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
+        for name, sigma in (self.sigmas | priors).items():
             if not 0.0 < sigma < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
         if self.loss not in LOSSES:
@@ -143,9 +144,7 @@ class Problem(Shown):
         for pattern in (*self.fixed, *self.priors):
             if not fnmatch.filter(names, pattern):
                 raise UnknownNameError('parameter', pattern, names)
-        for pattern, sigma in self.priors.items():
-            if not 0.0 < sigma < np.inf:
-                raise ConfigError(f'the prior of {pattern} must be a positive number, not {sigma}')
+        for pattern in self.priors:
             if self._places(pattern):
                 raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
         for pattern in self.fixed:

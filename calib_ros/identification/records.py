@@ -290,12 +290,13 @@ class Fingerprint:
     def of(cls, sets: Sequence[Observations], earlier: Fingerprint | None = None) -> Fingerprint:
         """Return that of rows, and of those fitted earlier."""
         new = hashes(sets)
-        if earlier is None:
-            return cls(len(new), np.unique(new)[:KEPT])
-        if not earlier.complete:
-            new = new[new <= earlier.least.max(initial=0)]
-        both = np.union1d(earlier.least, new)[:KEPT]
-        return cls(earlier.count + sum(map(len, sets)), both)
+        earlier = earlier or cls(0, new[:0])
+        both = np.union1d(earlier.least, earlier.of_those(new))[:KEPT]
+        return cls(earlier.count + len(new), both)
+
+    def of_those(self, rows: Hashes) -> Hashes:
+        """Return which hashes of rows (N,) would be among these if the rows were fitted."""
+        return rows if self.complete else rows[rows <= self.least.max(initial=0)]
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any], where: str) -> Fingerprint | None:
@@ -320,9 +321,7 @@ class Fingerprint:
 
     def share(self, sets: Sequence[Observations]) -> float:
         """Return the share of rows that were fitted, as far as it shows."""
-        rows = hashes(sets)
-        if not self.complete:
-            rows = rows[rows <= self.least.max(initial=0)]
+        rows = self.of_those(hashes(sets))
         return float(np.isin(rows, self.least).mean()) if rows.size else 0.0
 
 
