@@ -208,10 +208,8 @@ class Observations(Shown):
         positions = -np.einsum('nij,nj->ni', turned, self.positions)
         covariance = self.covariance if sigmas is None else self.covariances(sigmas)
         if covariance is not None:
-            jacobian = np.zeros((len(self), 6, 6))
-            jacobian[:, :3, :3] = -turned
-            jacobian[:, :3, 3:] = -turned @ se3.skew(self.positions)
-            jacobian[:, 3:, 3:] = -turned
+            lever, none = turned @ se3.skew(self.positions), np.zeros_like(turned)
+            jacobian = -np.block([[turned, lever], [none, turned]])
             covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
         return replace(
             self,

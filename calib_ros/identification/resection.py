@@ -10,7 +10,7 @@ that pose is refined as well, and the one with the smaller residuals counts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,6 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
 from calib_ros.kinematics.newton import Normal, minimise
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class BoardPoses:
-    """Poses (M, 4, 4) of the board in the camera, and RMS residuals (M,) [px] of the images."""
-
-    poses: FloatArray
-    rms: FloatArray
 
 
 def board_poses(observations: Observations, lens: Lens) -> Observations:
@@ -49,13 +41,13 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
             'where the camera is'
         )
     rows = observations.select(told[observations.images])
-    found = resect(rows, lens)
-    _require_fit(rows, found.rms)
+    poses, rms = resect(rows, lens)
+    _require_fit(rows, rms)
     first = np.flatnonzero(np.diff(rows.images, prepend=-1))
     seen = replace(
         replace(rows, pixels=None, points=None, on_flange=False).select(first),
-        positions=found.poses[:, :3, 3],
-        rotations=found.poses[:, :3, :3],
+        positions=poses[:, :3, 3],
+        rotations=poses[:, :3, :3],
         oriented=np.ones(len(first), dtype=bool),
     )
     return seen.inverted() if observations.on_flange else seen
@@ -118,8 +110,8 @@ def image_products(
     return np.asarray((parts[:, :, :first] @ parts.swapaxes(2, 3)).sum(axis=0))
 
 
-def resect(observations: Observations, lens: Lens) -> BoardPoses:
-    """Return the pose of the board in the camera for every image."""
+def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArray]:
+    """Return the poses (M, 4, 4) of the board in the camera, and RMS residuals (M,) [px]."""
     assert observations.points is not None
     assert observations.pixels is not None
     index = observations.images
@@ -133,22 +125,17 @@ def resect(observations: Observations, lens: Lens) -> BoardPoses:
     axes[2] = np.cross(axes[0], axes[1])
     plane = (observations.points - centre) @ axes.T
     start = _from_homography(plane[:, :2], lens.rays(observations.pixels), index)
-    local = np.zeros((3, len(plane)))
-    local[:2] = plane[:, :2].T
-    best = _refined(start, local, observations.pixels, index, lens)
-    mirrored = best.poses.copy()
-    sight = mirrored[:, :3, 3] / np.linalg.norm(mirrored[:, :3, 3], axis=1, keepdims=True)
-    normal = mirrored[:, :3, 2]
-    axis = np.cross(normal, sight)
-    along = np.sign((normal * sight).sum(axis=1, keepdims=True))
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    turn = axis * along * 2.0 * np.arcsin(np.clip(sine, 0.0, 1.0)) / np.maximum(sine, 1e-12)
-    mirrored[:, :3, :3] = se3.exp_rotation(turn) @ mirrored[:, :3, :3]
-    other = _refined(mirrored, local, observations.pixels, index, lens)
-    swap = other.rms < best.rms
-    poses = np.where(swap[:, np.newaxis, np.newaxis], other.poses, best.poses)
+    local = plane.T * [[1.0], [1.0], [0.0]]
+    best, rms = _refined(start, local, observations.pixels, index, lens)
+    mirrored, normal = best.copy(), best[:, :3, 2]
+    sight = best[:, :3, 3] / np.linalg.norm(best[:, :3, 3], axis=1, keepdims=True)
+    # half a turn about the normal, then one about the line of sight
+    halves = [2.0 * v[:, :, np.newaxis] * v[:, np.newaxis] - np.eye(3) for v in (sight, normal)]
+    mirrored[:, :3, :3] = halves[0] @ halves[1] @ best[:, :3, :3]
+    other, others = _refined(mirrored, local, observations.pixels, index, lens)
+    poses = np.where((others < rms)[:, np.newaxis, np.newaxis], other, best)
     board = se3.transform(axes.T, centre)  # T_board_plane
-    return BoardPoses(poses @ se3.invert(board), np.minimum(best.rms, other.rms))
+    return poses @ se3.invert(board), np.minimum(rms, others)
 
 
 def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -194,8 +181,8 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
 
 def _refined(
     poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
-) -> BoardPoses:
-    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return poses (M, 4, 4) refined on the pixels (N, 2), and RMS residuals (M,) [px]."""
     count = np.bincount(index)
 
     def linearise(poses: FloatArray, which: NDArray[np.intp]) -> Normal:
@@ -218,4 +205,4 @@ def _refined(
         return moved
 
     found = minimise(linearise, poses.transpose(1, 2, 0), move, fall=HALF_THE_DIGITS)
-    return BoardPoses(found.x.transpose(2, 0, 1), np.sqrt(found.cost / count))
+    return found.x.transpose(2, 0, 1), np.sqrt(found.cost / count)

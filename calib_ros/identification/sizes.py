@@ -176,12 +176,7 @@ class Evidence:
         """Return the logarithm of the evidence of sizes (S, G), given by their logarithms."""
         weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
         scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
-        # the last row of the factor of [A b; b^T c] is L^-1 b
-        wide = np.zeros((len(sizes), scaled.shape[1] + 1, scaled.shape[1] + 1))
-        wide[:, :-1, :-1] = scaled
-        wide[:, -1, :-1] = scale * self._vector
-        wide[:, -1, -1] = 1e300  # more than any square
-        factor = np.linalg.cholesky(wide)
-        volume = 2.0 * np.log(scale / np.einsum('spp->sp', factor)[:, :-1]).sum(axis=1)
-        fit = (factor[:, -1, :-1] ** 2).sum(axis=1)
+        seen = (scale * self._vector)[:, :, np.newaxis]
+        fit = (seen * np.linalg.solve(scaled, seen)).sum(axis=(1, 2))
+        volume = 2.0 * np.log(scale).sum(axis=1) - np.linalg.slogdet(scaled)[1]
         return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))
