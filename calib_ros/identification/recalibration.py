@@ -24,12 +24,7 @@ from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration, about, made
 from calib_ros.identification.changes import Columns, Explanation, Told
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.leastsquares import (
-    System,
-    minimise,
-    normal_equations,
-    products_of,
-)
+from calib_ros.identification.leastsquares import System, minimise, normal_equations, products_of
 from calib_ros.identification.levels import ALIKE, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered

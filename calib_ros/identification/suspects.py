@@ -251,15 +251,14 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
 
 def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
     """Return that a joint counts the other way round, has another zero [rad], or both."""
-    whats, in_file, column = [], [], f'q{k + 1}'
+    parts, column = [], f'q{k + 1}'
     if sign < 0.0:
-        whats.append('counts the other way round')
-        in_file.append(f'sign: {-chain.joints[k].sign}')
+        parts.append(('counts the other way round', f'sign: {-chain.joints[k].sign}'))
         column = f'-{column}'
     if degrees:
-        whats.append(f'has its zero {degrees[1:]} degrees away')
-        in_file.append(f'theta {degrees} degrees')
+        parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
         column += f'{degrees[0]}{abs(angle):.16g}'
+    whats, in_file = zip(*parts, strict=True)
     own = np.eye(len(chain.joints))[k]
     remedy = f'{" and ".join(in_file)} in the chain file'
     return Suspect(
