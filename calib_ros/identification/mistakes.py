@@ -308,10 +308,8 @@ def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
     here, there = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(e, name) for e in parts])[order][
-            there if name == 'joints' else here
-        ]
-        for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
-    }
+    joined: dict[str, Any] = {}
+    for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented'):
+        ordered = np.concatenate([getattr(e, name) for e in parts])[order]
+        joined[name] = ordered[there if name == 'joints' else here]
     return Observations(**joined, base=each.base, tool=each.tool, socket=each.socket)

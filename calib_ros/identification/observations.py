@@ -19,19 +19,12 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
-    'stamps_ns': (),
-    'joints': (None,),
-    'positions': (3,),
+    **dict.fromkeys(('stamps_ns', 'oriented', 'distances', 'delay'), ()),
+    **dict.fromkeys(('joints', 'approach', 'velocity', 'acceleration'), (None,)),
+    **dict.fromkeys(('positions', 'points'), (3,)),
     'rotations': (3, 3),
-    'oriented': (),
     'covariance': (6, 6),
-    'approach': (None,),
-    'distances': (),
-    'velocity': (None,),
-    'acceleration': (None,),
-    'delay': (),
     'pixels': (2,),
-    'points': (3,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
 SOME_POSES = 200

@@ -201,10 +201,9 @@ class Record:
             names = tuple(known['names'])
             square = unpacked(known['root'], len(names))
             freedom = math.inf if known['freedom'] is None else float(known['freedom'])
-            if not set(names) <= set(chain.parameter_names) or len(set(names)) < len(names):
-                raise ValueError('names of another chain')
-            if not (np.diag(square) > 0.0).all() or not freedom > 0.0:
-                raise ValueError('no covariance')
+            ours = set(names) <= set(chain.parameter_names) and len(set(names)) == len(names)
+            if not (ours and (np.diag(square) > 0.0).all() and freedom > 0.0):
+                raise ValueError('no covariance of this chain')
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
             raise damaged('covariance', self.where, err) from err
         return names, square, freedom
@@ -296,7 +295,8 @@ class Fingerprint:
 
     def of_those(self, rows: Hashes) -> Hashes:
         """Return which hashes of rows (N,) would be among these if the rows were fitted."""
-        return rows if self.complete else rows[rows <= self.least.max(initial=0)]
+        every = self.count <= len(self.least)
+        return rows if every else rows[rows <= self.least.max(initial=0)]
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any], where: str) -> Fingerprint | None:
@@ -309,11 +309,6 @@ class Fingerprint:
         except (KeyError, TypeError, ValueError) as err:
             what = f'{where}: calibration.rows is not as it was written'
             raise ConfigError(f'{what}: {err}') from err
-
-    @property
-    def complete(self) -> bool:
-        """Tell whether the hashes are those of all rows."""
-        return self.count <= len(self.least)
 
     def document(self) -> dict[str, Any]:
         """Return it for the record of a calibration."""

@@ -113,8 +113,8 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
         np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
         for share in (abs(scale), std)
     )
-    text = f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by {size} % '
-    text += f'(sigma {sigma} %): '
+    way = 'grow' if scale > 0.0 else 'shrink'
+    text = f'all lengths of the arm {way} alike, by {size} % (sigma {sigma} %): '
     advice = 'check the scale of the measuring device, and the temperature'
     return text + ('no arm does' if certain else advice), certain
 
