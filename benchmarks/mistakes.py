@@ -259,8 +259,7 @@ def fewer(problem, count):
 def typical(problem):
     """Return the typical error of a problem as it is given [m]."""
     sets = tuple(each for each in problem.sets if each.distances is None)
-    few = tuple(mistakes._few(each) for each in sets)
-    trial = mistakes._tried(problem.chain, few)
+    trial = mistakes._tried(problem.chain, tuple(each.spread() for each in sets))
     if trial is None:
         return np.inf
     return min(trial.error, mistakes._polished(problem, trial).error)

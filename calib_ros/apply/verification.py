@@ -35,11 +35,11 @@ from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import configurations
-from calib_ros.identification.fingerprint import reused_in_words
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
 from calib_ros.identification.levels import CONFIDENT, NEARER
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.records import reused_in_words
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3

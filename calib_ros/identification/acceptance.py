@@ -12,8 +12,7 @@
    `largest_length` or `largest_angle`, and at most `largest_error` remains: otherwise it is
    another robot, not a faulty one.
 6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
-7. Nothing moved during the session: no step in time of a frame or a joint's zero explains more
-   than half of the residuals (`steps.py`).
+7. Nothing moved during the session (`steps.py`).
 8. Outliers are not the arm's own behaviour (`misfits.py`), and the error including them does not
    get worse: neither its mean, nor with 99 % confidence its RMS.
 9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
@@ -22,82 +21,85 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
-from calib_ros.identification.validation import COUNTS, Comparison, ParameterRow, log_gain
+from calib_ros.identification.validation import COUNTS, Comparison, log_gain
 from calib_ros.shown import some
 
+if TYPE_CHECKING:
+    from calib_ros.identification.identification import Identification
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """What the rules go by: of a fit, of poses left out, and of what else explains the gain.
 
-    `sized` tells whether anything that was measured tells the size of the arm.
+def refusals(
+    problem: Problem,
+    result: Identification,
+    own_behaviour: str | None,
+    may_be_rounding: bool,
+    sized: bool,
+) -> tuple[Reason, ...]:
+    """Return the rules of acceptance that fail, in words.
+
+    By the result, by what else explains the gain (`misfits.py`, `rounding.py`), and by whether
+    anything that was measured tells the size of the arm.
     """
-
-    converged: bool
-    parameters: Sequence[ParameterRow]
-    validation: Comparison | None
-    chance: float | None
-    region: Region | None
-    step: Step | None
-    own_behaviour: str | None
-    may_be_rounding: bool
-    sized: bool = True
-
-
-def refusals(problem: Problem, found: Findings) -> tuple[Reason, ...]:
-    """Return the rules of acceptance that fail, in words."""
-    failed = [*_of_the_fit(problem, found)]
-    validation = found.validation
+    failed = [*_of_the_fit(problem, result, own_behaviour)]
+    validation = result.validation
     if validation is None:
         text = 'too few poses to leave some out of the fit and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
-        if found.step is not None and not found.step.harmful:
-            failed.append(found.step.reason)
+        if result.step is not None and not result.step.harmful:
+            failed.append(result.step.reason)
         text = (
             f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
             'and what is predicted do not belong together'
         )
         return (*failed, Reason(Rule.OUTLIERS, text))
-    return (*failed, *_of_the_gain(problem, found, validation), *_of_harm(found, validation))
+    gained = _of_the_gain(problem, result, validation, sized)
+    return (*failed, *gained, *_of_harm(validation, may_be_rounding))
 
 
-def _of_the_fit(problem: Problem, found: Findings) -> Iterator[Reason]:
+def _of_the_fit(
+    problem: Problem, result: Identification, own_behaviour: str | None
+) -> Iterator[Reason]:
     """Yield what is wrong whatever the error on poses left out."""
-    if found.step is not None and found.step.harmful:
-        yield found.step.reason
-    if found.own_behaviour is not None:
-        yield Reason(Rule.OWN_BEHAVIOUR, found.own_behaviour)
-    if not found.converged:
+    if result.step is not None and result.step.harmful:
+        yield result.step.reason
+    if own_behaviour is not None:
+        yield Reason(Rule.OWN_BEHAVIOUR, own_behaviour)
+    if not result.converged:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
-    not_excited = [p.name for p in found.parameters if p.status == 'not excited']
-    if not_excited:
-        frames = dict.fromkeys(n.owner for n in not_excited if problem.model.owns_frame(n))
+    if untold := result.not_excited:
+        frames = dict.fromkeys(n.owner for n in untold if problem.model.owns_frame(n))
         known = f' (or {", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
-        yield Reason(
-            Rule.EXCITATION, f'the poses do not determine {", ".join(not_excited)}{known}'
-        )
+        yield Reason(Rule.EXCITATION, f'the poses do not determine {", ".join(untold)}{known}')
     limits = (problem.largest_length, problem.largest_angle)
-    if beyond := [p for p in found.parameters if p.beyond(*limits)]:
-        far = [f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond]
-        yield Reason(
-            Rule.COMMON_SENSE,
-            f'{", ".join(some(far))} off, more than a faulty robot of this kind can be',
-        )
+    if beyond := [p for p in result.parameters if p.beyond(*limits)]:
+        far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
+        text = f'{", ".join(far)} off, more than a faulty robot of this kind can be'
+        yield Reason(Rule.COMMON_SENSE, text)
 
 
-def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> Iterator[Reason]:
+def _gain(
+    validation: Comparison, part: str, which: NDArray[np.bool_], *confidence: float
+) -> tuple[float, float]:
+    """Return the `log_gain` of errors of `position` or `orientation` of pairs (N,)."""
+    before, after = (getattr(each, part)[which] for each in (validation.before, validation.after))
+    return log_gain(before, after, validation.after.configurations[which], *confidence)
+
+
+def _of_the_gain(
+    problem: Problem, result: Identification, validation: Comparison, sized: bool
+) -> Iterator[Reason]:
     """Yield why the error on poses left out does not show that the arm got better."""
     before, after = validation.figures
     if after.rms_mm > 1e3 * problem.largest_error:
@@ -107,11 +109,7 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
             f'{1e3 * problem.largest_error:g} mm (largest_error)',
         )
     judged = validation.deciding
-    gain, limit = log_gain(
-        validation.before.position[judged],
-        validation.after.position[judged],
-        validation.after.configurations[judged],
-    )
+    gain, limit = _gain(validation, 'position', judged)
     if not gain > limit:
         text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
         if gain > 0.0:
@@ -120,30 +118,31 @@ def _of_the_gain(problem: Problem, found: Findings, validation: Comparison) -> I
             chance = before.rms_mm * np.exp(-limit)
             text += f'; with {count} {kind} chance alone may give {chance:.3f} mm'
         yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
-    elif found.chance is not None and found.chance > 1.0 - CONFIDENT:
+    elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
             'a slow drift of the measuring device could explain the improvement: time-shifted '
-            f'residuals are explained just as well in {100.0 * found.chance:.0f} % of cases '
+            f'residuals are explained just as well in {100.0 * result.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
-    elif found.region is None:
+    elif result.region is None:
         text = (
             'what the correction removes is not larger than its own uncertainty, even at the '
             'poses measured'
         )
-        if not found.sized:
-            text += '; measure what tells how large the arm is: positions, or two sockets a known '
-            text += 'distance apart'
+        if not sized:
+            text += (
+                '; measure what tells how large the arm is: positions, or two sockets a known '
+                'distance apart'
+            )
         yield Reason(Rule.REGION, text)
 
 
-def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
+def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
     """Yield what got worse, or may be no gain of the arm."""
     if validation.outliers:
         first, second = validation.figures_of_all
-        pairs = (validation.before.position, validation.after.position)
-        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
+        gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
         if second.mean_mm > first.mean_mm or gain < -max(limit, COUNTS):
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
@@ -151,19 +150,12 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
                 f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
                 f'{second.mean_mm:.3f} mm)',
             )
-    if found.may_be_rounding:
-        yield Reason(
-            Rule.ROUNDING,
-            'the improvement may only come from rounded joint values, alike in many poses',
-        )
+    if may_be_rounding:
+        text = 'the improvement may only come from rounded joint values, alike in many poses'
+        yield Reason(Rule.ROUNDING, text)
     before, after = validation.figures
     if after.rms_mrad is not None:
-        judged = validation.deciding
-        gain, limit = log_gain(
-            validation.before.orientation[judged],
-            validation.after.orientation[judged],
-            validation.after.configurations[judged],
-        )
+        gain, limit = _gain(validation, 'orientation', validation.deciding)
         if gain < -limit:
             yield Reason(
                 Rule.ORIENTATION,
@@ -178,13 +170,9 @@ def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) ->
     `coarse` are the steps [rad or m] of rounded joint values.
     """
     found = [] if step is None or step.harmful else [str(step)]
-    if coarse:
-        kinds = {joint.name: joint.type for joint in problem.chain.joints}
-        steps = [
-            f'{name} ({1e3 * step:.3g} {"mrad" if kinds[name] == "revolute" else "mm"})'
-            for name, step in coarse.items()
-        ]
-        found.append(
-            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
-        )
+    units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
+    steps = [f'{name} ({1e3 * size:.3g} m{units[name]})' for name, size in coarse.items()]
+    if steps:
+        listed = ', '.join(steps)
+        found.append(f'joint values are multiples of a step: {listed}; record more digits')
     return tuple(found)

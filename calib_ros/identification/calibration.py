@@ -3,13 +3,13 @@
 """A calibration, saved and loaded whole: a chain file with a record of where it comes from.
 
 What it removes at q is the distance between the nominal arm, in fitted frames, and the calibrated
-one. What remains is predicted by the expected squares C of the parameters' errors and by the RMS
-error r on poses that were not fitted,
+one. What remains is predicted by the expected squares C of the parameters' errors, with J the rows
+of position of the error model, and by the RMS error r on poses that were not fitted,
 
     removed(q) = |p_nominal - p|      sigma(q)^2 = tr J C J^T      remaining(q)^2 = sigma^2 + r^2
 
-with J the rows of position of the error model. An arm that is commanded by its nominal model is
-expected to miss by the root of removed^2 + remaining^2, by its calibrated model by `remaining`.
+The arm is expected to miss by the root of removed^2 + remaining^2 if commanded by its nominal
+model, by `remaining` if by its calibrated one.
 """
 
 from __future__ import annotations
@@ -26,13 +26,11 @@ import numpy as np
 import calib_ros
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification import records
-from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import ALIKE
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.region import Region, region_of_record
-from calib_ros.identification.samples import BLOCK
+from calib_ros.identification.region import Region, region_of_record, sigma_of
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
@@ -52,45 +50,31 @@ HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expect
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Shown):
-    """A corrected chain, what it was before, and how well it is known.
-
-    Attributes
-    ----------
-    chain, before : Chain
-        The corrected chain, and the nominal one in fitted frames.
-    names, covariance : tuple of str, (P, P)
-        Parameters that were fitted, and their covariance; none when it is not known.
-    freedom : float
-        Degrees of freedom from which the covariance was estimated.
-    residual : float or None
-        RMS position error [m] on poses that were not fitted; None when it is not known.
-    noise : Noise or None
-        Of the measurements, where it is known.
-    region : Region or None
-        Where the calibration may be used; None when it is not known.
-    world_frame : str
-        Frame in which the poses were measured.
-    owners : mapping
-        Which session, device or target each frame is of (`sampling.sample.Frames`), if known.
-    record : mapping
-        Where the numbers come from, as the file says it, but for the covariance and the rows.
-    rows : Fingerprint or None
-        Of the measurements that were fitted, if they are known.
-
-    """
+    """A corrected chain, what it was before, and how well it is known; None for what is not."""
 
     chain: Chain
     before: Chain
+    """The nominal chain in fitted frames."""
     names: tuple[str, ...] = ()
+    """Parameters that were fitted, (P,)."""
     covariance: FloatArray | None = None
+    """Theirs, (P, P)."""
     freedom: float = np.inf
+    """Degrees of freedom from which it was estimated."""
     residual: float | None = None
+    """RMS position error [m] on poses that were not fitted."""
     noise: Noise | None = None
+    """Of the measurements."""
     region: Region | None = None
+    """Where the calibration may be used."""
     world_frame: str = ''
+    """Frame in which the poses were measured."""
     owners: Mapping[str, records.Owner] = field(default_factory=dict)
+    """Which session, device or target each frame is of (`sampling.sample.Frames`)."""
     record: Mapping[str, Any] = field(default_factory=dict)
-    rows: Fingerprint | None = None
+    """Where the numbers come from, as the file says it, but for the covariance and the rows."""
+    rows: records.Fingerprint | None = None
+    """Of the measurements that were fitted."""
 
     @classmethod
     def of(
@@ -102,10 +86,9 @@ class Calibration(Shown):
     ) -> Calibration:
         """Return that of an identification; `origin` tells of its samples, those `fitted`."""
         before, after = (result.validation or result.fitted).figures
-        region, noise = result.region, result.noise
+        region, noise, owners = result.region, result.noise, owners or {}
         record = {
-            'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-            'software': f'calib_ros {calib_ros.__version__}',
+            **made(),
             'accepted': result.accepted,
             'world_frame': result.world_frame,
             'samples': len(result.fitted.judged),
@@ -115,25 +98,23 @@ class Calibration(Shown):
             'rms_mm_after': round(after.rms_mm, 6),
             'noise_in_sigma': asdict(noise) | {'shared': list(noise.shared)},
             'not_identifiable': list(result.unidentifiable),
-            'table_sha256': table_hash(result.chain),
-            'nominal': records.nominal_document(result.before) | frames_document(result.before),
-            'frames': records.owners_document(owners or {}),
-            'region': None if region is None else region.document(),
+            **about(result.chain, result.before, region),
+            'frames': records.owners_document(owners),
             **(origin or {}),
         }
         return cls(
-            result.chain,
-            result.before,
-            result.names,
-            result.covariance,
-            result.uncertainty.overall,
-            1e-3 * after.rms_mm,
-            noise,
-            region,
-            result.world_frame,
-            owners or {},
-            record,
-            Fingerprint.of(fitted) if fitted else None,
+            chain=result.chain,
+            before=result.before,
+            names=result.names,
+            covariance=result.covariance,
+            freedom=result.uncertainty.overall,
+            residual=1e-3 * after.rms_mm,
+            noise=noise,
+            region=region,
+            world_frame=result.world_frame,
+            owners=owners,
+            record=record,
+            rows=records.Fingerprint.of(fitted) if fitted else None,
         )
 
     def dump(self) -> str:
@@ -163,7 +144,7 @@ class Calibration(Shown):
         """
         if self.region is not None:
             return self.region.sigma(joints)
-        return self._sigma(joints, slice(0, 3))
+        return self._sigma(joints, slice(3))
 
     def sigma_turned(self, joints: FloatArray) -> FloatArray:
         """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
@@ -172,13 +153,7 @@ class Calibration(Shown):
     def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
         if self.covariance is None:
             return np.full(len(joints), np.nan)
-        model = ErrorModel(self.chain, self.names)
-        squares = np.empty(len(joints))
-        for first in range(0, len(joints), BLOCK):
-            part = slice(first, first + BLOCK)
-            rows = model.jacobian(joints[part])[:, components]
-            squares[part] = np.einsum('ncp,pq,ncq->n', rows, self.covariance, rows, optimize=True)
-        return np.sqrt(np.maximum(squares, 0.0))
+        return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
 
     def remaining(self, joints: FloatArray) -> FloatArray:
         """Return the error (N,) [m] expected to remain at (N, n); NaN if not known."""
@@ -232,6 +207,21 @@ class Calibration(Shown):
         )
 
 
+def made() -> dict[str, str]:
+    """Return when and by what a calibration is made, for its record."""
+    now = datetime.now(timezone.utc).isoformat(timespec='seconds')
+    return {'created': now, 'software': f'calib_ros {calib_ros.__version__}'}
+
+
+def about(chain: Chain, before: Chain, region: Region | None) -> dict[str, Any]:
+    """Return of what arms a calibration is, and where it holds, for its record."""
+    return {
+        'table_sha256': table_hash(chain),
+        'nominal': records.nominal_document(before) | frames_document(before),
+        'region': None if region is None else region.document(),
+    }
+
+
 def calibration_file(path: str | os.PathLike[str]) -> Path:
     """Return the file of a calibration, which may be in the folder of an identification."""
     file = Path(path)
@@ -255,9 +245,8 @@ def parse_calibration(
     all that calib_ros writes, and must not speak against a nominal chain that is given; nor may
     the numbers be further from it than `largest_length` and `largest_angle` of the settings allow.
     Without settings the identification has judged that, if it records the numbers of this chain.
-    Without a nominal chain that of the record is taken. What a file of before does not tell is
-    not known, but for the frames of the nominal chain: these are fitted to the corrected one, over
-    the whole range of the joints.
+    Without a nominal chain that of the record is taken; without its frames those that bring it
+    closest to the corrected one.
 
     Raises
     ------
@@ -269,24 +258,23 @@ def parse_calibration(
     chain = parse_chain(text, where)
     if nominal is not None:
         records.check_joints(chain, nominal, where)
-    about = records.parse_record(text, where)
-    if nominal is None:
-        nominal = records.nominal_of(about, chain, where)
-    records.check_nominal(chain, about, nominal, where, settings)
-    before = records.before_of(about, nominal, chain, where)
-    names, covariance, freedom = records.covariance_of(about, chain, where)
-    residual = about.get('rms_mm_after')
+    record = records.Record.parse(text, where)
+    nominal = nominal or record.nominal(chain)
+    record.check(chain, nominal, settings)
+    content = record.content
+    names, covariance, freedom = record.covariance(chain)
+    residual = content.get('rms_mm_after')
     return Calibration(
-        chain,
-        before,
-        names,
-        covariance,
-        freedom,
-        None if residual is None else 1e-3 * residual,
-        records.noise_of(about, where),
-        region_of_record(about, chain, where),
-        about.get('world_frame', ''),
-        records.owners_of(about, where),
-        {key: value for key, value in about.items() if key not in ('covariance', 'rows')},
-        Fingerprint.of_record(about, where),
+        chain=chain,
+        before=record.before(nominal, chain),
+        names=names,
+        covariance=covariance,
+        freedom=freedom,
+        residual=None if residual is None else 1e-3 * residual,
+        noise=record.noise(),
+        region=region_of_record(content, chain, where),
+        world_frame=content.get('world_frame', ''),
+        owners=record.owners(),
+        record={key: value for key, value in content.items() if key not in ('covariance', 'rows')},
+        rows=records.Fingerprint.of_record(content, where),
     )

@@ -7,18 +7,18 @@ matrix A and the vector b = A x^ (A may be singular: some poses determine only s
 Changes that need no explanation, x ~ N(0, K), such as the uncertainty of an earlier calibration,
 are marginalised first:
 
-    A' = A - A R M R^T A        b' = b - A R M R^T b        M = (1 + R^T A R)^-1,  K = R R^T
+    A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
-An explanation states x = G z: one parameter has changed, or all parameters of a joint (a bent
-link), or a frame (the device or the target was moved). Its gain in chi-squared,
+An explanation states x = G z: one parameter has changed, or all of a joint (a bent link) or of a
+frame (the device or the target was moved). It gains of chi-squared, with as many degrees of
+freedom as z,
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
-has as many degrees of freedom as z. A change is claimed if chance, over all explanations tried,
-reaches the gain in at most FALSE of the cases (Bonferroni). Explanations are compared by their
-evidence with z ~ N(0, S), S the typical size of changes, which penalises additional parameters
-(Occam's razor; MacKay 1992). Explanations whose share of the evidence exceeds 1 - CONFIDENT
-cannot be distinguished from the best one.
+A change is claimed if chance, over all explanations tried, gains as much in at most FALSE of the
+cases (Bonferroni). Explanations are compared by their evidence with z ~ N(0, S), S the typical
+size of changes, which penalises additional parameters (MacKay 1992). Those whose share of it
+exceeds 1 - CONFIDENT cannot be distinguished from the best one.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
+from calib_ros.identification.identifiability import followed
 from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
@@ -115,45 +116,38 @@ class Told(Shown):
 
     def beside(self, square: FloatArray) -> Told:
         """Return what is told beside changes that need no explanation, of covariance (P, P)."""
-        root, inverse = self._given(square)
-        shown = self.information @ root
-        left = self.information - shown @ inverse @ shown.T
-        vector = self.vector - shown @ (inverse @ (root.T @ self.vector))
-        return Told(self.names, 0.5 * (left + left.T), vector)
+        mean, covariance = self.mean(square)
+        left = self.information - self.information @ covariance @ self.information
+        return Told(self.names, left, self.vector - self.information @ mean)
 
     def mean(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return mean (P,) and covariance (P, P) of changes that were N(0, square) before."""
-        root, inverse = self._given(square)
-        return root @ (inverse @ (root.T @ self.vector)), root @ inverse @ root.T
-
-    def _given(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return a root R (P, P) of a covariance K, and (1 + R^T A R)^-1."""
         scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
         sizes, directions = linalg.eigh(square / np.outer(scale, scale))
         root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
         inner = np.eye(len(scale)) + root.T @ self.information @ root
         factor = linalg.cholesky(inner, lower=True)
-        inverse = linalg.solve_triangular(factor, np.eye(len(scale)), lower=True)
-        return root, inverse.T @ inverse
+        left = linalg.solve_triangular(factor, root.T, lower=True)
+        return left.T @ (left @ self.vector), left.T @ left
 
-    def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return the gain by changes along columns (P, k), these, and their covariance."""
+    def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
+        """Return the gain by changes along columns (P, k), these, their covariance, its rank."""
         inner = columns.T @ self.information @ columns
         scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
         covariance = scale[:, np.newaxis] * linalg.pinvh(inner * np.outer(scale, scale), rtol=1e-9)
         covariance = covariance * scale
         seen = columns.T @ self.vector
         values = covariance @ seen
-        return float(seen @ values), values, covariance
+        rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
+        return float(seen @ values), values, covariance, rank
 
     def evidence(self, columns: FloatArray, sizes: FloatArray) -> float:
         """Return the logarithm of the evidence of changes along columns (P, k), of sizes (k,)."""
         scaled = columns * sizes
         inner = np.eye(len(sizes)) + scaled.T @ self.information @ scaled
         seen = scaled.T @ self.vector
-        factor = linalg.cho_factor(inner)
-        volume = 2.0 * float(np.log(np.diag(factor[0])).sum())
-        return 0.5 * (float(seen @ linalg.cho_solve(factor, seen)) - volume)
+        gain = float(seen @ np.linalg.solve(inner, seen))
+        return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
 
 
 def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple[Explanation, ...]:
@@ -161,23 +155,15 @@ def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple
 
     `freedom` are the degrees of freedom from which the size of the noise was estimated.
     """
-    sets = columns.sets
-    if not sets:
+    if not columns.sets:
         return ()
-    logs = []
-    for _, names in sets:
-        sizes = np.array([SIZES.get(name.unit, 1.0) for name in names])
-        logs.append(told.evidence(columns.of(names), sizes))
-    shares = np.exp(logs - special.logsumexp(logs))
+    logs = [told.evidence(columns.of(names), _sizes(names)) for _, names in columns.sets]
     found = []
-    for (owner, names), share in zip(sets, shares.tolist(), strict=True):
-        matrix = columns.of(names)
-        gain, values, covariance = told.explained(matrix)
-        inner = matrix.T @ told.information @ matrix
-        rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
+    for (owner, names), share in zip(columns.sets, special.softmax(logs).tolist(), strict=True):
+        gain, change, covariance, rank = told.explained(columns.of(names))
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        chance = min(1.0, len(sets) * chance_of(gain, rank, freedom))
-        found.append(Explanation(owner, names, gain, chance, share, values, sigma))
+        chance = min(1.0, len(logs) * chance_of(gain, rank, freedom))
+        found.append(Explanation(owner, names, gain, chance, share, change, sigma))
     return tuple(sorted(found, key=lambda each: -each.share))
 
 
@@ -187,12 +173,17 @@ def reasons_of(told: Told, columns: Columns, freedom: float) -> tuple[Explanatio
     None where chance explains it as well.
     """
     found = explanations(told, columns, freedom)
-    return likely(found) if min((each.chance for each in found), default=1.0) <= FALSE else ()
+    return likely(found) if any(each.chance <= FALSE for each in found) else ()
 
 
 def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
     """Return the best of some explanations, and those that cannot be told apart from it."""
     return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or tuple(found[:1])
+
+
+def _sizes(names: Sequence[Parameter]) -> FloatArray:
+    """Return the typical sizes (k,) [m, rad] of changes."""
+    return np.array([SIZES.get(name.unit, 1.0) for name in names])
 
 
 class Columns:
@@ -214,24 +205,29 @@ class Columns:
     ) -> None:
         arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
         mapped, left = gauged(chain, names, arm, free=not frames)
-        seen = (left < HALF_THE_DIGITS) & (
-            np.abs(mapped).max(axis=0, initial=0.0) > HALF_THE_DIGITS
-        )
+        shows = np.abs(mapped).max(axis=0, initial=0.0) > HALF_THE_DIGITS
+        seen = shows & (left < HALF_THE_DIGITS)
         self._columns = {n: c for n, c, yes in zip(arm, mapped.T, seen, strict=True) if yes}
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
         for joint in chain.joint_names:
-            own: list[Parameter] = []
-            for name in parameters_of(joint, ORDER):
-                column = self._columns.get(name)
-                if column is not None and not any(_alike(column, self._columns[n]) for n in own):
-                    own.append(name)
+            own = self._unlike(parameters_of(joint, ORDER))
             sets += [(joint, (name,)) for name in own]
-            sets += [(joint, tuple(own))] if len(own) > 1 else []
+            sets += [(joint, own)] if len(own) > 1 else []
         for frame in frames:
-            own = [name for name in parameters_of(frame) if name in self._columns]
-            sets += [(frame, tuple(own))] if own else []
+            own = tuple(name for name in parameters_of(frame) if name in self._columns)
+            sets += [(frame, own)] if own else []
         self.sets = tuple(sets)
+
+    def _unlike(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:
+        """Return which of some parameters show and do not do the same as one before."""
+        units: dict[Parameter, FloatArray] = {}
+        for name in names:
+            if name in self._columns:
+                unit = self._columns[name] / np.linalg.norm(self._columns[name])
+                if all(abs(unit @ other) <= 1.0 - HALF_THE_DIGITS for other in units.values()):
+                    units[name] = unit
+        return tuple(units)
 
     def of(self, names: Sequence[Parameter]) -> FloatArray:
         """Return the columns (P, k) of k parameters."""
@@ -239,18 +235,9 @@ class Columns:
 
     def spread(self, reasons: Sequence[Explanation]) -> FloatArray:
         """Return the covariance (P, P) of changes whose sizes are left to the data."""
-        parts = []
-        for reason in reasons:
-            sizes = [SPREAD * SIZES.get(name.unit, 1.0) for name in reason.names]
-            parts.append(self.of(reason.names) * np.array(sizes))
+        parts = [self.of(each.names) * (SPREAD * _sizes(each.names)) for each in reasons]
         square = np.hstack(parts)
         return np.asarray(square @ square.T)
-
-
-def _alike(first: FloatArray, second: FloatArray) -> bool:
-    """Tell whether two parameters do the same."""
-    size = float(np.linalg.norm(first) * np.linalg.norm(second))
-    return bool(abs(first @ second) > (1.0 - HALF_THE_DIGITS) * size)
 
 
 def gauged(
@@ -264,18 +251,13 @@ def gauged(
     rng = np.random.default_rng(0)
     q = chain.random_joints(SOME_POSES, rng)
     frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
-    columns = list(dict.fromkeys([*frames, *names, *others]))
+    fitted = list(dict.fromkeys([*frames, *names]))
+    columns = list(dict.fromkeys([*fitted, *others]))
     rows = ErrorModel(chain, columns).jacobian(q, rng.choice([-1.0, 1.0], q.shape))
     rows[:, 3:] *= LEVER
     flat = rows.reshape(-1, len(columns))
-    index = {name: k for k, name in enumerate(columns)}
-    fitted = list(dict.fromkeys([*frames, *names]))
-    known = flat[:, [index[name] for name in fitted]]
-    scale = np.linalg.norm(known, axis=0)
-    scale[scale == 0.0] = 1.0  # what moves nothing
-    wanted = flat[:, [index[name] for name in others]]
-    taken = linalg.lstsq(known / scale, wanted, cond=1e-9)[0]
+    known, wanted = flat[:, : len(fitted)], flat[:, [columns.index(name) for name in others]]
+    taken = followed(known, wanted)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
-    left = np.linalg.norm(wanted - known / scale @ taken, axis=0) / size
-    taken /= scale[:, np.newaxis]
+    left = np.linalg.norm(wanted - known @ taken, axis=0) / size
     return taken[[fitted.index(name) for name in names]], left

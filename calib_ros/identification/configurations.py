@@ -32,9 +32,9 @@ def distinct(numbers: NDArray[np.intp]) -> int:
 
 def stops(joints: FloatArray) -> NDArray[np.intp]:
     """Return (N,) the number of the stop at which joint values (N, n) in sequence were taken."""
-    if len(joints) == 0:
-        return np.zeros(0, dtype=np.intp)
-    return np.append(0, np.cumsum(~_still(np.diff(joints, axis=0)))).astype(np.intp)
+    moved = np.zeros(len(joints), dtype=np.intp)
+    moved[1:] = ~_still(np.diff(joints, axis=0))
+    return np.cumsum(moved)
 
 
 def _still(change: FloatArray) -> NDArray[np.bool_]:
@@ -55,12 +55,11 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     number = stops(joints)
     standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
     place = np.concatenate(cos_sin(standing), axis=1)  # which knows no turns
-    close, label = _pairs(place, SCATTER), np.arange(len(standing))
+    close = _pairs(place, SCATTER)
     # what stands still is nearer than visits may scatter
     near = close[_still(standing[close[:, 0]] - standing[close[:, 1]])]
-    if len(near):
-        links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
-        _, label = connected_components(links, directed=False)
+    links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
+    _, label = connected_components(links, directed=False)
     _, first = np.unique(label, return_index=True)
     if np.isin(close, first).all(axis=1).any():
         label = _repeats(place[first])[label]
@@ -77,9 +76,8 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
     apart = np.arange(count)
     if count < TELLING:
         return apart
-    far, near = cKDTree(place).query(
-        place, k=range(2, 2 + min(TELLING, count - 1)), distance_upper_bound=GAP * SCATTER
-    )
+    ranks = range(2, 2 + min(TELLING, count - 1))
+    far, near = cKDTree(place).query(place, k=ranks, distance_upper_bound=GAP * SCATTER)
     first, which = np.nonzero(np.isfinite(far))
     graph = _graph(far[first, which], first, near[first, which], count)
     tree = minimum_spanning_tree(graph).tocoo()

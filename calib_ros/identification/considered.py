@@ -3,13 +3,16 @@
 """Errors that are not fitted but considered: unmodelled effects, and errors of the device.
 
 Effects that an arm may have, and the scale of the device, are columns of the posterior with their
-own sizes (`evidence.py`). Other errors of the device (`device.py`) and rounded joint values have
-known sizes s. Their columns N are eliminated from the products of the other columns A: A^T A
-becomes A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 + s^2 N N^T were the covariance of the
+own sizes (`evidence.py`). Smooth errors of the device, and rounded joint values, have known sizes
+s. Their columns N are eliminated from the products of the other columns A: A^T A becomes
+A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 + s^2 N N^T were the covariance of the
 measurements (Schmidt 1966).
 
-A scale error of the device stretches all lengths alike: positions are linear in all lengths L, so
-its column is the sum of L dp/dL.
+A scale error stretches all lengths L alike; positions are linear in them, so its column is the sum
+of L dp/dL. Axes that are not square, a lens, and misplaced mirrors or markers distort space, as
+arms do. No number of poses averages that out, and held-out poses share it. A device that is
+accurate to its sigma may have all of it in this form: second-order polynomials in the measured
+position, for each coordinate.
 """
 
 from __future__ import annotations
@@ -17,13 +20,15 @@ from __future__ import annotations
 import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations_with_replacement
 
 import numpy as np
 
-from calib_ros.identification.device import bends
+from calib_ros.identification.identifiability import DEGENERATE
 from calib_ros.identification.leastsquares import Normal, System, gram, normal_equations
 from calib_ros.identification.levels import PRINTED, SCALE
 from calib_ros.identification.observations import SOME_POSES
+from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
@@ -70,7 +75,7 @@ def told_of(
         products = known.products.sum(axis=0)
     else:
         few = replace(system.spread(most), prior=None)
-        products = share * _products(chain, columns, few, bends(few.sets) if by_device else ())
+        products = share * _products(chain, columns, few, by_device)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own = [*range(len(columns)), -1]
     products[np.ix_(own, own)] += share * (extra.T @ extra)
@@ -105,10 +110,9 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 
-def _products(
-    chain: Chain, columns: Sequence[str], system: System, fields: Sequence[FloatArray]
-) -> FloatArray:
-    """Return the products of columns, fields (K, c, N) of each set, and the residual."""
+def _products(chain: Chain, columns: Sequence[str], system: System, by_device: bool) -> FloatArray:
+    """Return the products of columns, those of the device if asked, and the residual."""
+    fields = bends(system.sets) if by_device else []
     if not any(map(len, fields)):
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
     size = len(columns)
@@ -124,3 +128,58 @@ def _products(
                 found[np.ix_(own, own)] += gram(rows)
             first = last
     return found
+
+
+def bends(sets: Sequence[Samples]) -> list[FloatArray]:
+    """Return for each set (K, c, N) what its device may do, weighted as the rows of positions.
+
+    Each of the K coefficients has the standard deviation 1, and together they have the sigma of
+    the device in each coordinate (RMS over the samples). Devices have their own; what is measured
+    in sockets, on planes, as distances or pixels has none.
+    """
+    by_device: dict[str, list[int]] = {}
+    for number, samples in enumerate(sets):
+        seen = samples.observations
+        if seen.distances is None and seen.pixels is None and not seen.socket:
+            by_device.setdefault(seen.tool if seen.inverse else seen.base, []).append(number)
+    found = [np.zeros((0, samples.width, samples.count)) for samples in sets]
+    for own in by_device.values():
+        mine = [sets[number] for number in own]
+        weights = [np.ones(s.count) if s.weights is None else s.weights for s in mine]
+        shown = [samples.observations for samples in mine]
+        places = [(each.inverted() if each.inverse else each).positions for each in shown]
+        waves = _polynomials(np.concatenate(places), np.concatenate(weights))
+        ends = np.cumsum([samples.count for samples in mine])[:-1]
+        parts = dict(zip(own, np.split(waves, ends, axis=1), strict=True))
+        for k, samples in enumerate(sets):
+            none = np.zeros((3 * len(waves), samples.width, samples.count))
+            bent = _rows(samples, parts[k]) if k in parts else none
+            found[k] = np.concatenate([found[k], bent])
+    return found
+
+
+def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return (M, N) weighted polynomials of mean square 1 together, orthogonal, of no mean."""
+    total = max(float(weights @ weights), 1.0)
+    centred = places - (weights**2 @ places) / total
+    centred /= max(float(np.sqrt((weights**2 @ centred**2).sum() / total)), DEGENERATE)
+    pairs = combinations_with_replacement(centred.T, 2)
+    terms = [np.ones(len(places)), *centred.T, *(one * other for one, other in pairs)]
+    columns = weights * np.array(terms)
+    basis, factor = np.linalg.qr(columns.T)
+    told = np.abs(np.diag(factor)) > DEGENERATE * np.linalg.norm(columns, axis=1)[: len(factor)]
+    told[0] = False
+    return np.asarray(basis.T[told] * np.sqrt(total / max(told.sum(), 1)))
+
+
+def _rows(samples: Samples, waves: FloatArray) -> FloatArray:
+    """Return (3 M, c, N) rows of weighted polynomials (M, N) along each axis of the device."""
+    seen = samples.observations
+    axes = seen.rotations if seen.inverse else np.eye(3)[np.newaxis]
+    bent = np.einsum('mn,nia->main', waves, np.broadcast_to(axes, (samples.count, 3, 3)))
+    bent = bent.reshape(-1, 3, samples.count)
+    if samples.whitening is None:
+        return np.asarray(bent)
+    covariance = seen.covariances(samples.sigmas)[:, :3, :3]
+    sigma = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3.0))
+    return np.asarray(np.einsum('rsn,psn->prn', samples.whitening[:, :3], sigma * bent))

@@ -8,11 +8,11 @@ freedoms. The difference d of the parameters is tested by d^T C^-1 d with C = C_
 few parameters that may have changed are searched for (`changes.py`). The difference of predicted
 positions, in the best frames, is a quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
-Unmodelled effects appear in both calibrations, and differently if other poses were measured; so do
-smooth errors of a device that was moved (`device.py`). Covariances of noise do not include them;
-expected squares of errors do (`region.py`). A difference that is significant only by the former is
-reported as such. If a calibration held DH parameters at nominal, its fitted parameters contain
-part of their errors, so its expected squares replace its covariance.
+What the models lack, and smooth errors of a device that was moved (`considered.py`), differ if
+other poses were measured. Only expected squares of errors include them (`region.py`): a difference
+that is significant only by the covariances of the noise is reported as such. If a calibration held
+DH parameters at nominal, its fitted ones contain part of their errors, so its expected squares
+replace its covariance.
 """
 
 from __future__ import annotations
@@ -25,20 +25,11 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.errors import InputError
+from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import (
-    FALSE,
-    MOST_CHANGES,
-    Columns,
-    Explanation,
-    Told,
-    gauged,
-    reason_in_words,
-    reasons_document,
-    reasons_of,
-)
+from calib_ros.identification.changes import Columns, Explanation, Told
 from calib_ros.identification.evidence import group_of
-from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.identification.identifiability import followed, structurally_independent
 from calib_ros.identification.levels import CONFIDENT, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import TYPICAL
@@ -76,29 +67,28 @@ class Difference(Shown):
     @property
     def same(self) -> bool:
         """Tell whether nothing has changed as far as is known."""
-        return self.chance > FALSE and not self.changed
+        return self.chance > changes.FALSE and not self.changed
 
     def in_words(self) -> str:
         """Return what is different."""
-        size = (
-            f'{1e3 * self.rms:.3f} mm RMS over the joint range (at most {1e3 * self.limit:.3f} mm)'
-        )
         if self.same:
             return f'unchanged within {1e3 * self.limit:.3f} mm'
-        if self.beyond > FALSE:
+        rms, limit = 1e3 * self.rms, 1e3 * self.limit
+        size = f'{rms:.3f} mm RMS over the joint range (at most {limit:.3f} mm)'
+        if self.beyond > changes.FALSE:
             return (
                 f'different by {size}, which noise does not explain, but smooth errors of the '
                 'device or what the models lack may: measure the same poses from the same place '
                 'to tell'
             )
-        if self.changed and self.unexplained > FALSE:
-            reasons = '; '.join(reason_in_words(each) for each in self.changed)
+        if self.changed and self.unexplained > changes.FALSE:
+            reasons = '; '.join(changes.reason_in_words(each) for each in self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
         return f'many parameters are different, by {size}: identify anew, and look at the robot'
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values; lengths of predictions in mm."""
-        changes = zip(self.names, self.change.tolist(), self.sigma.tolist(), strict=True)
+        rows = zip(self.names, self.change.tolist(), self.sigma.tolist(), strict=True)
         return {
             'same': self.same,
             'words': self.in_words(),
@@ -107,21 +97,18 @@ class Difference(Shown):
             'left_mm': 1e3 * self.left,
             'chance': self.chance,
             'chance_beyond_models': self.beyond,
-            'changed': [reasons_document(each) for each in self.changed],
+            'changed': [changes.reasons_document(each) for each in self.changed],
             'unexplained': self.unexplained,
-            'parameters': {str(n): {'change': x, 'sigma': s} for n, x, s in changes},
+            'parameters': {str(n): {'change': x, 'sigma': s} for n, x, s in rows},
         }
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Return the six parameters that differ by the most sigmas, in words."""
-        order = np.argsort(-np.abs(self.change) / self.sigma)[:6]
-        return tuple(
-            (
-                self.names[k],
-                f'{1e3 * self.change[k]:+.3f} ± {1e3 * self.sigma[k]:.3f} m{self.names[k].unit}',
-            )
-            for k in order
-        )
+        change, sigma = 1e3 * self.change, 1e3 * self.sigma
+        order = np.argsort(-np.abs(change) / sigma)[:6].tolist()
+        names = [self.names[k] for k in order]
+        sizes = [f'{change[k]:+.3f} ± {sigma[k]:.3f} m{self.names[k].unit}' for k in order]
+        return tuple(zip(names, sizes, strict=True))
 
 
 def difference(first: Calibration, second: Calibration) -> Difference:
@@ -139,16 +126,14 @@ def difference(first: Calibration, second: Calibration) -> Difference:
             f'the joints {", ".join(arms[0].joint_names)} ({arms[0].convention}) and '
             f'{", ".join(arms[1].joint_names)} ({arms[1].convention}) are of other robots'
         )
-    for number, each in enumerate((first, second)):
-        if each.covariance is None:
-            raise InputError(
-                f'calibration {number + 1} does not hold the covariance of its parameters: '
-                'identify it again with this version'
-            )
     names, chain, change, left = _in_parameters_of(first, second)
     square, lacking = np.zeros((2, len(names), len(names)))
-    for each in (first, second):
-        assert each.covariance is not None
+    for number, each in enumerate((first, second), 1):
+        if each.covariance is None:
+            raise InputError(
+                f'calibration {number} does not hold the covariance of its parameters: '
+                'identify it again with this version'
+            )
         own = whole = _in_names(each.chain, names, each.names, each.covariance)
         region = each.region
         if region is not None:
@@ -160,18 +145,17 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         lacking += whole
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
-    told = _told(names, change, lacking)
-    beyond = _chance(told, freedom)
     told = _told(names, change, square)
-    chance = _chance(told, freedom)
+    chance, beyond = _chance(told, freedom), _chance(_told(names, change, lacking), freedom)
     changed: list[tuple[Explanation, ...]] = []
-    while len(changed) < MOST_CHANGES and (reasons := reasons_of(told, columns, freedom)):
+    while len(changed) < changes.MOST_CHANGES and (
+        reasons := changes.reasons_of(told, columns, freedom)
+    ):
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
     predicted = _predicted(chain, names)
-    draws = np.random.default_rng(0).multivariate_normal(
-        change, square, 10 * SOME_POSES, method='eigh'
-    )
+    rng = np.random.default_rng(0)
+    draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
     squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)
     return Difference(
         names,
@@ -217,7 +201,7 @@ def _in_names(
     change = np.array([[float(name == other) for other in mine] for name in names])
     others = [k for k, name in enumerate(mine) if name.of_dh and name not in names]
     if others:
-        change[:, others] = gauged(chain, names, [mine[k] for k in others], free=True)[0]
+        change[:, others] = changes.gauged(chain, names, [mine[k] for k in others], free=True)[0]
     whole = change @ square @ change.T
     unknown = np.abs(change).max(axis=1) < HALF_THE_DIGITS
     sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]
@@ -242,6 +226,6 @@ def _predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
     frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
     rows = ErrorModel(chain, [*frames, *names]).jacobian(joints)[:, :3]
     flat = rows.reshape(-1, rows.shape[2])
-    basis = linalg.orth(flat[:, : len(frames)])
-    left = flat[:, len(frames) :] - basis @ (basis.T @ flat[:, len(frames) :])
+    known, wanted = flat[:, : len(frames)], flat[:, len(frames) :]
+    left = wanted - known @ followed(known, wanted)
     return np.asarray(left.T @ left) / len(joints)

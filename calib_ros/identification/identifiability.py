@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 from scipy.linalg import lapack
 
 from calib_ros.kinematics.chain import Chain
@@ -35,22 +34,13 @@ def independent(
 ) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
-    The order of the names is their priority: of the parameters that trade against each other,
-    the last ones are left out (and so stay nominal). With the frames first, theirs are fitted.
-
-    Parameters
-    ----------
-    factor : (P, P)
-        Upper triangular factor of the weighted Jacobian, columns in the order of the names.
-    names : sequence of str
-        Parameters, the most wanted first.
-    frame_tolerance : float
-        Least share of a frame's column; of other columns HALF_THE_DIGITS.
-
+    `factor` (P, P) is the upper triangular one of the weighted Jacobian, with columns in the order
+    of the names, the most wanted first: of the parameters that trade against each other, the last
+    ones are left out (and so stay nominal). So much of a frame's column must be left by those
+    before it, HALF_THE_DIGITS of others.
     """
-    least = np.where(
-        [Parameter(name).kind in FRAME_KINDS for name in names], frame_tolerance, HALF_THE_DIGITS
-    ) * np.linalg.norm(factor, axis=0)
+    frames = [Parameter(name).kind in FRAME_KINDS for name in names]
+    least = np.where(frames, frame_tolerance, HALF_THE_DIGITS) * np.linalg.norm(factor, axis=0)
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
         return tuple(names)  # the diagonal is what is left of each
     basis = np.zeros(factor.shape)
@@ -108,12 +98,10 @@ def structurally_independent(
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
     frames = [name for name in names if chain.owns_frame(name)]
-    anywhere = chain.with_offsets(
-        dict(zip(frames, rng.uniform(0.1, 0.5, len(frames)), strict=True))
-    )
-    approach = rng.choice([-1.0, 1.0], joints.shape)
-    rows = np.zeros((0, len(names)))
-    velocity = rng.normal(size=joints.shape)
+    places = rng.uniform(0.1, 0.5, len(frames))
+    anywhere = chain.with_offsets(dict(zip(frames, places, strict=True)))
+    approach, velocity = rng.choice([-1.0, 1.0], joints.shape), rng.normal(size=joints.shape)
+    rows = []
     for number, kind in enumerate(kinds):
         posed = joints
         if kind.socket or kind.plane:
@@ -131,13 +119,12 @@ def structurally_independent(
             jacobian = np.einsum('nc,ncp->np', line, jacobian[:, :3])
         elif not kind.oriented:
             jacobian = jacobian[:, :3]
-        rows = np.concatenate([rows, jacobian.reshape(-1, len(names))])
+        rows.append(jacobian.reshape(-1, len(names)))
     if extra is not None:
-        rows = np.concatenate([rows, extra(anywhere, names)[0]])
+        rows.append(extra(anywhere, names)[0])
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
-    rows = np.concatenate([rows, np.eye(len(names))[lens]])
-    factor: FloatArray = np.asarray(linalg.qr(rows, mode='r')[0], dtype=float)[: len(names)]
-    return independent(factor, names)
+    rows.append(np.eye(len(names))[lens])
+    return independent(np.asarray(np.linalg.qr(np.concatenate(rows), mode='r')), names)
 
 
 def untold_size(
@@ -176,11 +163,16 @@ def growth(
     every = tuple(dict.fromkeys((*names, *lengths)))
     rows = ErrorModel(chain, every, *ends).jacobian(joints)[:, : 6 if oriented else 3]
     rows = rows.reshape(-1, len(every))
-    reach = np.linalg.norm(rows[:, : len(names)], axis=0)
-    reach[reach == 0.0] = 1.0
     seen = rows[:, [every.index(n) for n in lengths]] @ [*lengths.values()]
-    found = np.linalg.lstsq(rows[:, : len(names)] / reach, seen, rcond=1e-10)[0]
-    return np.asarray(found / reach)
+    return followed(rows[:, : len(names)], seen[:, np.newaxis])[:, 0]
+
+
+def followed(columns: FloatArray, wanted: FloatArray) -> FloatArray:
+    """Return the changes (P, K) of parameters with columns (R, P) nearest to `wanted` (R, K)."""
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0  # what moves nothing
+    found = np.linalg.lstsq(columns / scale, wanted, rcond=1e-9)[0]
+    return np.asarray(found / scale[:, np.newaxis])
 
 
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
@@ -222,14 +214,8 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
 class Uncertainty(Shown):
     """Covariance of the fitted parameters, by source of error.
 
-    Attributes
-    ----------
-    parts : (K, P, P)
-        Share of each source: position, orientation, what was known before.
-    freedom : (K,)
-        Degrees of freedom from which the size of each source was estimated; infinite where it is
-        known.
-
+    `parts` (K, P, P) are the shares of position, orientation, and what was known before; `freedom`
+    (K,) the degrees of freedom from which the size of each was estimated, infinite where known.
     """
 
     parts: FloatArray
@@ -263,16 +249,15 @@ def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dic
     `matrix` (P, P) is the normal matrix of all of them.
     """
     sizes = np.sqrt(np.diag(matrix))
-    seen = np.flatnonzero(sizes > ROUNDING * sizes.max(initial=0.0)).tolist()
-    fitted = [k for k in seen if names[k] in set(kept)]
-    left_out = [k for k in seen if names[k] not in set(kept)]
+    seen = sizes > ROUNDING * sizes.max(initial=0.0)
+    fitted, left_out = (np.flatnonzero(seen & (np.isin(names, kept) == x)) for x in (True, False))
     scaled = matrix[fitted] / sizes[fitted, np.newaxis]
     basis, columns = (scaled[:, part] / sizes[part] for part in (fitted, left_out))
     shares = np.abs(np.linalg.lstsq(basis, columns, rcond=None)[0])
     strong = (shares > DEGENERATE * shares.max(axis=0, initial=0.0)).T
     partners: dict[str, list[str]] = {name: [] for name in names if name not in set(kept)}
-    for k, marks in zip(left_out, strong, strict=True):
-        partners[names[k]] = [names[j] for j, yes in zip(fitted, marks, strict=True) if yes]
+    for k, marks in zip(left_out.tolist(), strong, strict=True):
+        partners[names[k]] = [names[j] for j in fitted[marks].tolist()]
     return partners
 
 
@@ -295,8 +280,7 @@ def observability(factor: FloatArray, poses: int) -> Observability:
     """Return the indices from R (P, P) of the weighted Jacobian of a number of poses."""
     singular = np.asarray(np.linalg.svd(factor, compute_uv=False), dtype=float)
     mean = float(np.exp(np.log(np.maximum(singular, 1e-300)).mean()))
-    rest = {name: float(index) for name, index in indices_of(singular).items()}
-    return Observability(mean / np.sqrt(poses), **rest)
+    return Observability(mean / np.sqrt(poses), *map(float, indices_of(singular).values()))
 
 
 def indices_of(singular: FloatArray) -> dict[str, FloatArray]:
@@ -316,9 +300,6 @@ def correlated(
     """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
     std = np.sqrt(np.diag(matrix))
     correlation = matrix / np.outer(std, std)
-    rows, columns = np.nonzero(np.triu(np.abs(correlation) > threshold, 1))
-    pairs = [
-        (names[i], names[j], float(correlation[i, j]))
-        for i, j in zip(rows.tolist(), columns.tolist(), strict=True)
-    ]
+    strong = np.argwhere(np.triu(np.abs(correlation) > threshold, 1)).tolist()
+    pairs = [(names[i], names[j], float(correlation[i, j])) for i, j in strong]
     return tuple(sorted(pairs, key=lambda pair: -abs(pair[2])))

@@ -10,8 +10,8 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,19 +19,13 @@ from scipy import special
 
 from calib_ros.errors import InputError
 from calib_ros.identification import identifiability, mistakes, suspicions
-from calib_ros.identification.acceptance import Findings, refusals, remarks
+from calib_ros.identification.acceptance import refusals, remarks
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.considered import considered
 from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.fitting import (
-    SOME,
-    Fitted,
-    Simpler,
-    fit,
-    parameter_rows,
-)
-from calib_ros.identification.leastsquares import Fit, System, minimise, normal_equations
+from calib_ros.identification.fitting import SOME, Fitted, Simpler, fit, parameter_rows
+from calib_ros.identification.leastsquares import System, minimise, normal_equations
 from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.misfits import Outlier, arms_own, outliers_of
 from calib_ros.identification.noise import Noise
@@ -51,6 +45,7 @@ from calib_ros.identification.validation import (
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown, as_frame, as_html
@@ -60,85 +55,58 @@ __all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residua
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Shown):
-    """The result; a poor fit is data in it, not an error.
-
-    Attributes
-    ----------
-    chain : Chain
-        Corrected chain with fitted frames.
-    before : Chain
-        Nominal chain with fitted frames.
-    parameters : tuple of ParameterRow
-        Every parameter of the model.
-    names, uncertainty : tuple of str, Uncertainty
-        Fitted parameters and their covariance for the noise found in the residuals.
-    fitted, validation : Comparison
-        Residuals on the fitted pairs and on pairs that were not fitted. The latter is None when
-        there are too few poses to hold any out.
-    validated_by : str
-        How the pairs of `validation` were held out.
-    noise : Noise
-    distances : tuple of (N,)
-        Size of the residuals of each set's samples in units of the usual one (`robust.py`).
-    outliers : tuple of Outlier
-        Samples of gross error; they carry no or little weight in the fit.
-    gauges : dict
-        For each parameter that was left out, the fitted ones that it trades against.
-    observability : Observability
-    rank, iterations : int
-    converged : bool
-    chance : float or None
-        Probability that errors shared by what was measured in succession, as of a drifting
-        tracker, would let the arm's parameters explain as much. None for a target in sockets.
-    refusals : tuple of Reason
-        Rules of acceptance that failed, in words; none when the result is accepted.
-    posterior : Posterior
-        What is known of the arm, effects that the model leaves out included.
-    region : Region or None
-        Where the calibration may be used; None where it may not be used anywhere.
-    weak : tuple of str
-        Parameters that the poses hardly determine, held near their nominal values by a prior of
-        the size that this arm's errors have.
-    verdicts : tuple of Verdict
-        Where the model was chosen: what paid for itself and what did not.
-    step : Step or None
-        What moved while it was measured (`steps.py`).
-    remarks : tuple of str
-        What is suspicious though the figures are good, and what to do (`suspicions.py`).
-    coupled : bool
-        Whether couplings of the wrist that are not fitted explain most of what is left.
-    images : int
-        How many images of a board were fitted.
-
-    """
+    """The result; a poor fit is data in it, not an error."""
 
     chain: Chain
     before: Chain
+    """The nominal chain. Both have fitted frames."""
     parameters: tuple[ParameterRow, ...]
+    """Every parameter of the model."""
     names: tuple[str, ...]
+    """Fitted parameters, (P,)."""
     uncertainty: identifiability.Uncertainty
+    """Their covariance for the noise found in the residuals."""
     fitted: Comparison
+    """Residuals on the fitted pairs."""
     validation: Comparison | None
+    """Residuals on pairs that were not fitted; None where there are too few poses for that."""
     validated_by: str
+    """How these pairs were held out."""
     noise: Noise
     distances: tuple[FloatArray, ...]
+    """Size (N,) of the residuals of each set's samples, in the usual one (`robust.py`)."""
     outliers: tuple[Outlier, ...]
+    """Samples of gross error; they carry no or little weight in the fit."""
     gauges: dict[str, list[str]]
+    """For each parameter that was left out, the fitted ones that it trades against."""
     observability: identifiability.Observability
     priors: dict[str, float]
+    """Standard deviations [m, rad] that were known before."""
     world_frame: str
     iterations: int
     converged: bool
     chance: float | None
+    """Probability that errors shared by what was measured in succession, as of a drifting tracker,
+    would let the arm's parameters explain as much. None for a target in sockets."""
     refusals: tuple[Reason, ...]
+    """Rules of acceptance that failed, in words; none when the result is accepted."""
     posterior: Posterior
+    """What is known of the arm, effects that the model leaves out included."""
     region: Region | None
+    """Where the calibration may be used; None where it may not be used anywhere."""
     weak: tuple[str, ...] = ()
+    """Parameters that the poses hardly determine, held near their nominal values by a prior of the
+    size that this arm's errors have."""
     verdicts: tuple[effects.Verdict, ...] = ()
+    """Where the model was chosen: what paid for itself and what did not."""
     step: Step | None = None
+    """What moved while it was measured (`steps.py`)."""
     remarks: tuple[str, ...] = ()
+    """What is suspicious though the figures are good, and what to do (`suspicions.py`)."""
     coupled: bool = False
+    """Whether couplings of the wrist that are not fitted explain most of what is left."""
     images: int = 0
+    """How many images of a board were fitted."""
 
     @property
     def accepted(self) -> bool:
@@ -159,6 +127,11 @@ class Identification(Shown):
     def unidentifiable(self) -> tuple[str, ...]:
         """Return the parameters that were free but could not be determined."""
         return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))
+
+    @property
+    def not_excited(self) -> tuple[Parameter, ...]:
+        """Return those of them that other poses would determine."""
+        return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
     def pose_covariance(self, q: FloatArray) -> FloatArray:
         """Return the expected squares (N, 6, 6) [m, rad] of errors of the pose at q (N, n).
@@ -193,7 +166,7 @@ class Identification(Shown):
         return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
 
     def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
-        """Return the pairs of parameters whose correlation exceeds a threshold."""
+        """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
         return identifiability.correlated(self.covariance, self.names, threshold)
 
     def to_frame(self) -> Any:
@@ -224,11 +197,6 @@ class Identification(Shown):
         verdict = 'accepted' if self.accepted else 'not accepted'
         notes = (figures, *self.refusals, *self.remarks)
         return as_html(f'{self.chain.name}: {verdict}', notes, rows)
-
-    @property
-    def not_excited(self) -> tuple[str, ...]:
-        """Return those of them that other poses would determine."""
-        return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
 
 def identify(
@@ -273,7 +241,7 @@ def _identified(
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     posterior = fitted.posterior(size, considered(chain, names, problem.fixed), doubts)
-    found = _findings(fitted, before, posterior, validation, parameters, coarse)
+    step = find_step(problem, names, robust)
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -291,44 +259,23 @@ def _identified(
         priors=_priors(problem),
         world_frame=problem.world_frame,
         iterations=robust.iterations,
-        converged=found.converged,
-        chance=found.chance,
-        refusals=refusals(problem, found),
+        converged=before.converged and robust.fit.converged and robust.settled,
+        chance=_chance(problem, before.chain, names, robust),
+        refusals=(),
         posterior=posterior,
-        region=found.region,
+        region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
         weak=_weak(problem, parameters),
-        step=found.step,
-        remarks=remarks(problem, found.step, coarse),
+        step=step,
+        remarks=remarks(problem, step, coarse),
         coupled=share > 0.0,
         images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
+    own_behaviour = None if step else arms_own(problem, robust)
+    rounding = may_be_rounding(problem, before.chain, names, coarse, robust.good)
+    refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None)
+    result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
     return suspicions.remarked(problem, named, another=named is result)
-
-
-def _findings(
-    fitted: Fitted,
-    before: Fit,
-    posterior: Posterior,
-    validation: Comparison | None,
-    parameters: Sequence[ParameterRow],
-    coarse: Mapping[str, float],
-) -> Findings:
-    """Return what the rules of acceptance go by; `coarse` are the steps of rounded joints."""
-    problem, robust, names = fitted.problem, fitted.robust, fitted.names
-    step = find_step(problem, names, robust)
-    return Findings(
-        converged=before.converged and robust.fit.converged and robust.settled,
-        parameters=parameters,
-        validation=validation,
-        chance=_chance(problem, before.chain, names, robust),
-        region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
-        step=step,
-        own_behaviour=None if step else arms_own(problem, robust),
-        may_be_rounding=bool(coarse)
-        and may_be_rounding(problem, before.chain, names, coarse, robust.good),
-        sized=fitted.held is None,
-    )
 
 
 def _size(fitted: Fitted, explained: float) -> float:
@@ -370,15 +317,9 @@ def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ..
     """Return the DH parameters that the poses tell less of than what is known of other arms."""
     if problem.learned is None:
         return ()
-    known, learned = {*dict(problem.model.effects), *problem.given}, problem.learned.priors
-    return tuple(
-        p.name
-        for p in parameters
-        if p.std is not None
-        and p.name in learned
-        and p.name not in known
-        and p.std**2 > 0.5 * learned[p.name] ** 2
-    )
+    learned = {n: x for n, x in problem.learned.priors.items() if n not in _priors(problem)}
+    stds = [(p.name, p.std) for p in parameters if p.std is not None and p.name in learned]
+    return tuple(name for name, std in stds if std**2 > 0.5 * learned[name] ** 2)
 
 
 def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, list[str]]:

@@ -3,12 +3,9 @@
 """Are the outliers of a robust fit gross errors, or the arm's own behaviour?
 
 Errors of a device occur anywhere, errors of an arm follow its joint values. So outliers are the
-arm's own behaviour if
-
-- a joint hardly moves except in them,
-- all targets seen at a stop are off there, more often than by chance,
-- they follow the values of a joint. Shifted in time against the joint values, as in `drift.py`,
-  outliers of a device do so as well, even if they occur in a row.
+arm's own behaviour if a joint hardly moves except in them; if all targets seen at a stop are off
+there, more often than by chance; or if they follow the values of a joint. Outliers of a device do
+so as well when they are shifted in time against these, as in `drift.py`, even if in a row.
 """
 
 from __future__ import annotations
@@ -49,24 +46,23 @@ def outliers_of(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
     """Return the samples that a robust fit has given up."""
     if problem.loss == 'none':
         return ()
-    found = []
-    for number, (each, distances) in enumerate(zip(problem.sets, robust.distances, strict=True)):
-        for sample in np.flatnonzero(distances > OUTLIER):
-            stamp = int(each.stamps_ns[sample])
-            found.append(Outlier(number, int(sample), stamp, float(distances[sample])))
-    return tuple(found)
+    return tuple(
+        Outlier(number, k, int(each.stamps_ns[k]), float(distances[k]))
+        for number, (each, distances) in enumerate(
+            zip(problem.sets, robust.distances, strict=True)
+        )
+        for k in np.flatnonzero(distances > OUTLIER).tolist()
+    )
 
 
 def arms_own(problem: Problem, robust: Robust) -> str | None:
     """Return in words why outliers look like the arm's own behaviour, None where they do not."""
     if not robust.outliers.any() or any(each.socket for each in problem.sets):
         return None
-    joints = np.concatenate([each.joints for each in problem.sets])
-    names = problem.chain.joint_names
+    joints, kept = np.concatenate([each.joints for each in problem.sets]), ~robust.outliers
     whole = np.ptp(joints, axis=0)
-    kept = joints[~robust.outliers]
-    left = np.ptp(kept, axis=0) if len(kept) else np.zeros(len(names))
-    for name, part, all_of_it in zip(names, left, whole, strict=True):
+    left = np.ptp(joints[kept], axis=0) if kept.any() else 0.0 * whole
+    for name, part, all_of_it in zip(problem.chain.joint_names, left, whole, strict=True):
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
             return f'{name} moves only in poses that were taken for gross errors: {ADVICE}'
     shared, by_chance = _shared(problem, robust)
@@ -84,17 +80,16 @@ def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
     count = 1 + max(int(each.max()) for each in problem.configurations)
     targets = dict.fromkeys(each.tool for each in problem.sets)
     seen, off = np.zeros((2, len(targets), count))
-    for each, numbers, far in zip(
-        problem.sets, problem.configurations, robust.distances, strict=True
-    ):
+    sets = zip(problem.sets, problem.configurations, robust.distances, strict=True)
+    for each, numbers, far in sets:
         row = list(targets).index(each.tool)
         seen[row] += np.bincount(numbers, minlength=count)
         off[row] += np.bincount(numbers, far > OUTLIER, count)
-    several = (seen > 0).sum(axis=0) > 1
-    wrong = (off > 0.5 * seen) & (seen > 0)
-    both = several & (wrong == (seen > 0)).all(axis=0)
-    rates = wrong.sum(axis=1) / np.maximum((seen > 0).sum(axis=1), 1)
-    expected = np.prod(np.where(seen > 0, rates[:, np.newaxis], 1.0), axis=0)[several].sum()
+    there, wrong = seen > 0, off > 0.5 * seen
+    several = there.sum(axis=0) > 1
+    both = several & (wrong == there).all(axis=0)
+    rates = wrong.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+    expected = np.prod(np.where(there, rates[:, np.newaxis], 1.0), axis=0)[several].sum()
     found = int(both.sum())
     return found, float(special.gammainc(found, expected)) if found else 1.0
 

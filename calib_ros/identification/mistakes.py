@@ -3,21 +3,22 @@
 """The usual mistakes, tried out: units, conventions, joints, the wrong arm. Never corrected.
 
 If the nominal arm misses the measurements by more than faulty arms do, each suspected mistake is
-undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`).
-The best few are refined by least squares. A mistake is named if undoing it reduces the typical
-error below NEARER times the original and to a level that faulty arms have; mistakes that explain
-nearly as much are named with it. If none does, the positions are tried without the orientations,
-then several mistakes at once.
+undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`);
+the best few are refined by least squares. A mistake is named if undoing it reduces the typical
+error below NEARER times the original and to a level that faulty arms have; so are those that
+explain nearly as much. If none does, the positions are tried without the orientations, then
+several mistakes at once.
 
-The typical error is the median over the samples of the distance and the angle times LEVER, in
-units of the spread of the positions. Mistakes without effect cannot be detected: the zero of the
-first joint is a rotation of the base, that of the last joint one of the tool.
+The typical error is the median over the samples of the distance and the angle times LEVER.
+Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
+that of the last joint one of the tool.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,14 +31,12 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.start import closed_forms
+from calib_ros.identification.start import closed_forms, movable
 from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
-from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
@@ -71,15 +70,12 @@ class Explained:
 
 
 def remarked(problem: Problem, result: Identification) -> Identification:
-    """Return the result with the mistake that explains its errors, if there are such.
+    """Return the result with the mistake that explains its errors, if there is one.
 
-    It stands first among the refusals, to which measurements that are not what they should be
-    belong; another arm, and orientations that do not fit, are a remark where the result is not
-    refused.
+    It is the first of the refusals; but another arm, and orientations that do not fit, are only
+    remarked on where nothing else refuses the result.
     """
-    if not _suspicious(problem, result):
-        return result
-    found = explained(problem)
+    found = explained(problem) if _suspicious(problem, result) else None
     if found is None:
         return result
     if result.refusals or found.alone:
@@ -95,9 +91,9 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     if not result.converged or (not result.refusals and result.coupled):
         return True
     judged = result.validation or result.fitted
-    for each in (judged.before, judged.after, result.fitted.before):
-        turns = each.orientation[~np.isnan(each.orientation[:, 0])]
-        if _rms(each.position) > problem.largest_error or _rms(turns) > problem.largest_angle:
+    for each in (*judged.figures_of_all, result.fitted.figures_of_all[0]):
+        error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
+        if error > problem.largest_error or angle > problem.largest_angle:
             return True
     if judged.outliers > MOST_OUTLIERS * len(judged.judged):
         return True
@@ -105,109 +101,106 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     return any(each.beyond(*limits) for each in result.parameters)
 
 
-def _rms(vectors: FloatArray) -> float:
-    return float(np.sqrt((vectors**2).sum() / max(len(vectors), 1)))
-
-
 def explained(problem: Problem) -> Explained | None:
     """Return what explains the measurements much better than what was given, if anything does."""
-    sets = tuple(e for e in problem.sets if e.distances is None)
-    of_images = any(each.pixels is not None for each in sets)
-    if of_images:
-        sets = tuple(_as_poses(problem, e) for e in sets if e.pixels is not None)
+    sets = tuple(
+        _as_poses(problem, each)
+        for each in problem.sets
+        if each.distances is None and _of_images(problem) == (each.pixels is not None)
+    )
     if not sets or max(map(len, sets)) < 6:
         return None  # base and tool alone explain nearly all of them
     if not any(each.socket for each in sets):
         sets = (max(sets, key=len),)
-    chain = replace(
-        problem.chain, base=_known(problem.chain.base), tool=_known(problem.chain.tool)
+    base, tool = (
+        frame if frame is not None and frame.fixed else None
+        for frame in (problem.chain.base, problem.chain.tool)
     )
-    few = tuple(map(_few, sets))
-    given = _tried(chain, few)
+    chain = replace(problem.chain, base=base, tool=tool)
+    given = _tried(chain, tuple(each.spread() for each in sets))
     if given is None:
         return None
+    given = _polished(problem, given)
     found = (
-        _named(problem, chain, sets, few, given)
+        _named(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
-        or _several(problem, chain, few, given)
+        or _several(problem, chain, given)
     )
     if found is None or not problem.of_messages:
         return found
     return replace(found, suspects=tuple(replace(e, remedy=e.published) for e in found.suspects))
 
 
-def _named(
-    problem: Problem, chain: Chain, sets: Sets, few: Sets, given: _Trial
-) -> Explained | None:
+def _of_images(problem: Problem) -> bool:
+    return any(each.pixels is not None for each in problem.sets)
+
+
+def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
     """Return the mistakes that explain nearly the most, up to three, if they explain enough."""
-    of_images = any(each.pixels is not None for each in problem.sets)
-    rough = []
-    for k, each in enumerate(suspects(chain, few, of_images)):
-        whole = [_moved(problem, one, each.rows) for one in sets] if each.rows else few
-        found = _tried(each.chain or chain, tuple(map(each.change, map(_few, whole))))
+    rough, tried = [], []
+    for each in suspects(chain, given.sets, _of_images(problem)):
+        few = given.sets
+        if each.rows:
+            few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
+        found = _tried(each.chain or chain, each.undone(few))
         if found is not None and found.share < given.share:
-            rough.append((found.share, k, each, found))
-    largest = problem.largest_error + LEVER * problem.largest_angle / 3.0
-    tried = []
-    for _, k, each, found in sorted(rough, key=lambda one: one[:2])[:POLISHED]:
+            rough.append((found, each))
+    for found, each in sorted(rough, key=lambda one: one[0].share)[:POLISHED]:
         so = _polished(problem, found)
-        if so.error <= largest:  # an arm in mm fits places in mm, and is off by metres
-            tried.append((so.share, k, each, so))
+        if so.error <= _largest(problem):  # an arm in mm fits places in mm, and is off by metres
+            tried.append((so.share, so, each))
     if not tried:
         return None
-    tried.sort(key=lambda one: one[:2])
-    best = tried[0][3]
-    given = min(given, _polished(problem, given), key=lambda one: one.share)
-    if best.error > NEARER * given.error:
+    tried.sort(key=lambda one: one[0])
+    least, best, _ = tried[0]
+    if best.error > NEARER * given.error or least > NEARER * min(given.share, 1.0):
         return None
-    if best.share > NEARER * min(given.share, 1.0):
-        return None
-    named = [each for share, _, each, _ in tried if share <= ALIKE * best.share]
+    named = [each for share, _, each in tried if share <= ALIKE * least]
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
-    named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
+    named += [each for share, _, each in tried if ALIKE * least < share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
     return Explained(tuple(unlike.values())[:3], given.error, best.error)
 
 
+def _largest(problem: Problem) -> float:
+    """Return the typical error [m] beyond which an arm is not a faulty one."""
+    return problem.largest_error + LEVER * problem.largest_angle / 3.0
+
+
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
     """Return that the orientations are wrong, if the arm, or a mistake, explains the positions."""
-    of_images = any(each.pixels is not None for each in problem.sets)
-    if of_images or not all(e.oriented.all() and not (e.socket or e.inverse) for e in sets):
+    whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
+    if _of_images(problem) or not whole:
         return None
     alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
-    few = tuple(map(_few, alone))
-    start = _tried(chain, few)
+    start = _tried(chain, tuple(each.spread() for each in alone))
     if start is None:
         return None
     so = _polished(problem, start)
-    given = min(given, _polished(problem, given), key=lambda one: one.share)
     if so.error <= min(problem.largest_error, NEARER * given.error):
         known = so.error + LEVER * problem.sigma_orientation
         enough = known < NEARER * given.error
         return Explained((ORIENTATIONS,), given.error, so.error) if enough else None
-    found = _named(problem, chain, alone, few, start)
+    found = _named(problem, chain, alone, so)
     if found is None or len(found.suspects) > 1:
         return None
     what = f'{found.suspects[0].what}, and the orientations do not fit either'
     return replace(found, suspects=(replace(found.suspects[0], what=what),))
 
 
-def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explained | None:
+def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
     """Return mistakes that were made at once, each of which explains a part of the errors.
 
     The best few are kept and another one is added to each, until the arm explains the rest, or
     one more is no better. One alone may be no better: two can hide each other.
     """
-    given = min(given, _polished(problem, given), key=lambda one: one.share)
     if given.error <= problem.largest_error:
         return None
-    of_images = any(each.pixels is not None for each in problem.sets)
-    options = [each for each in suspects(chain, few, of_images) if each.part]
-    largest = min(
-        problem.largest_error + LEVER * problem.largest_angle / 3.0, NEARER * given.error
-    )
-    share, least = NEARER * min(given.share, 1.0), given.share
+    few = given.sets
+    options = [each for each in suspects(chain, few, _of_images(problem)) if each.part]
+    largest, share = min(_largest(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
+    least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
     for _ in range(MOST_AT_ONCE):
         found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
@@ -215,7 +208,7 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
             for each in options:
                 if each.part not in {one.part for one in some}:
                     more = tuple(sorted((*some, each), key=lambda one: one.part != 'measured'))
-                    trial = _tried(chain, _undone(more, few))
+                    trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
                     if trial is not None:  # others may be the same in other words
                         found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:POLISHED]]
@@ -229,28 +222,15 @@ def _several(problem: Problem, chain: Chain, few: Sets, given: _Trial) -> Explai
     return None
 
 
-def _undone(mistakes: Sequence[Suspect], sets: Sets) -> Sets:
-    for each in mistakes:
-        sets = tuple(map(each.change, sets))
-    return sets
-
-
 def _together(mistakes: Sequence[Suspect]) -> Suspect:
     """Return several mistakes as one."""
-    remedies = [
-        (each.what, each.remedy if each.part == 'measured' else each.published, each.published)
-        for each in mistakes
+    published = [f'{each.what} ({each.published})' for each in mistakes]
+    of_tables = [
+        f'{each.what} ({each.remedy})' if each.part == 'measured' else said
+        for each, said in zip(mistakes, published, strict=True)
     ]
-    return replace(
-        mistakes[0],
-        what='several mistakes at once',
-        remedy='; '.join(f'{what} ({remedy})' for what, remedy, _ in remedies),
-        published='; '.join(f'{what} ({published})' for what, _, published in remedies),
-    )
-
-
-def _known(frame: Frame | None) -> Frame | None:
-    return frame if frame is not None and frame.fixed else None
+    what = 'several mistakes at once'
+    return Suspect(what, '; '.join(of_tables), published='; '.join(published))
 
 
 def _as_poses(problem: Problem, each: Observations) -> Observations:
@@ -260,94 +240,76 @@ def _as_poses(problem: Problem, each: Observations) -> Observations:
     return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
 
 
-def _few(observations: Observations) -> Observations:
-    return observations.spread()
-
-
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A chain with its frames for some samples, and their typical error [m].
+    """A chain with its frames for some samples, and the spread of the positions [m].
 
-    `share` is the error in units of the spread of the positions, of the flange or measured, which
-    is less: with metres taken for millimetres, or radians for degrees, every error is small.
+    That of the flange or measured, which is less: with metres taken for millimetres, or radians
+    for degrees, every error is small.
     """
 
     chain: Chain
     sets: Sets
-    error: float
-    share: float
+    spread: float = 1.0
+
+    @cached_property
+    def error(self) -> float:
+        """Return the median of the samples' errors [m]."""
+        sizes = []
+        for each in self.sets:
+            found = self.chain.forward(each.joints, base=each.base, tool=each.tool)
+            away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
+            if each.oriented.any():
+                turns = se3.angles_between(found[:, :3, :3], each.rotations)
+                away = away + LEVER * np.where(each.oriented, turns, 0.0)
+            sizes.append(away)
+        return float(np.median(np.concatenate(sizes)))
+
+    @property
+    def share(self) -> float:
+        """Return the error in units of the spread."""
+        return self.error / max(self.spread, 1e-9)
 
 
 def _tried(chain: Chain, sets: Sets) -> _Trial | None:
     """Return the chain with its frames for some samples in closed form, set by set."""
     spreads = []
     for each in sets:
-        best: tuple[float, Chain] | None = None
-        alone = (replace(each, base='base', tool='tool'),)
-        for start in closed_forms(chain, alone[0]):
-            error = _error(start, alone)
-            if np.isfinite(error) and (best is None or error < best[0]):
-                best = error, start
-        if best is None:
+        alone = replace(each, base='base', tool='tool')
+        starts = [_Trial(start, (alone,)) for start in closed_forms(chain, alone)]
+        starts = [start for start in starts if np.isfinite(start.error)]
+        if not starts:
             return None
-        bare = replace(best[1], base=None, tool=None).forward(each.joints)[:, :3, 3]
+        best = min(starts, key=lambda start: start.error).chain
+        bare = replace(best, base=None, tool=None).forward(each.joints)[:, :3, 3]
         seen = bare if each.socket else each.positions  # in sockets there is no measured place
         spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (bare, seen)))
-        chain = chain.with_frame(each.base, best[1].frame('base'))
-        chain = chain.with_frame(each.tool, best[1].frame('tool'))
-    return _trial(chain, sets, float(np.median(spreads)))
-
-
-def _trial(chain: Chain, sets: Sets, spread: float) -> _Trial:
-    error = _error(chain, sets)
-    return _Trial(chain, sets, error, error / max(spread, 1e-9))
+        chain = chain.with_frame(each.base, best.frame('base'))
+        chain = chain.with_frame(each.tool, best.frame('tool'))
+    return _Trial(chain, sets, float(np.median(spreads)))
 
 
 def _polished(problem: Problem, trial: _Trial) -> _Trial:
     """Return a trial with its frames by least squares."""
     chain, sets = trial.chain, trial.sets
-    samples = [Samples(each, problem.sigma_position, problem.sigma_orientation) for each in sets]
-    system = System(tuple(samples))
-    frames = dict.fromkeys(name for each in sets for name in (each.base, each.tool))
+    sigmas = problem.sigma_position, problem.sigma_orientation
+    system = System(tuple(Samples(each, *sigmas) for each in sets))
     sockets = {each.base for each in sets if each.socket}
-    names = [
-        name
-        for frame in frames
-        if not chain.frame(frame).fixed
-        for name in parameters_of(frame)
-        if name.is_length or frame not in sockets
-    ]
+    every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
+    names = [name for name in every if name.is_length or name.owner not in sockets]
     known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
-    spread = trial.error / trial.share if trial.share > 0.0 else np.inf
-    return min(trial, _trial(fitted, sets, spread), key=lambda one: one.error)
-
-
-def _error(chain: Chain, sets: Sets) -> float:
-    """Return the median of the samples' errors [m]."""
-    sizes = []
-    for each in sets:
-        found = chain.forward(each.joints, base=each.base, tool=each.tool)
-        away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
-        if each.oriented.any():
-            turns = se3.angles_between(found[:, :3, :3], each.rotations)
-            away = away + LEVER * np.where(each.oriented, turns, 0.0)
-        sizes.append(away)
-    return float(np.median(np.concatenate(sizes)))
+    return min(trial, _Trial(fitted, sets, trial.spread), key=lambda one: one.error)
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     """Return each measurement with the joint values so many rows below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
-    same = [_as_poses(problem, e) for e in same]
-    parts = [replace(e, covariance=None) for e in (each, *same) if e.distances is None]
+    parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
-    here = slice(max(0, -rows), len(order) - max(0, rows))
-    there = slice(max(0, rows), len(order) - max(0, -rows))
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(e, name) for e in parts])[
-            order[there if name == 'joints' else here]
-        ]
-        for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented')
-    }
+    here, there = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
+    joined: dict[str, Any] = {}
+    for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented'):
+        ordered = np.concatenate([getattr(e, name) for e in parts])[order]
+        joined[name] = ordered[there if name == 'joints' else here]
     return Observations(**joined, base=each.base, tool=each.tool, socket=each.socket)

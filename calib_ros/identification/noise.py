@@ -58,26 +58,20 @@ def noise_of(
     """
     plain = identifiability.covariance(factor)
     taken = np.array([float(np.sum(plain * part)) for part in fit.normal.parts])
-    sums, counts, joint_sums, joint_counts = _squares(fit.chain, system)
+    squares = _squares(fit.chain, system)
     if not fit.normal.parts[1].any():  # whitened as a whole, or no orientation
-        sums, counts, joint_sums, joint_counts = (
-            np.array([each.sum(), 0.0]) for each in (sums, counts, joint_sums, joint_counts)
-        )
+        squares = np.column_stack([squares.sum(axis=1), np.zeros(4)])
+    sums, counts, joint_sums, joint_counts = squares
     freedom = counts - taken
     known = freedom > 1e-9
     variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
     beyond = 0.5 * (1.0 - SURE)
     low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
-    neighbours = shared_errors(fit, names, system)
-    noise = Noise(
-        float(np.sqrt(variances[0])),
-        float(np.sqrt(variances[1])) if known[1] else None,
-        consistent,
-        neighbours.successive,
-        neighbours.near,
-        neighbours.found,
-    )
+    position, orientation = np.sqrt(variances).tolist()
+    orientation = orientation if known[1] else None
+    by = shared_errors(fit, names, system)
+    noise = Noise(position, orientation, consistent, by.successive, by.near, by.found)
     together = joint_sums / np.maximum(sums, 1e-300)
     alone = np.maximum(variances, 1.0) if consistent else variances
     sizes = np.where(together > SUSPICIOUS, together, 1.0) * alone
@@ -85,8 +79,7 @@ def noise_of(
     extra, _ = system.extra_rows(fit.chain, names)
     if system.prior is not None:
         extra[: len(names)] *= system.prior.noise
-    alike = neighbours.middles
-    estimated = np.array([not consistent or sizes[k] != 1.0 or k in alike for k in (0, 1)])
+    estimated = np.array([not consistent or sizes[k] != 1.0 or k in by.middles for k in (0, 1)])
     seen = np.where(together > SUSPICIOUS, joint_counts, counts)
     freedom = np.maximum(seen - taken, 1.0)
     freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
@@ -97,8 +90,8 @@ def noise_of(
         sources = (*by_part, extra.T @ extra)
         return np.array([identifiability.covariance(factor, middle) for middle in sources])
 
-    covariance = covariances([alike.get(k, middle) for k, middle in enumerate(middles)])
-    if alike:
+    covariance = covariances([by.middles.get(k, middle) for k, middle in enumerate(middles)])
+    if by.middles:
         alone = np.diag(covariances(middles).sum(axis=0))
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
@@ -106,15 +99,14 @@ def noise_of(
     return replace(noise, size=size), Uncertainty(covariance, freedom)
 
 
-def _squares(
-    chain: Chain, system: System
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return by part (2,) the sums of squared residuals and their numbers, and both of the sums.
+def _squares(chain: Chain, system: System) -> FloatArray:
+    """Return by part (4, 2) the sums of squared residuals, their numbers, and both of the sums.
 
     The latter are over the pairs of each configuration: if its pairs share no error, the squares
     of the sums add up to as much as the squares.
     """
-    sums, counts, joint_sums, joint_counts = np.zeros((4, 2))
+    found = np.zeros((4, 2))
+    sums, counts, joint_sums, joint_counts = found  # views
     for samples in system.sets:
         for k, part in enumerate(samples.whitened_residuals(chain)):
             weights = np.ones(len(part)) if samples.weights is None else samples.weights**2
@@ -125,4 +117,4 @@ def _squares(
             weighted = np.sqrt(weights[known]) * part[known].T
             joint_sums[k] += sum((np.bincount(groups, row) ** 2).sum() for row in weighted)
             joint_counts[k] += part.shape[1] * np.count_nonzero(np.bincount(groups))
-    return sums, counts, joint_sums, joint_counts
+    return found

@@ -19,19 +19,12 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
-    'stamps_ns': (),
-    'joints': (None,),
-    'positions': (3,),
+    **dict.fromkeys(('stamps_ns', 'oriented', 'distances', 'delay'), ()),
+    **dict.fromkeys(('joints', 'approach', 'velocity', 'acceleration'), (None,)),
+    **dict.fromkeys(('positions', 'points'), (3,)),
     'rotations': (3, 3),
-    'oriented': (),
     'covariance': (6, 6),
-    'approach': (None,),
-    'distances': (),
-    'velocity': (None,),
-    'acceleration': (None,),
-    'delay': (),
     'pixels': (2,),
-    'points': (3,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
 SOME_POSES = 200
@@ -46,12 +39,10 @@ class Observations(Shown):
     ----------
     stamps_ns : (N,) int64
     joints : (N, n) [rad or m]
-    positions : (N, 3) [m]
+    positions, rotations : (N, 3) [m], (N, 3, 3)
         Of the target in the measuring device's frame, the world.
-    rotations : (N, 3, 3)
-        Of the target in the world; the identity where none was measured.
     oriented : (N,) bool
-        True where the orientation was measured.
+        True where the orientation was measured; elsewhere the rotation is the identity.
     covariance : (N, 6, 6), optional
         Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
         PoseWithCovariance; NaN rows where the measurement brought none.
@@ -170,8 +161,8 @@ class Observations(Shown):
     @classmethod
     def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
         """Make observations (N) of a point at the tool that touched one plane."""
-        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         heights = np.zeros(len(joints))
+        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
     def select(self, mask: NDArray[np.generic] | slice) -> Observations:
@@ -210,10 +201,8 @@ class Observations(Shown):
         positions = -np.einsum('nij,nj->ni', turned, self.positions)
         covariance = self.covariance if sigmas is None else self.covariances(sigmas)
         if covariance is not None:
-            jacobian = np.zeros((len(self), 6, 6))
-            jacobian[:, :3, :3] = -turned
-            jacobian[:, :3, 3:] = -turned @ se3.skew(self.positions)
-            jacobian[:, 3:, 3:] = -turned
+            lever, none = turned @ se3.skew(self.positions), np.zeros_like(turned)
+            jacobian = -np.block([[turned, lever], [none, turned]])
             covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
         return replace(
             self,
@@ -248,18 +237,15 @@ class Observations(Shown):
         """
         if self.velocity is None or delay is None:
             return self
-        more = np.full((len(self), 1), delay)
-        if self.delay is not None:
-            more -= self.delay[:, np.newaxis]
+        delays = np.full(len(self), float(delay))
+        more = (delays if self.delay is None else delays - self.delay)[:, np.newaxis]
         if not more.any():
             return self
         velocity, joints = self.velocity, self.joints - more * self.velocity
         if self.acceleration is not None:
             joints = joints + 0.5 * more**2 * self.acceleration
             velocity = velocity - more * self.acceleration
-        return replace(
-            self, joints=joints, velocity=velocity, delay=np.full(len(self), float(delay))
-        )
+        return replace(self, joints=joints, velocity=velocity, delay=delays)
 
     @property
     def camera(self) -> str:
@@ -269,11 +255,10 @@ class Observations(Shown):
     @cached_property
     def images(self) -> NDArray[np.intp]:
         """Return (N,) the number of the image that each row of pixels is from."""
-        if not len(self):
-            return np.zeros(0, dtype=np.intp)
-        other = np.diff(self.stamps_ns) != 0
-        other |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
-        return np.concatenate([[0], np.cumsum(other)]).astype(np.intp)
+        other = np.zeros(len(self), dtype=np.intp)
+        other[1:] = np.diff(self.stamps_ns) != 0
+        other[1:] |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
+        return np.cumsum(other)
 
     @cached_property
     def configurations(self) -> NDArray[np.intp]:

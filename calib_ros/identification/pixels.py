@@ -8,8 +8,7 @@ their rows are
     [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
 
 and their products follow from those of G with [G | L | residual]: (6, 16) for an image at most,
-however many points it shows. Gross errors are told point by point, and image by image, by the sum
-over its points.
+however many points it shows. Gross errors are told point by point, and image by image.
 """
 
 from __future__ import annotations
@@ -48,13 +47,6 @@ class _Images:
     twist: FloatArray
     lens: list[int]
     seen: View
-
-    def rows(self, columns: FloatArray, twist: FloatArray) -> FloatArray:
-        """Return rows (P + 1, 2, C) by points or sums over images."""
-        found = np.empty((len(twist) + 1, *columns.shape[1:]))
-        np.einsum('psc,skc->pkc', twist, columns[:6], out=found[:-1])
-        found[[*self.lens, -1]] = columns[6:]
-        return found
 
 
 class PixelSamples(Samples):
@@ -95,16 +87,14 @@ class PixelSamples(Samples):
         """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
         size = len(names)
         found = np.zeros((count, 2, size + 1, size + 1))
-        these: slice | NDArray[np.bool_] = slice(None)
         for block in self._linearised(chain, names):
             inner = image_products(block.columns, block.begins, 6)
             twist = np.ascontiguousarray(block.twist.T)
             outer = inner[:, :, :6] @ twist
             own = np.array([*block.lens, size])
+            of = np.zeros(len(block.owner), dtype=np.intp) if folds is None else folds[block.part]
             for k, (matrix, _) in enumerate(found):
-                if folds is not None:
-                    these = folds[block.part][block.begins] == k
-                here = these if folds is None else folds[block.part] == k
+                these, here = of[block.begins] == k, of == k
                 turned = twist[these].reshape(-1, size).T
                 mixed = turned @ inner[these, :, 6:].reshape(-1, len(own))
                 alone = block.columns[6:, :, here].reshape(len(own), -1)
@@ -122,19 +112,12 @@ class PixelSamples(Samples):
                 unit = np.zeros((2, len(block.owner)))
                 unit[k] = self.sigmas[0]
                 shifts[block.part, k] = block.seen.at_the_board(unit)
-            rows = block.rows(block.columns, block.twist[:, :, block.owner])
+            rows = np.empty((len(names) + 1, *block.columns[0].shape))
+            twist = block.twist[:, :, block.owner]
+            np.einsum('psc,skc->pkc', twist, block.columns[:6], out=rows[:-1])
+            rows[[*block.lens, -1]] = block.columns[6:]
             yield (rows / self.sigmas[0],)
         self._shifts = shifts
-
-    def sums(
-        self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
-    ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
-        """Yield numbers (n,) of groups (N,) of images and the sums (P + 1, 2, n) of their rows."""
-        for block in self._linearised(chain, names):
-            index = groups[block.part][block.begins]
-            begins = np.flatnonzero(np.diff(index, prepend=-1))
-            rows = block.rows(np.add.reduceat(block.columns, block.begins, axis=2), block.twist)
-            yield index[begins], (np.add.reduceat(rows, begins, axis=2) / self.sigmas[0],)
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
         """Return what weighted residuals (rows,) are at the board, (N, 3) [m].
@@ -159,17 +142,12 @@ class PixelSamples(Samples):
         if not self.count:
             return
         length = np.linalg.norm(found, axis=1, keepdims=True)
-        most = INNER * np.median(length)
-        sums = np.add.reduceat(
-            found * np.minimum(1.0, most / np.maximum(length, 1e-300)), self._begins
-        )
+        bounded = np.minimum(1.0, INNER * np.median(length) / np.maximum(length, 1e-300))
+        sums = np.add.reduceat(found * bounded, self._begins)
         yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
     def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Images]:
-        """Yield blocks of images that hold about four BLOCKs of points.
-
-        The arm is linearised for all images of about a BLOCK at once.
-        """
+        """Yield blocks of images that hold about four BLOCKs of points."""
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
         lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
@@ -177,26 +155,20 @@ class PixelSamples(Samples):
         kinds, numbers = [name.kind for name in own], [names.index(name) for name in own]
         ends, total = np.append(self._begins, self.count), len(self._begins)
         few = max(4 * BLOCK * total // max(self.count, 1), 1)
-        for start in range(0, total, few * max(BLOCK // few, 1)):
-            end = min(start + few * max(BLOCK // few, 1), total)
-            axes, origin, twist = self._arm(model, slice(start, end))
-            for first in range(start, end, few):
-                last = min(first + few, end)
-                part, here = (
-                    slice(*ends[[first, last]].tolist()),
-                    slice(first - start, last - start),
-                )
-                owner, points = self._images[part] - first, self._points[:, part]
-                placed = axes[..., here], origin[:, here], owner, points
-                seen = view(lens, *placed, seen_by.on_flange)
-                columns = np.empty((7 + len(own), *seen.pixels.shape))
-                seen.by_twist(columns[:6])
-                lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
-                columns[-1] = self._pixels[:, part] - seen.pixels
-                if self.weights is not None:
-                    columns *= self.weights[part]
-                begins = self._begins[first:last] - part.start
-                yield _Images(part, begins, owner, columns, twist[..., here], numbers, seen)
+        for first in range(0, total, few):
+            images = slice(first, min(first + few, total))
+            part = slice(*ends[[images.start, images.stop]].tolist())
+            axes, origin, twist = self._arm(model, images)
+            owner, points = self._images[part] - first, self._points[:, part]
+            seen = view(lens, axes, origin, owner, points, seen_by.on_flange)
+            columns = np.empty((7 + len(own), *seen.pixels.shape))
+            seen.by_twist(columns[:6])
+            lens.by_lens(seen.points, seen.pixels, kinds, columns[6:-1])
+            columns[-1] = self._pixels[:, part] - seen.pixels
+            if self.weights is not None:
+                columns *= self.weights[part]
+            begins = self._begins[images] - part.start
+            yield _Images(part, begins, owner, columns, twist, numbers, seen)
 
     def _arm(self, model: ErrorModel, images: slice) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return axes (3, 3, M) and origin (3, M) of the chain's end, and twists (P, 6, M)."""

@@ -46,26 +46,23 @@ class Problem(Shown):
     ----------
     chain : Chain
         The nominal chain. Frames that it does not fix are fitted.
-    observations : Observations
-        Pairs to fit.
+    observations, more : Observations, sequence of Observations
+        Pairs to fit; further sets in the same fit: other sessions or targets with frames of their
+        own, other kinds of measurement.
     separations : sequence of (str, str, float)
         Pairs of base frames whose origins are a known distance [m] apart: sockets in which a ball
         on the flange sat. Their worlds are parallel to the arm's base.
     world_frame : str
         Frame in which the poses were measured, for the record.
-    more : sequence of Observations
-        Further sets in the same fit: other sessions or targets with frames of their own, other
-        kinds of measurement.
     held_out : Observations or several, optional
         Pairs that are never fitted and judge the result. Without them the result is judged by
         cross-validation over whole configurations.
     sigma_position, sigma_orientation : float
         Standard deviations [m, rad] of measurements without a covariance of their own. Their
         ratio weighs position against orientation; the size of the noise is estimated.
-    sigma_pixel : float
-        Standard deviation [px] of each coordinate of a point of a board in an image.
-    sigma_touch : float
-        Standard deviation [m] of heights over a plane.
+    sigma_pixel, sigma_touch : float
+        The same [px] of each coordinate of a point of a board in an image, and [m] of heights over
+        a plane.
     loss : 'redescending', 'huber' or 'none'
         How gross errors are kept from ruining the fit (`robust.py`).
     priors : mapping of str to float
@@ -112,7 +109,8 @@ class Problem(Shown):
 
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
-        for name, sigma in self.sigmas.items():
+        priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
+        for name, sigma in (self.sigmas | priors).items():
             if not 0.0 < sigma < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
         if self.loss not in LOSSES:
@@ -146,9 +144,6 @@ class Problem(Shown):
         for pattern in (*self.fixed, *self.priors):
             if not fnmatch.filter(names, pattern):
                 raise UnknownNameError('parameter', pattern, names)
-        for pattern, sigma in self.priors.items():
-            if not 0.0 < sigma < np.inf:
-                raise ConfigError(f'the prior of {pattern} must be a positive number, not {sigma}')
         for pattern in self.priors:
             if self._places(pattern):
                 raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
@@ -166,13 +161,10 @@ class Problem(Shown):
                     f'this chain has nothing to fit in "{name}" (gear needs the gear_ratio of '
                     'joints in the chain file)'
                 )
-            if effects.group_of(f'.{name}') == 'compliance' and not any(
-                joint.mass for joint in self.chain.joints
-            ):
+            group = effects.group_of(f'.{name}')
+            if group == 'compliance' and not any(joint.mass for joint in self.chain.joints):
                 raise ConfigError('compliance needs the masses of the links in the chain file')
-            if effects.group_of(f'.{name}') == 'backlash' and all(
-                each.approach is None for each in self.sets
-            ):
+            if group == 'backlash' and all(each.approach is None for each in self.sets):
                 raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
 
     def _places(self, pattern: str) -> bool:
@@ -189,7 +181,7 @@ class Problem(Shown):
     def judging(self) -> tuple[Observations, ...]:
         """Return the held-out sets that hold anything."""
         held_out = self.held_out or ()
-        sets = (held_out,) if isinstance(held_out, Observations) else tuple(held_out)
+        sets = (held_out,) if isinstance(held_out, Observations) else held_out
         return tuple(each for each in sets if len(each))
 
     @cached_property
@@ -239,9 +231,7 @@ class Problem(Shown):
 
         Frames have none; effects always have one.
         """
-        sigmas = (
-            dict(self.given) if self.learned is None else {**self.learned.priors, **self.given}
-        )
+        sigmas = {**(self.learned.priors if self.learned else {}), **self.given}
         for name, _ in self.model.effects:
             sigmas.setdefault(name, effects.expected(name))
         return sigmas
@@ -251,22 +241,16 @@ class Problem(Shown):
         """Return the standard deviations [m, rad] of the priors that were given, by name."""
         sigmas: dict[str, float] = {}
         for name in self.free:
-            for pattern, sigma in self.priors.items():
-                if fnmatch.fnmatchcase(name, pattern) and (
-                    not self.model.owns_frame(name) or Parameter(name).of_lens
-                ):
-                    sigmas.setdefault(name, sigma)
+            fits = [x for pattern, x in self.priors.items() if fnmatch.fnmatchcase(name, pattern)]
+            if fits and (name.of_lens or not self.model.owns_frame(name)):
+                sigmas[name] = fits[0]
         return sigmas
 
     @cached_property
     def informed(self) -> frozenset[str]:
         """Return the DH parameters whose prior says more than common sense does."""
-        known = dict(self.model.effects)
-        return frozenset(
-            name
-            for name, sigma in self.given.items()
-            if name not in known and sigma < self.common_sense(name)
-        )
+        known = {n for n, sigma in self.given.items() if sigma < self.common_sense(n)}
+        return frozenset(known - dict(self.model.effects).keys())
 
     def common_sense(self, name: str) -> float:
         """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
@@ -282,14 +266,10 @@ class Problem(Shown):
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None
-        samples = [
-            samples_of(
-                each,
-                (self.sigma_touch if each.plane else self.sigma_position, self.sigma_orientation),
-                self.sigma_pixel,
-            )
-            for each in sets
-        ]
+        samples = []
+        for each in sets:
+            position = self.sigma_touch if each.plane else self.sigma_position
+            samples.append(samples_of(each, (position, self.sigma_orientation), self.sigma_pixel))
         present = {each.base for each in sets}
         apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
         return System(tuple(samples), prior, apart)

@@ -4,33 +4,15 @@
 
 from __future__ import annotations
 
-from enum import Enum, auto
+from enum import Enum
 
-
-class Rule(Enum):
-    """What a result can fail; `acceptance.py` says how each is judged."""
-
-    ENCODER = auto()
-    MOVED = auto()
-    OWN_BEHAVIOUR = auto()
-    CONVERGENCE = auto()
-    EXCITATION = auto()
-    COMMON_SENSE = auto()
-    LARGEST_ERROR = auto()
-    CONFIGURATIONS = auto()
-    OUTLIERS = auto()
-    GAIN = auto()
-    DRIFT = auto()
-    REGION = auto()
-    GAIN_WITH_OUTLIERS = auto()
-    ROUNDING = auto()
-    ORIENTATION = auto()
-    SCALE = auto()
-    MISTAKE = auto()
-    UNKNOWN_LOSS = auto()
-    UNREADABLE = auto()
-    DROPPED = auto()
-    POSED = auto()
+Rule = Enum(
+    'Rule',
+    'ENCODER MOVED OWN_BEHAVIOUR CONVERGENCE EXCITATION COMMON_SENSE LARGEST_ERROR CONFIGURATIONS '
+    'OUTLIERS GAIN DRIFT REGION GAIN_WITH_OUTLIERS ROUNDING ORIENTATION SCALE MISTAKE '
+    'UNKNOWN_LOSS UNREADABLE DROPPED POSED',
+)
+"""What a result can fail; `acceptance.py` says how each is judged."""
 
 
 class Reason(str):

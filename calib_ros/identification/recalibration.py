@@ -5,9 +5,9 @@
 The earlier parameters x have the covariance C, and each of the arm's parameters has drifted since
 by a growth g per root of a year (a random walk). The residuals r of the new poses at the earlier
 arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ N(0, C + g^2 t). A
-larger change must have a cause: a collision, say, that changed few parameters (`changes.py`).
-These become free, and the estimate is the mean of dx given A and b, relinearised until it
-converges. If two causes cannot be distinguished, both are free.
+larger change must have a cause that changed few parameters (`changes.py`). These become free (if
+two causes cannot be distinguished, those of both), and the estimate is the mean of dx given A and
+b, relinearised until it converges.
 """
 
 from __future__ import annotations
@@ -19,44 +19,24 @@ from typing import Any
 
 import numpy as np
 
-import calib_ros
 from calib_ros.errors import InputError
-from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import (
-    FALSE,
-    MOST_CHANGES,
-    SIZES,
-    Columns,
-    Explanation,
-    Told,
-    reason_in_words,
-    reasons_document,
-    reasons_of,
-)
+from calib_ros.identification import changes
+from calib_ros.identification.calibration import Calibration, about, made
+from calib_ros.identification.changes import Columns, Explanation, Told
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.fingerprint import Fingerprint, reused_in_words
-from calib_ros.identification.leastsquares import (
-    System,
-    minimise,
-    normal_equations,
-    products_of,
-)
+from calib_ros.identification.leastsquares import System, minimise, normal_equations, products_of
 from calib_ros.identification.levels import ALIKE, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.records import nominal_document
+from calib_ros.identification.records import Fingerprint, reused_in_words
 from calib_ros.identification.validation import ErrorFigures, left_out
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import frames_document, table_hash
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
 from calib_ros.shown import Shown
-
-PER_METRE = SIZES['rad'] / SIZES['m']
-"""Angles [rad] grow by so much more than lengths [m]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,14 +64,14 @@ class Recalibration(Shown):
         """Tell whether the result may be used."""
         better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
-        return self.unexplained > FALSE and bool(agrees) and not self.reused
+        return self.unexplained > changes.FALSE and bool(agrees) and not self.reused
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values."""
         return {
             'accepted': self.accepted,
             'reused': self.reused,
-            'changed': [reasons_document(each) for each in self.changed],
+            'changed': [changes.reasons_document(each) for each in self.changed],
             'unexplained': self.unexplained,
             'before': asdict(self.before),
             'after': asdict(self.after),
@@ -103,22 +83,23 @@ class Recalibration(Shown):
             f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
             'new poses (each left out in turn)'
         )
+        if self.accepted:
+            said = 'unchanged within what is known, brought up to date'
+            if self.changed:
+                said = '; '.join(changes.reason_in_words(each) for each in self.changed)
+            return f'accepted: {said}; {text}'
         if self.reused:
-            return f'NOT accepted: {reused_in_words(self.reused)}, and give only those. {text}'
-        if self.unexplained <= FALSE:
-            return (
-                f'NOT accepted: no few parameters explain what has changed; identify anew. {text}'
+            why = f'{reused_in_words(self.reused)}, and give only those'
+        elif self.unexplained <= changes.FALSE:
+            why = 'no few parameters explain what has changed; identify anew'
+        elif self.anew:
+            why = (
+                'the earlier calibration, in new frames, fits the new poses better; keep it, or '
+                'identify anew from more poses'
             )
-        if not self.accepted and self.anew:
-            return (
-                'NOT accepted: the earlier calibration, in new frames, fits the new poses better; '
-                f'keep it, or identify anew from more poses. {text}'
-            )
-        if not self.accepted:
-            return f'NOT accepted: the new poses contradict each other; measure more. {text}'
-        if not self.changed:
-            return f'accepted: unchanged within what is known, brought up to date; {text}'
-        return f'accepted: {"; ".join(reason_in_words(each) for each in self.changed)}; {text}'
+        else:
+            why = 'the new poses contradict each other; measure more'
+        return f'NOT accepted: {why}. {text}'
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -159,8 +140,7 @@ def recalibrate(
 
     """
     sets = (*problem.sets, *problem.judging)
-    _require_known(previous, sets)
-    arm = _Arm.of(previous, years, growth)
+    arm = _Arm.of(previous, sets, years, growth)
     system = _system(problem, sets, previous)
     names = [name for frame in new for name in parameters_of(frame) if name in arm.names]
     if names:
@@ -174,71 +154,81 @@ def recalibrate(
     columns = Columns(arm.chain, arm.names, movable)
     changed: list[tuple[Explanation, ...]] = []
     found = arm.solved(system)
-    while len(changed) < MOST_CHANGES:
-        reasons = reasons_of(found.told.beside(arm.square), columns, previous.freedom)
-        if not reasons:
-            break
+    while len(changed) < changes.MOST_CHANGES and (
+        reasons := changes.reasons_of(found.told.beside(arm.square), columns, previous.freedom)
+    ):
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
+    left = found.squares - float(found.told.vector @ found.change)
     return Recalibration(
-        _updated(previous, arm, found, problem, tuple(changed)),
+        _updated(arm, found, problem, changed),
         tuple(changed),
-        found.unexplained(arm.square, system.rows, previous.freedom),
-        *_judged(previous, arm, found, system, sets),
+        chance_of(left, system.rows, previous.freedom),
+        *_judged(arm, found, system, sets),
         previous.reused(sets),
         bool(names),
     )
 
 
-def _require_known(previous: Calibration, sets: Sequence[Observations]) -> None:
-    """Refuse a calibration without a covariance, and frames that it does not know."""
-    if previous.covariance is None:
-        raise InputError(
-            'the earlier calibration does not hold the covariance of its parameters: identify it '
-            'again with this version, from the poses of then'
-        )
-    known = previous.chain.frame_names
-    for each in sets:
-        if not {each.base, each.tool} <= set(known):
-            raise InputError(
-                f'the earlier calibration knows the frames {", ".join(known)}, not {each.base} '
-                f'and {each.tool}'
-            )
-
-
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """The solution at new poses: the change (P,), its covariance, and what was told about it."""
+    """The solution at new poses: the change (P,), its covariance, and what was told about it.
+
+    `squares` are those of the residuals at the earlier arm, to second order.
+    """
 
     change: FloatArray
     covariance: FloatArray
     told: Told
     squares: float
 
-    def unexplained(self, square: FloatArray, rows: int, freedom: float) -> float:
-        """Return the probability of squares as large as those that are left."""
-        left = self.squares - float(self.told.vector @ self.told.mean(square)[0])
-        return chance_of(left, rows, freedom)
-
 
 @dataclass(frozen=True, eq=False)
 class _Arm:
     """The earlier arm, parameters that are known to a covariance (P, P), effects considered."""
 
+    previous: Calibration
     chain: Chain
     names: tuple[Parameter, ...]
     square: FloatArray
 
     @classmethod
-    def of(cls, previous: Calibration, years: float, growth: float) -> _Arm:
-        region, covariance = previous.region, previous.covariance
-        chain, names = previous.chain, previous.names
-        if region is not None:
-            chain, names, covariance = region.chain, region.names, region.square
+    def of(
+        cls, previous: Calibration, sets: Sequence[Observations], years: float, growth: float
+    ) -> _Arm:
+        """Return that of a calibration that has a covariance and knows the frames of the sets."""
+        if previous.covariance is None:
+            raise InputError(
+                'the earlier calibration does not hold the covariance of its parameters: identify '
+                'it again with this version, from the poses of then'
+            )
+        known = previous.chain.frame_names
+        for each in sets:
+            if not {each.base, each.tool} <= set(known):
+                raise InputError(
+                    f'the earlier calibration knows the frames {", ".join(known)}, not '
+                    f'{each.base} and {each.tool}'
+                )
+        chain, names, square = previous.chain, previous.names, previous.covariance
+        if (region := previous.region) is not None:
+            chain, names, square = region.chain, region.names, region.square
         named = tuple(map(Parameter, names))
-        assert covariance is not None
-        return cls(chain, named, covariance + _wandered(named, years, growth))
+        grown = growth / changes.SIZES['m']  # a year
+        sizes = [grown * changes.SIZES[n.unit] if n.of_dh else 0.0 for n in named]
+        wandered = np.diag(np.square(sizes)) * max(years, 0.0)
+        return cls(previous, chain, named, square + wandered)
+
+    @property
+    def own(self) -> list[int]:
+        """Return which parameters are the calibration's: what it fitted, or held nominal."""
+        known = self.previous.names
+        return [k for k, name in enumerate(self.names) if name in known or name.of_dh]
+
+    def changed(self, change: FloatArray) -> Chain:
+        """Return the chain with changes (P,); effects that were considered stay zero."""
+        own: dict[str, float] = {self.names[k]: float(change[k]) for k in self.own}
+        return replace(self.chain, effects=self.previous.chain.effects).with_offsets(own)
 
     def solved(self, system: System) -> _Found:
         """Return the mean change given the new poses, relinearised until it stands still.
@@ -253,12 +243,6 @@ class _Arm:
             squares = normal.cost + float(change @ (normal.gradient + told.vector))
             change, covariance = told.mean(self.square)
         return _Found(change, covariance, told, squares)
-
-
-def _wandered(names: Sequence[Parameter], years: float, growth: float) -> FloatArray:
-    """Return the covariance (P, P) that the arm's geometry has gained by time."""
-    sizes = [(growth if name.is_length else PER_METRE * growth) * name.of_dh for name in names]
-    return np.diag(np.square(sizes)) * max(years, 0.0)
 
 
 def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
@@ -289,85 +273,56 @@ def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
 
 
 def _judged(
-    previous: Calibration,
-    arm: _Arm,
-    found: _Found,
-    system: System,
-    sets: Sequence[Observations],
+    arm: _Arm, found: _Found, system: System, sets: Sequence[Observations]
 ) -> tuple[ErrorFigures, ErrorFigures]:
     """Return the errors of the new poses before, and by what the others tell."""
     groups = numbered(sets)
     count = min(SOME_POSES, distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
     chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
-    chains = []
+    start, chains = arm.changed(np.zeros(len(arm.names))), []
     parts = products_of(chain, arm.names, system, folds).sum(axis=1)
     for products in parts.sum(axis=0) - parts:
         information = products[:-1, :-1]
         rest = Told(arm.names, information, products[:-1, -1] + information @ found.change)
-        change = dict(zip(arm.names, rest.mean(arm.square)[0], strict=True))
-        chains.append((_applied(previous, arm.chain, {}), _applied(previous, arm.chain, change)))
+        chains.append((start, arm.changed(rest.mean(arm.square)[0])))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
     return before.figures(every), after.figures(every)
 
 
-def _applied(previous: Calibration, start: Chain, change: Mapping[str, float]) -> Chain:
-    """Return a chain with changes of the arm; effects that were considered stay zero."""
-    own = {name: x for name, x in change.items() if _kept(previous, name)}
-    return replace(start, effects=previous.chain.effects).with_offsets(own)
-
-
-def _kept(previous: Calibration, name: str) -> bool:
-    """Tell whether a change is one of the calibration: of what was fitted, or held nominal."""
-    return name in previous.names or Parameter(name).of_dh
-
-
 def _updated(
-    previous: Calibration,
-    arm: _Arm,
-    found: _Found,
-    problem: Problem,
-    changed: Sequence[Sequence[Explanation]],
+    arm: _Arm, found: _Found, problem: Problem, changed: Sequence[Sequence[Explanation]]
 ) -> Calibration:
     """Return the calibration with the changes in it."""
-    change = dict(zip(arm.names, found.change, strict=True))
-    chain = _applied(previous, arm.chain, change)
+    previous, chain = arm.previous, arm.changed(found.change)
     before = previous.before
     for name in before.frame_names:
-        old, new = previous.chain.frame(name), chain.frame(name)
-        here = before.frame(name)
-        motion = new.matrix @ se3.invert(old.matrix)
+        old, new, here = (each.frame(name) for each in (previous.chain, chain, before))
+        moved = new.matrix @ se3.invert(old.matrix) @ here.matrix
         if name.startswith('tool'):
             moved = here.matrix @ se3.invert(old.matrix) @ new.matrix
-        else:
-            moved = motion @ here.matrix
         before = before.with_frame(name, replace(here, matrix=moved))
-    own = [k for k, name in enumerate(arm.names) if _kept(previous, name)]
-    names = tuple(arm.names[k] for k in own)
-    region = previous.region
+    own, region = arm.own, previous.region
     if region is not None:
-        left = np.array([0.0 if name in names else x for name, x in change.items()])
+        left = found.change.copy()
+        left[own] = 0.0
         square = found.covariance + np.outer(left, left)
         effects = [name for name, _ in region.chain.effects]
         region = replace(region, chain=chain.with_effects(effects), square=square)
-    count = sum(map(len, (*problem.sets, *problem.judging)))
     record = {
         **previous.record,
-        'created': datetime.now(timezone.utc).isoformat(timespec='seconds'),
-        'software': f'calib_ros {calib_ros.__version__}',
+        **made(),
+        **about(chain, before, region),
         'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
-        'new_samples': count,
-        'changed': [reason_in_words(each) for each in changed],
-        'table_sha256': table_hash(chain),
-        'nominal': nominal_document(before) | frames_document(before),
-        'region': None if region is None else region.document(),
+        'new_samples': sum(map(len, (*problem.sets, *problem.judging))),
+        'changed': [changes.reason_in_words(each) for each in changed],
     }
     return replace(
         previous,
         chain=chain,
         before=before,
-        names=names,
+        names=tuple(arm.names[k] for k in own),
         covariance=found.covariance[np.ix_(own, own)],
         region=region,
         record=record,

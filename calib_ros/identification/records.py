@@ -1,29 +1,41 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a calibration in its file: the key `calibration` of a chain file."""
+"""The record of a calibration in its file: the key `calibration` of a chain file.
+
+A few hundred numbers in it identify the measurements that were fitted. Each row has a hash. The
+smallest `KEPT` hashes are a random sample of the rows. A further row with a hash up to the largest
+kept one is either among them or was not fitted (Broder 1997).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError
 from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.start import likened
+from calib_ros.identification.observations import SOME_POSES, Observations
+from calib_ros.identification.start import likened, movable
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
-from calib_ros.kinematics.parameter import DH_KINDS, parameters_of
+from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.settings import Settings
 from calib_ros.values import parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, whether a camera on the flange measured, whether it is a socket; device or target."""
+OWNER = ('session', 'eye_in_hand', 'socket', 'label')
+Hashes: TypeAlias = NDArray[np.uint64]
+KEPT = 256
+"""Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept."""
+GRID = 1.618e-6
+"""Values [rad, m or px] in one cell are equal; no decimal number is near the edge of a cell."""
 
 
 def packed(square: FloatArray) -> list[str]:
@@ -34,72 +46,42 @@ def packed(square: FloatArray) -> list[str]:
     return [' '.join(f'{x:.9e}' for x in row[: k + 1]) for k, row in enumerate(root)]
 
 
-def unpacked(rows: Sequence[str], size: int) -> FloatArray:
-    """Return the matrix (P, P) of rows that `packed` made.
+def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
+    """Return the matrix (P, K) of rows of numbers, to the diagonal of a `triangular` one.
 
     Raises
     ------
     ValueError
-        When they are not those of one of that size.
+        When they are not so many, of other lengths, or not finite.
 
     """
-    root = np.zeros((size, size))
-    for k, row in enumerate(rows):
-        root[k, : k + 1] = [float(part) for part in row.split()]
-    if len(rows) != size or not np.isfinite(root).all():
-        raise ValueError(f'{len(rows)} rows of finite numbers for {size} names')
+    numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
+    widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
+    matrix = np.zeros((count, max(widths, default=0)))
+    for row, given, width in zip(matrix, numbers, widths, strict=True):
+        row[:width] = given
+    if not np.isfinite(matrix).all():
+        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
+    return matrix
+
+
+def unpacked(rows: Sequence[str], size: int) -> FloatArray:
+    """Return the matrix (P, P) of rows that `packed` made."""
+    root = parse_rows(rows, size, triangular=True)
     return np.asarray(root @ root.T)
-
-
-def parse_record(text: str, where: str) -> dict[str, Any]:
-    """Return what a calibration says of where it comes from.
-
-    Raises
-    ------
-    ConfigError
-        When it says nothing, was not accepted, or could not be judged or published.
-
-    """
-    record = calibration_record(text)
-    if not record:
-        raise ConfigError(
-            f'{where} is a chain, but no calibration: it does not say where its numbers come '
-            'from (key "calibration"); give the calibration.yaml of calib_ros identify'
-        )
-    if record.get('accepted') is False:
-        raise ConfigError(f'{where} was not accepted: identify again, from more or better poses')
-    rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
-    number = isinstance(rms, int | float) and not isinstance(rms, bool)
-    if not number or not 0.0 <= rms < math.inf:
-        raise ConfigError(f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}')
-    if not isinstance(frame, str):
-        raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
-    return record
 
 
 def nominal_document(nominal: Chain) -> dict[str, Any]:
     """Return the numbers of the chain that a calibration belongs to, row by row."""
     rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
     effects = {name: float(value) for name, value in nominal.effects if value}
-    return {'convention': nominal.convention, 'joints': rows} | (
-        {'effects': effects} if effects else {}
-    )
+    more = {'effects': effects} if effects else {}
+    return {'convention': nominal.convention, 'joints': rows, **more}
 
 
-def nominal_of(record: Mapping[str, Any], chain: Chain, where: str) -> Chain:
-    """Return the nominal chain of a corrected one, by its record."""
-    known = _known(record, where)
-    if known.get('convention') != chain.convention:
-        raise ConfigError(f'{where} does not hold its nominal chain: give that with --chain')
-    joints = []
-    for joint, row in zip(chain.joints, _rows(known, chain, where).values(), strict=True):
-        a, alpha, d, theta, beta = row.values()
-        joints.append(replace(joint, a=a, alpha=alpha, d=d, theta=theta, beta=beta))
-    effects = dictionary(known.get('effects'), f'{where}: calibration.nominal.effects')
-    values = {
-        name: parse_number(value, f'{where}: nominal {name}') for name, value in effects.items()
-    }
-    return replace(chain, joints=tuple(joints), effects=()).with_effect_values(values)
+def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
+    """Return which session, device or target each frame is of, as plain values."""
+    return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
 
 
 def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
@@ -114,48 +96,147 @@ def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
         )
 
 
-def check_nominal(
-    chain: Chain,
-    record: Mapping[str, Any],
-    nominal: Chain,
-    where: str,
-    settings: Settings | None = None,
-) -> None:
-    """Refuse a calibration that is not one of a nominal chain (`parse_calibration`)."""
-    known = _known(record, where)
-    told = known.get('convention') == nominal.convention  # else there is nothing to compare
-    for name, row in (_rows(known, nominal, where) if told else {}).items():
-        for kind, value in row.items():
-            wanted = nominal.value(f'{name}.{kind}')
-            if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits are written
-                raise ConfigError(
-                    f'{where} was identified from another nominal chain, with {name}.{kind} '
-                    f'{value:.9g} and not {wanted:.9g}: give that one, or identify again'
-                )
-    limits = settings or Settings()
-    length, angle = limits.largest_length, limits.largest_angle
-    if told and settings is None:
-        length = angle = math.inf
-    differing = _differing(chain, nominal, length, angle)
-    if differing:
-        raise ConfigError(
-            f'{where} is not the calibration of this robot: {", ".join(differing)} differ from '
-            f'chain "{nominal.name}" by more than largest_length and largest_angle allow'
-        )
+@dataclass(frozen=True, eq=False)
+class Record:
+    """What a calibration says of itself; `where` names it in errors."""
 
+    content: Mapping[str, Any]
+    where: str
 
-def _known(record: Mapping[str, Any], where: str) -> dict[str, Any]:
-    return dictionary(record.get('nominal'), f'{where}: calibration.nominal')
+    @classmethod
+    def parse(cls, text: str, where: str) -> Record:
+        """Return the record in the text of a calibration.
 
+        Raises
+        ------
+        ConfigError
+            When it says nothing, was not accepted, or could not be judged or published.
 
-def _rows(known: Mapping[str, Any], chain: Chain, where: str) -> dict[str, dict[str, float]]:
-    """Return the recorded nominal numbers by joint and kind."""
-    rows = dictionary(known.get('joints'), f'{where}: calibration.nominal.joints')
-    found = {}
-    for name in chain.joint_names:
-        row = parse_numbers(rows.get(name), len(DH_KINDS), f'{where}: nominal {name}')
-        found[name] = dict(zip(DH_KINDS, row.tolist(), strict=True))
-    return found
+        """
+        record = calibration_record(text)
+        if not record:
+            raise ConfigError(
+                f'{where} is a chain, but no calibration: it does not say where its numbers come '
+                'from (key "calibration"); give the calibration.yaml of calib_ros identify'
+            )
+        if record.get('accepted') is False:
+            raise ConfigError(
+                f'{where} was not accepted: identify again, from more or better poses'
+            )
+        rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
+        number = isinstance(rms, int | float) and not isinstance(rms, bool)
+        if not number or not 0.0 <= rms < math.inf:
+            raise ConfigError(
+                f'{where}: calibration.rms_mm_after must be a length [mm], not {rms!r}'
+            )
+        if not isinstance(frame, str):
+            raise ConfigError(f'{where}: calibration.world_frame must be a name, not {frame!r}')
+        return cls(record, where)
+
+    def _part(self, key: str) -> dict[str, Any]:
+        return dictionary(self.content.get(key), f'{self.where}: calibration.{key}')
+
+    def _rows(self, chain: Chain) -> dict[str, dict[str, Any]]:
+        """Return the recorded nominal numbers by joint and kind."""
+        where = f'{self.where}: calibration.nominal.joints'
+        rows = dictionary(self._part('nominal').get('joints'), where)
+        found = {}
+        for name in chain.joint_names:
+            row = parse_numbers(rows.get(name), len(DH_KINDS), f'{self.where}: nominal {name}')
+            found[name] = dict(zip(DH_KINDS, row.tolist(), strict=True))
+        return found
+
+    def nominal(self, chain: Chain) -> Chain:
+        """Return the nominal chain of a corrected one."""
+        known, where = self._part('nominal'), self.where
+        if known.get('convention') != chain.convention:
+            raise ConfigError(f'{where} does not hold its nominal chain: give that with --chain')
+        rows = self._rows(chain)
+        joints = tuple(replace(joint, **rows[joint.name]) for joint in chain.joints)
+        effects = dictionary(known.get('effects'), f'{where}: calibration.nominal.effects')
+        values = {n: parse_number(x, f'{where}: nominal {n}') for n, x in effects.items()}
+        return replace(chain, joints=joints, effects=()).with_effect_values(values)
+
+    def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
+        """Refuse a calibration that is not one of a nominal chain (`parse_calibration`)."""
+        # else there is nothing to compare
+        told = self._part('nominal').get('convention') == nominal.convention
+        for name, row in (self._rows(nominal) if told else {}).items():
+            for kind, value in row.items():
+                wanted = nominal.value(f'{name}.{kind}')
+                if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits written
+                    raise ConfigError(
+                        f'{self.where} was identified from another nominal chain, with '
+                        f'{name}.{kind} {value:.9g} and not {wanted:.9g}: give that one, or '
+                        'identify again'
+                    )
+        limits = settings or Settings()
+        length, angle = limits.largest_length, limits.largest_angle
+        if told and settings is None:
+            length = angle = math.inf
+        if differing := _differing(chain, nominal, length, angle):
+            raise ConfigError(
+                f'{self.where} is not the calibration of this robot: {", ".join(differing)} '
+                f'differ from chain "{nominal.name}" by more than largest_length and '
+                'largest_angle allow'
+            )
+
+    def before(self, nominal: Chain, chain: Chain) -> Chain:
+        """Return the nominal chain in its recorded frames, else those closest to the other one."""
+        known = self._part('nominal')
+        if {'base', 'tool'} & set(known):
+            return replace(nominal, **parse_frames(known, f'{self.where}: calibration.nominal'))
+        joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
+        base, tool = chain.frame('base'), chain.frame('tool')
+        start = replace(nominal, base=base, tool=tool, frames=chain.frames)
+        names = movable(start, ('base', 'tool'))
+        return likened(start, names, chain, joints)[0] if names else start
+
+    def covariance(self, chain: Chain) -> tuple[tuple[str, ...], FloatArray | None, float]:
+        """Return the fitted parameters, their covariance (P, P) and its degrees of freedom."""
+        known = self._part('covariance')
+        if not known:
+            return (), None, math.inf
+        try:
+            names = tuple(known['names'])
+            square = unpacked(known['root'], len(names))
+            freedom = math.inf if known['freedom'] is None else float(known['freedom'])
+            ours = set(names) <= set(chain.parameter_names) and len(set(names)) == len(names)
+            if not (ours and (np.diag(square) > 0.0).all() and freedom > 0.0):
+                raise ValueError('no covariance of this chain')
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
+            raise damaged('covariance', self.where, err) from err
+        return names, square, freedom
+
+    def noise(self) -> Noise | None:
+        """Return the noise of the measurements, if it is recorded."""
+        known = self._part('noise_in_sigma')
+        if not known:
+            return None
+        sizes = ('position', 'successive', 'near', 'widened', 'size')
+        try:
+            turned, given = known['orientation'], dictionary(known.get('given'), 'given')
+            return Noise(
+                **{key: parse_number(known[key], key) for key in sizes},
+                orientation=None if turned is None else parse_number(turned, 'orientation'),
+                consistent=bool(known['consistent']),
+                shared=tuple(map(str, known['shared'])),
+                given={str(n): parse_number(sigma, f'given: {n}') for n, sigma in given.items()},
+            )
+        except (ConfigError, KeyError, TypeError) as err:
+            raise damaged('noise_in_sigma', self.where, err) from err
+
+    def owners(self) -> dict[str, Owner]:
+        """Return which session, device or target each frame is of, where that is recorded."""
+        found = {}
+        for name, row in self._part('frames').items():
+            parts = dictionary(row, f'{self.where}: calibration.frames.{name}')
+            session, eye, socket, label = (parts.get(key) for key in OWNER)
+            told = isinstance(session, str) and isinstance(label, str)
+            if not (told and isinstance(eye, bool) and isinstance(socket, bool)):
+                raise damaged(f'frames.{name}', self.where)
+            found[name] = (str(session), bool(eye), bool(socket), str(label))
+        return found
 
 
 def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
@@ -173,92 +254,78 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
     return names
 
 
-def before_of(record: Mapping[str, Any], nominal: Chain, chain: Chain, where: str) -> Chain:
-    """Return the nominal chain in its recorded frames, else in those closest to the other one."""
-    known = _known(record, where)
-    if {'base', 'tool'} & set(known):
-        return replace(nominal, **parse_frames(known, f'{where}: calibration.nominal'))
-    joints = nominal.random_joints(SOME_POSES, np.random.default_rng(0))
-    start = replace(
-        nominal, base=chain.frame('base'), tool=chain.frame('tool'), frames=chain.frames
-    )
-    names = [
-        name
-        for frame in ('base', 'tool')
-        if not start.frame(frame).fixed
-        for name in parameters_of(frame)
-    ]
-    return likened(start, names, chain, joints)[0] if names else start
-
-
-def covariance_of(
-    record: Mapping[str, Any], chain: Chain, where: str
-) -> tuple[tuple[str, ...], FloatArray | None, float]:
-    """Return the fitted parameters, their covariance (P, P) and its degrees of freedom."""
-    known = dictionary(record.get('covariance'), f'{where}: calibration.covariance')
-    if not known:
-        return (), None, math.inf
-    try:
-        names = tuple(known['names'])
-        square = unpacked(known['root'], len(names))
-        freedom = math.inf if known['freedom'] is None else float(known['freedom'])
-        if not set(names) <= set(chain.parameter_names) or len(set(names)) < len(names):
-            raise ValueError('names of another chain')
-        if not (np.diag(square) > 0.0).all() or not freedom > 0.0:
-            raise ValueError('no covariance')
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
-        raise damaged('covariance', where, err) from err
-    return names, square, freedom
-
-
-def noise_of(record: Mapping[str, Any], where: str) -> Noise | None:
-    """Return the noise of the measurements, if it is recorded."""
-    known = dictionary(record.get('noise_in_sigma'), f'{where}: calibration.noise_in_sigma')
-    if not known:
-        return None
-    try:
-        turned = known['orientation']
-        return Noise(
-            parse_number(known['position'], 'position'),
-            None if turned is None else parse_number(turned, 'orientation'),
-            bool(known['consistent']),
-            parse_number(known['successive'], 'successive'),
-            parse_number(known['near'], 'near'),
-            tuple(map(str, known['shared'])),
-            parse_number(known['widened'], 'widened'),
-            parse_number(known['size'], 'size'),
-            {
-                str(name): parse_number(sigma, f'given: {name}')
-                for name, sigma in dictionary(known.get('given'), 'given').items()
-            },
-        )
-    except (ConfigError, KeyError, TypeError) as err:
-        raise damaged('noise_in_sigma', where, err) from err
-
-
-OWNER = ('session', 'eye_in_hand', 'socket', 'label')
-
-
-def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
-    """Return which session, device or target each frame is of, as plain values."""
-    return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
-
-
-def owners_of(record: Mapping[str, Any], where: str) -> dict[str, Owner]:
-    """Return which session, device or target each frame is of, where that is recorded."""
-    known = dictionary(record.get('frames'), f'{where}: calibration.frames')
-    owners = {}
-    for name, row in known.items():
-        parts = dictionary(row, f'{where}: calibration.frames.{name}')
-        session, eye, socket, label = (parts.get(key) for key in OWNER)
-        told = isinstance(session, str) and isinstance(label, str)
-        if not (told and isinstance(eye, bool) and isinstance(socket, bool)):
-            raise damaged(f'frames.{name}', where)
-        owners[name] = (str(session), bool(eye), bool(socket), str(label))
-    return owners
-
-
 def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
     """Return the error that says which part of a record is not as it was written."""
     kind = '' if err is None else f' ({type(err).__name__})'
     return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
+
+
+def hashes(sets: Sequence[Observations]) -> Hashes:
+    """Return a hash (N,) of the joint values and the measurement of each row."""
+    found = [np.zeros(0, dtype=np.uint64)]
+    for each in sets:
+        measured = each.positions
+        if each.pixels is not None:
+            measured = np.concatenate([each.pixels, each.points], axis=1)
+        elif each.distances is not None:
+            measured = each.distances[:, np.newaxis]
+        cells = np.round(np.concatenate([each.joints, measured], axis=1) / GRID)
+        mixed = np.zeros(len(each), dtype=np.uint64)
+        for column in cells.astype(np.int64).view(np.uint64).T:  # Fibonacci hashing, folded
+            mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)
+            mixed ^= mixed >> np.uint64(29)
+        found.append(mixed)
+    return np.concatenate(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Fingerprint:
+    """The least hashes of `count` rows, in ascending order."""
+
+    count: int
+    least: Hashes
+
+    @classmethod
+    def of(cls, sets: Sequence[Observations], earlier: Fingerprint | None = None) -> Fingerprint:
+        """Return that of rows, and of those fitted earlier."""
+        new = hashes(sets)
+        earlier = earlier or cls(0, new[:0])
+        both = np.union1d(earlier.least, earlier.of_those(new))[:KEPT]
+        return cls(earlier.count + len(new), both)
+
+    def of_those(self, rows: Hashes) -> Hashes:
+        """Return which hashes of rows (N,) would be among these if the rows were fitted."""
+        every = self.count <= len(self.least)
+        return rows if every else rows[rows <= self.least.max(initial=0)]
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any], where: str) -> Fingerprint | None:
+        """Return what the record of a calibration says, if it does."""
+        if 'rows' not in record:
+            return None
+        try:
+            least = np.frombuffer(bytes.fromhex(record['rows']['least']), '>u8')
+            return cls(int(record['rows']['count']), least.astype(np.uint64))
+        except (KeyError, TypeError, ValueError) as err:
+            what = f'{where}: calibration.rows is not as it was written'
+            raise ConfigError(f'{what}: {err}') from err
+
+    def document(self) -> dict[str, Any]:
+        """Return it for the record of a calibration."""
+        return {'count': self.count, 'least': self.least.astype('>u8').tobytes().hex()}
+
+    def share(self, sets: Sequence[Observations]) -> float:
+        """Return the share of rows that were fitted, as far as it shows."""
+        rows = self.of_those(hashes(sets))
+        return float(np.isin(rows, self.least).mean()) if rows.size else 0.0
+
+
+def reused_in_words(share: float) -> str:
+    """Return a warning about measurements of which such a share was fitted; empty for none."""
+    if not share:
+        return ''
+    which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'
+    return (
+        f'{which} are the measurements that the calibration was fitted to, so they prove nothing '
+        'about other poses: measure new ones'
+    )

@@ -3,16 +3,16 @@
 """Where a calibration may be used: where it is known to improve the arm, not only near its poses.
 
 By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C); those of
-the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, the
-errors are |A x| without and |A (x^ - x)| with the calibration. It makes the arm worse there if
+the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, it makes
+the arm worse if
 
     |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
 
 The left side is normal, so this *risk* is a value of the normal distribution, or a mean of several
 for different sizes of errors, which are uncertain. The calibration may be used at the measured
-poses if the risk there is below RISK, for these poses alone and together with all poses of the
-joint range that are predicted as well. It may be used further out, in shells of growing standard
-deviation of the predicted position, as long as the risk in each shell is below RISK.
+poses if the risk is below RISK there, and with all poses of the joint range that are predicted as
+well; further out, in shells of growing standard deviation of the predicted position, as long as
+that holds in each shell.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.levels import KNOWN
 from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.records import damaged, packed, unpacked
+from calib_ros.identification.records import damaged, packed, parse_rows, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -68,10 +68,7 @@ class Region(Shown):
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
         model = ErrorModel(self.chain, self.names, self.base, self.tool)
-        starts = range(0, len(joints), BLOCK)
-        parts = [joints[first : first + BLOCK] for first in starts]
-        lengths = [_length(model.jacobian(part)[:, :3], self.square) for part in parts]
-        return np.concatenate(lengths) if lengths else np.zeros(0)
+        return sigma_of(model, self.square, joints)
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
         """Tell (N,) at which joint values (N, n) the calibration may be used."""
@@ -107,6 +104,22 @@ class Region(Shown):
         }
 
 
+def sigma_of(
+    model: ErrorModel, square: FloatArray, joints: FloatArray, components: slice = np.s_[:3]
+) -> FloatArray:
+    """Return the expected size (N,) of some components of errors of poses at (N, n).
+
+    `square` (P, P) are the expected squares of the errors of the model's parameters.
+    """
+    found = np.empty(len(joints))
+    for first in range(0, len(joints), BLOCK):
+        part = slice(first, first + BLOCK)
+        rows = model.jacobian(joints[part])[:, components]
+        flat = rows.reshape(-1, rows.shape[2])
+        found[part] = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+    return np.sqrt(np.maximum(found, 0.0))
+
+
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
     """Return the region of a calibrated chain from its record; None where it names none.
 
@@ -123,46 +136,29 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         names = tuple(str(name) for name in document['names'])
         geometric = {n for n in names if chain.owns_frame(n) or Parameter(n).of_dh}
         chain = chain.with_effects([n for n in names if n not in geometric])
+        ends = str(document['base']), str(document['tool'])
         ErrorModel(chain, names)
+        for frame in ends:
+            if frame not in chain.frame_names:
+                raise UnknownNameError('frame', frame, chain.frame_names)
         limit = document['limit']
         region = Region(
             chain,
             names,
             unpacked(document['root'], len(names)),
-            _rows(document.get('device', [''] * len(names)), len(names)),
+            parse_rows(document.get('device', [''] * len(names)), len(names)),
             np.inf if limit is None else float(limit),
             float(document['share']),
-            str(document['base']),
-            str(document['tool']),
+            *ends,
         )
     except UnknownNameError as err:
-        what = f'parameter in {where}: calibration.region'
+        what = f'{err.what} in {where}: calibration.region'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
         raise damaged('region', where, err) from err
     if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
         raise damaged('region', where)
-    for frame in (region.base, region.tool):
-        if frame not in chain.frame_names:
-            raise UnknownNameError(
-                f'frame in {where}: calibration.region', frame, chain.frame_names
-            )
     return region
-
-
-def _rows(rows: Sequence[str], count: int) -> FloatArray:
-    """Return the matrix (P, K) of rows of numbers.
-
-    Raises
-    ------
-    ValueError
-        When they are not so many, of different lengths, or not finite.
-
-    """
-    matrix = np.array([[float(part) for part in row.split()] for row in rows]).reshape(count, -1)
-    if len(rows) != count or not np.isfinite(matrix).all():
-        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
-    return matrix
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
@@ -170,74 +166,48 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
 
     `freedom` are the degrees of freedom from which the noise was estimated.
     """
-    ends = sets[0]
+    ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    judge = _Judge(posterior, np.concatenate([measured, drawn]), ends, freedom)
-    near, far = np.split(judge.sigma, [len(measured)])
-    limit = float(near.max())
-    order = np.argsort(far)
-    own = judge.products([*range(len(measured))])
-    inner = own + judge.products(len(measured) + order[far[order] <= limit])
+    model = ErrorModel(posterior.chain, posterior.names, *ends)
+    near, far = (sigma_of(model, posterior.square, each) for each in (measured, drawn))
+    order, limit = np.argsort(far), float(near.max())
+    judge = _Judge(posterior, *ends, freedom)
+    own, inside = judge.products(measured), far[order] <= limit
+    inner = own + judge.products(drawn[order[inside]])
     if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
         return None
-    shells = len(measured) + order[far[order] > limit]
+    shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
-        added = judge.products(shell)
+        added = judge.products(drawn[shell])
         if not judge.risk(added, inner + added) < RISK:
             break
-        inner = inner + added
-        limit = float(judge.sigma[shell[-1]])
+        inner, limit = inner + added, float(far[shell[-1]])
     share = float(np.mean(far <= limit))
-    return Region(
-        posterior.chain,
-        posterior.names,
-        posterior.square,
-        posterior.device,
-        np.inf if share == 1.0 else limit,
-        share,
-        ends.base,
-        ends.tool,
-    )
-
-
-def _length(rows: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the roots (N,) of the expected squared lengths of J x, J (N, 3, P)."""
-    flat = rows.reshape(-1, rows.shape[2])
-    squares = ((flat @ square) * flat).sum(axis=1).reshape(-1, 3).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+    limit = np.inf if share == 1.0 else limit
+    known = posterior.chain, posterior.names, posterior.square, posterior.device
+    return Region(*known, limit, share, *ends)
 
 
 class _Judge:
     """Tells how probable it is that a calibration makes the arm worse at some poses."""
 
-    def __init__(
-        self, posterior: Posterior, joints: FloatArray, ends: Observations, freedom: float
-    ) -> None:
+    def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
         chain, names = posterior.chain, posterior.names
-        frames = [*parameters_of(ends.base), *parameters_of(ends.tool)[:3]]
-        every = list(dict.fromkeys([*frames, *names]))
-        model = ErrorModel(chain, every, ends.base, ends.tool)
-        shift = model.linearise(np.ascontiguousarray(joints.T))[2]
-        row = dict(zip(every, model.order.tolist(), strict=True))
-        own = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
-        found = shift[[row[name] for name in names]]
-        flat = found.reshape(len(names), -1)
-        squares = ((posterior.square @ flat) * flat).sum(axis=0).reshape(3, -1).sum(axis=0)
-        self.sigma = np.sqrt(np.maximum(squares, 0.0))
-        self._placed = len(frames)
-        self._rows = shift[[row[name] for name in [*frames, *(names[k] for k in own)]]]
-        self._offsets = posterior.offsets[own]
+        arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        frames = [*parameters_of(base), *parameters_of(tool)[:3]]
+        self._placed, self._freedom = len(frames), freedom
+        self._model = ErrorModel(chain, [*frames, *(names[k] for k in arm)], base, tool)
+        self._offsets = posterior.offsets[arm]
         weights, means, covariances = zip(*posterior.doubted, strict=True)
-        self._weights, self._means = np.array(weights), np.array(means)[:, own]
-        self._covariances = np.array(covariances)[:, own][:, :, own]
-        self._freedom = freedom
+        self._weights, self._means = np.array(weights), np.array(means)[:, arm]
+        self._covariances = np.array(covariances)[:, arm][:, :, arm]
 
-    def products(self, which: Sequence[int] | NDArray[np.intp]) -> FloatArray:
-        """Return (K, K) the products of the columns with each other, over some poses."""
-        rows = self._rows[:, :, which].reshape(len(self._rows), -1)
-        return np.asarray(rows @ rows.T)
+    def products(self, joints: FloatArray) -> FloatArray:
+        """Return (K, K) the products of the columns with each other, over poses at (N, n)."""
+        rows = self._model.jacobian(joints)[:, :3].reshape(-1, len(self._model.names))
+        return np.asarray(rows.T @ rows)
 
     def risk(self, which: FloatArray, around: FloatArray) -> float:
         """Return it for some poses, in frames fitted to those around; both by their products."""

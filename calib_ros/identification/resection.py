@@ -10,7 +10,7 @@ that pose is refined as well, and the one with the smaller residuals counts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,6 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
 from calib_ros.kinematics.newton import Normal, minimise
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class BoardPoses:
-    """Poses (M, 4, 4) of the board in the camera, and RMS residuals (M,) [px] of the images."""
-
-    poses: FloatArray
-    rms: FloatArray
 
 
 def board_poses(observations: Observations, lens: Lens) -> Observations:
@@ -49,26 +41,31 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
             'where the camera is'
         )
     rows = observations.select(told[observations.images])
-    found = resect(rows, lens)
-    _require_fit(rows, found.rms)
+    poses, rms = resect(rows, lens)
+    _require_fit(rows, rms)
     first = np.flatnonzero(np.diff(rows.images, prepend=-1))
-    alone = replace(rows, pixels=None, points=None, on_flange=False).select(first)
     seen = replace(
-        alone,
-        positions=found.poses[:, :3, 3],
-        rotations=found.poses[:, :3, :3],
-        oriented=np.ones(len(alone), dtype=bool),
+        replace(rows, pixels=None, points=None, on_flange=False).select(first),
+        positions=poses[:, :3, 3],
+        rotations=poses[:, :3, :3],
+        oriented=np.ones(len(first), dtype=bool),
     )
     return seen.inverted() if observations.on_flange else seen
+
+
+def _per_image(rows: FloatArray, index: NDArray[np.intp]) -> FloatArray:
+    """Return the means (M, ...) of rows (N, ...) over each image."""
+    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    counts = np.diff(begins, append=len(index)).reshape(-1, *[1] * (rows.ndim - 1))
+    return np.asarray(np.add.reduceat(rows, begins) / counts)
 
 
 def _require_fit(observations: Observations, rms: FloatArray) -> None:
     """Raise unless a pose of the board explains most of where most images show its points."""
     assert observations.pixels is not None
     index, pixels = observations.images, observations.pixels
-    count = np.bincount(index)[:, np.newaxis]
-    centre = np.stack([np.bincount(index, row) for row in pixels.T], axis=1) / count
-    spread = np.sqrt(np.bincount(index, ((pixels - centre[index]) ** 2).sum(axis=1)) / count[:, 0])
+    beside_the_centre = pixels - _per_image(pixels, index)[index]
+    spread = np.sqrt(_per_image((beside_the_centre**2).sum(axis=1), index))
     beside = ~(rms < NEARER * spread)
     if 2 * beside.sum() > len(rms):
         raise InputError(
@@ -113,8 +110,8 @@ def image_products(
     return np.asarray((parts[:, :, :first] @ parts.swapaxes(2, 3)).sum(axis=0))
 
 
-def resect(observations: Observations, lens: Lens) -> BoardPoses:
-    """Return the pose of the board in the camera for every image."""
+def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArray]:
+    """Return the poses (M, 4, 4) of the board in the camera, and RMS residuals (M,) [px]."""
     assert observations.points is not None
     assert observations.pixels is not None
     index = observations.images
@@ -128,36 +125,29 @@ def resect(observations: Observations, lens: Lens) -> BoardPoses:
     axes[2] = np.cross(axes[0], axes[1])
     plane = (observations.points - centre) @ axes.T
     start = _from_homography(plane[:, :2], lens.rays(observations.pixels), index)
-    local = np.zeros((3, len(plane)))
-    local[:2] = plane[:, :2].T
-    best = _refined(start, local, observations.pixels, index, lens)
-    mirrored = best.poses.copy()
-    sight = mirrored[:, :3, 3] / np.linalg.norm(mirrored[:, :3, 3], axis=1, keepdims=True)
-    normal = mirrored[:, :3, 2]
-    axis = np.cross(normal, sight)
-    along = np.sign((normal * sight).sum(axis=1, keepdims=True))
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    turn = axis * along * 2.0 * np.arcsin(np.clip(sine, 0.0, 1.0)) / np.maximum(sine, 1e-12)
-    mirrored[:, :3, :3] = se3.exp_rotation(turn) @ mirrored[:, :3, :3]
-    other = _refined(mirrored, local, observations.pixels, index, lens)
-    swap = other.rms < best.rms
-    poses = np.where(swap[:, np.newaxis, np.newaxis], other.poses, best.poses)
+    local = plane.T * [[1.0], [1.0], [0.0]]
+    best, rms = _refined(start, local, observations.pixels, index, lens)
+    mirrored, normal = best.copy(), best[:, :3, 2]
+    sight = best[:, :3, 3] / np.linalg.norm(best[:, :3, 3], axis=1, keepdims=True)
+    # half a turn about the normal, then one about the line of sight
+    halves = [2.0 * v[:, :, np.newaxis] * v[:, np.newaxis] - np.eye(3) for v in (sight, normal)]
+    mirrored[:, :3, :3] = halves[0] @ halves[1] @ best[:, :3, :3]
+    other, others = _refined(mirrored, local, observations.pixels, index, lens)
+    poses = np.where((others < rms)[:, np.newaxis, np.newaxis], other, best)
     board = se3.transform(axes.T, centre)  # T_board_plane
-    return BoardPoses(poses @ se3.invert(board), np.minimum(best.rms, other.rms))
+    return poses @ se3.invert(board), np.minimum(rms, others)
 
 
 def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return (M,) which images show enough points that are not in line, nor are there."""
     assert observations.points is not None
     assert observations.pixels is not None
-    count = np.bincount(index)
-    told = count >= 4
-    begins = np.flatnonzero(np.diff(index, prepend=-1))
+    told = np.bincount(index) >= 4
     for places in (observations.points, observations.pixels):
-        mean = np.stack([np.bincount(index, row) for row in places.T], axis=1)
-        rest = places - (mean / count[:, np.newaxis])[index]
-        outer = rest[:, :, np.newaxis] * rest[:, np.newaxis]
-        spread = np.linalg.eigvalsh(np.add.reduceat(outer, begins))
+        rest = places - _per_image(places, index)[index]
+        spread = np.linalg.eigvalsh(
+            _per_image(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
+        )
         told &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
     return np.asarray(told)
 
@@ -166,10 +156,9 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
     """Return poses (M, 4, 4) from points (N, 2) [m] of the plane and rays (N, 2)."""
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     scale = np.sqrt((plane**2).sum(axis=1).mean())
-    count = np.bincount(index)[:, np.newaxis]
-    centre = np.add.reduceat(rays, begins) / count
+    centre = _per_image(rays, index)
     near = rays - centre[index]
-    size = np.sqrt(np.add.reduceat((near**2).sum(axis=1), begins)[:, np.newaxis] / count)
+    size = np.sqrt(_per_image((near**2).sum(axis=1, keepdims=True), index))
     near = near / size[index]
     point = np.ones((3, len(plane)))
     point[:2] = plane.T / scale
@@ -185,18 +174,15 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
     matrix *= np.sign(matrix[:, 2, 2])[:, np.newaxis, np.newaxis]  # in front of the camera
     length = np.linalg.norm(matrix[:, :, :2], axis=1).mean(axis=1)
     matrix /= np.maximum(length, 1e-300)[:, np.newaxis, np.newaxis]
-    rotation = np.empty_like(matrix)
-    rotation[:, :, :2] = matrix[:, :, :2]
-    rotation[:, :, 2] = np.cross(matrix[:, :, 0], matrix[:, :, 1])
-    left, _, right = np.linalg.svd(rotation)
-    left[:, :, -1] *= np.linalg.det(left @ right)[:, np.newaxis]
-    return se3.transform(left @ right, matrix[:, :, 2])
+    place = matrix[:, :, 2].copy()
+    matrix[:, :, 2] = np.cross(matrix[:, :, 0], matrix[:, :, 1])
+    return se3.transform(se3.nearest_rotation(matrix), place)
 
 
 def _refined(
     poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
-) -> BoardPoses:
-    """Return poses (M, 4, 4) refined by damped Gauss-Newton steps on the pixels (N, 2)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return poses (M, 4, 4) refined on the pixels (N, 2), and RMS residuals (M,) [px]."""
     count = np.bincount(index)
 
     def linearise(poses: FloatArray, which: NDArray[np.intp]) -> Normal:
@@ -219,4 +205,4 @@ def _refined(
         return moved
 
     found = minimise(linearise, poses.transpose(1, 2, 0), move, fall=HALF_THE_DIGITS)
-    return BoardPoses(found.x.transpose(2, 0, 1), np.sqrt(found.cost / count))
+    return found.x.transpose(2, 0, 1), np.sqrt(found.cost / count)

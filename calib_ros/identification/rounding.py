@@ -3,14 +3,11 @@
 """Rounded joint values: does the arm explain the gain, or the rounding?
 
 Values that are multiples of a step are off by up to half a step, identically wherever a joint has
-the same value, as in grids or while other joints move. A model follows that, even on left-out
-poses with the same values. So two explanations of the nominal residuals y, frames projected out,
-are compared by their evidence (the marginal likelihood, Gaussian throughout):
+the same value. A model follows that, even on left-out poses with the same values. So an F test
+tells whether the arm explains more of the nominal residuals y, frames projected out, than chance
+would if rounding explained them all,
 
-    rounding      y ~ N(0, k I + C C^T)                 C: a column for each value of each joint
-    and the arm   y ~ N(0, k I + C C^T + s J J^T)       J: the arm's columns, times usual errors
-
-with the best variance k of the noise and size s of the arm's errors.
+    y ~ N(0, k (I + C C^T))        C: a column for each value of each joint, as large as its error
 """
 
 from __future__ import annotations
@@ -19,13 +16,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import linalg
 
-from calib_ros.identification.evidence import group_of
+from calib_ros.identification.changes import Told
 from calib_ros.identification.leastsquares import owners, stacked
-from calib_ros.identification.levels import CERTAIN
+from calib_ros.identification.levels import SURE, chance_of
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.sizes import TYPICAL
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
@@ -36,10 +32,6 @@ WIDER = 5
 """How many times as wide a step must not fit as well (benchmarks/harm.py)."""
 WHOLE = 1e-3
 """Share of a step by which multiples of it may be off."""
-RATIOS = np.array([0.0, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0])
-NOISES = np.geomspace(0.2, 20.0, 15)
-DECIDED = float(special.logit(CERTAIN))
-"""Logarithm of the ratio of evidences from which on a gain is the arm's."""
 
 
 def rounded(problem: Problem) -> dict[str, float]:
@@ -102,44 +94,23 @@ def may_be_rounding(
     arm = [name for name in names if not before.owns_frame(name)]
     frames = [name for name in names if before.owns_frame(name)]
     chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
-    system = problem.system(sets)
     wanted = list(dict.fromkeys([*frames, *arm, *levels]))
-    parts = system.rows_of(chain, wanted)
+    parts = problem.system(sets).rows_of(chain, wanted)
     owner, rows = owners(parts), stacked(parts)
-    basis = linalg.qr(rows[:, : len(frames)], mode='economic', check_finite=False)[0]
-    columns = rows[:, len(frames) : len(frames) + len(arm)]
-    columns = columns * [TYPICAL[group_of(before, name) or 'drive'] for name in arm]
-    alike = []
+    columns = [rows[:, : len(frames)]]
     for name, level in levels.items():
         size = steps[Parameter(name).owner] / np.sqrt(12.0)
         column = size * rows[:, [wanted.index(name)]]
-        alike.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
-    everything = np.column_stack([*alike, columns, rows[:, -1]])
-    everything -= basis @ (basis.T @ everything)
-    width = sum(part.shape[1] for part in alike)
-    freedom = len(rows) - len(frames)
-    found = {
-        (with_rounding, size): _evidence(
-            everything[:, :-1] * np.repeat([with_rounding, size], [width, len(arm)]),
-            everything[:, -1],
-            freedom,
-        )
-        for with_rounding in (0.0, 1.0)
-        for size in RATIOS
-    }
-    healthy = max(found[key] for key in found if key[1] == 0.0)
-    return bool(max(found.values()) - healthy < DECIDED)
-
-
-def _evidence(columns: FloatArray, values: FloatArray, freedom: int) -> float:
-    """Return the log evidence of values ~ N(0, k I + columns columns^T) for the best noise k."""
-    sizes, vectors = np.linalg.eigh(columns.T @ columns)
-    good = sizes > 1e-12 * max(float(sizes.max(initial=0.0)), 1e-300)
-    sizes = sizes[good]
-    inside = (vectors[:, good].T @ (columns.T @ values)) ** 2 / sizes
-    outside = max(float(values @ values) - float(inside.sum()), 0.0)
-    noise = NOISES[:, np.newaxis] ** 2
-    total = noise + sizes
-    squares = (inside / total).sum(axis=1) + outside / noise[:, 0]
-    logs = np.log(total).sum(axis=1) + (freedom - len(sizes)) * np.log(noise[:, 0])
-    return float((-0.5 * (squares + logs)).max())
+        columns.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
+    beside = np.column_stack(columns)
+    every = np.column_stack([beside, rows[:, len(frames) : len(frames) + len(arm)], rows[:, -1]])
+    first, rest = np.s_[: beside.shape[1]], np.s_[beside.shape[1] :]
+    products = every.T @ every
+    prior = np.diag(np.arange(beside.shape[1]) >= len(frames)).astype(float)
+    taken = linalg.solve(products[first, first] + prior, products[first, rest], assume_a='pos')
+    left = products[rest, rest] - products[rest, first] @ taken
+    told = Told(tuple(map(Parameter, arm)), left[:-1, :-1], left[:-1, -1])
+    gain, _, _, rank = told.explained(np.eye(len(arm)))
+    freedom = max(len(rows) - len(frames) - rank, 1)
+    noise = max(float(left[-1, -1]) - gain, 1e-300) / freedom
+    return chance_of(gain / noise, rank, freedom) > 1.0 - SURE

@@ -125,18 +125,16 @@ class Evidence:
             return [(1.0, size)]
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
         tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
-        likely = self._of(tried) - 0.5 * (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(
-            axis=1
-        )
+        unusual = (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(axis=1)
+        likely = self._of(tried) - 0.5 * unusual
         upper = special.expit(likely[::2] - likely[1::2])
         weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
         return list(zip(weights.tolist(), tried, strict=True))
 
     def _within(self, size: FloatArray) -> FloatArray:
         """Return sizes (G,) no further from the typical ones than any that are looked for."""
-        return self._typical + np.clip(
-            size - self._typical, np.log(LEAST_SIZE), -np.log(LEAST_SIZE)
-        )
+        most = -np.log(LEAST_SIZE)
+        return self._typical + np.clip(size - self._typical, -most, most)
 
     def widen(self, size: FloatArray) -> None:
         """Give offsets the variances that the prior's tails have in the mean, for sizes (G,)."""
@@ -178,12 +176,7 @@ class Evidence:
         """Return the logarithm of the evidence of sizes (S, G), given by their logarithms."""
         weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
         scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
-        # the last row of the factor of [A b; b^T c] is L^-1 b
-        wide = np.zeros((len(sizes), scaled.shape[1] + 1, scaled.shape[1] + 1))
-        wide[:, :-1, :-1] = scaled
-        wide[:, -1, :-1] = scale * self._vector
-        wide[:, -1, -1] = 1e300  # more than any square
-        factor = np.linalg.cholesky(wide)
-        volume = 2.0 * np.log(scale / np.einsum('spp->sp', factor)[:, :-1]).sum(axis=1)
-        fit = (factor[:, -1, :-1] ** 2).sum(axis=1)
+        seen = (scale * self._vector)[:, :, np.newaxis]
+        fit = (seen * np.linalg.solve(scaled, seen)).sum(axis=(1, 2))
+        volume = 2.0 * np.log(scale).sum(axis=1) - np.linalg.slogdet(scaled)[1]
         return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))

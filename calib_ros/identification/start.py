@@ -5,44 +5,38 @@
 With the nominal arm K_i = A_1 ... A_n, a measured pose is M_i = T_world_base K_i T_flange_target.
 
 Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading singular vectors
-of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013).
-Positions: a point set registration of the flange positions (Umeyama 1991) that leaves the tool
-out, and the linear system p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row.
-Translations are linear once R_B is known. Where orientations hardly vary, the tool's translation
-is the shortest one, the base takes the rest, and rotations come from the registration.
-Distances: their squares are linear in the base's position and its square, solved for the better
-half of the samples. A touched plane: n p_K + n R_K t = d is linear in n, n t^T and d, or with the
-tool given it is the plane through the points. Pixels: the pose of the board in each image
-(`resection.py`). Every start is polished by least squares on the frames alone; the best one
-counts. Where none fits (few or degenerate poses), the 24 rotations of a cube are tried as well.
+of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013). Positions: a point set
+registration of the flange positions (Umeyama 1991) that leaves the tool out, and the linear system
+p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row. Translations are linear once R_B is
+known. Where orientations hardly vary, the tool's translation is the shortest one, the base takes
+the rest, and rotations come from the registration.
+Distances: their squares are linear in the base's position and its square. A touched plane:
+n p_K + n R_K t = d is linear in n, n t^T and d, or with the tool given it is the plane through the
+points. Pixels: the pose of the board in each image (`resection.py`).
+
+Every start is polished by least squares on the frames alone; the best one counts. Where none fits
+(few or degenerate poses), the 24 rotations of a cube are tried as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.identification.identifiability import DEGENERATE, excited, structurally_independent
-from calib_ros.identification.leastsquares import (
-    System,
-    factor_of,
-    minimise,
-    normal_equations,
-)
-from calib_ros.identification.levels import TELLING
+from calib_ros.identification.leastsquares import System, factor_of, minimise, normal_equations
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.resection import board_poses
-from calib_ros.identification.robust import robust_fit
+from calib_ros.identification.robust import robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
-from calib_ros.identification.trimmed import STARTS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 GOOD = 0.03
@@ -63,78 +57,78 @@ def start_frames(
     """
     found: set[str] = set()
     for observations in sets:
-        ends = {'base': observations.base, 'tool': observations.tool}
-        frames = {}
-        for key, name in ends.items():
-            frames[key] = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}[name]
-            if name in found:
-                frames[key] = replace(chain.frame(name), fixed=True)
-        view = replace(chain, base=frames['base'], tool=frames['tool'])
+        known = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}
+        known |= {name: replace(chain.frame(name), fixed=True) for name in found}
+        base, tool = observations.base, observations.tool
+        view = replace(chain, base=known[base], tool=known[tool])
         alone = replace(observations, base='base', tool='tool')
-        if observations.pixels is not None:
+        if alone.pixels is not None:
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
             share = -(-(int(alone.images[-1]) + 1) // SOME_POSES)
             alone = board_poses(alone.select(alone.images % share == 0), lens)
-        view = _start_one(view, alone, sigma_position, sigma_orientation, loss)
-        for key, name in ends.items():
+        view = _start_one(view, alone, (sigma_position, sigma_orientation), loss)
+        for key, name in (('base', base), ('tool', tool)):
             frame = replace(view.frame(key), fixed=chain.frame(name).fixed)
             chain = chain.with_frame(name, frame)
-        found |= set(ends.values())
+        found |= {base, tool}
     return chain
 
 
 def _start_one(
-    chain: Chain,
-    observations: Observations,
-    sigma_position: float,
-    sigma_orientation: float,
-    loss: str,
+    chain: Chain, observations: Observations, sigmas: tuple[float, float], loss: str
 ) -> Chain:
-    """Return the chain with frames for one set of observations."""
+    """Return the chain with frames for one set of observations; sigmas [m, rad]."""
     oriented = bool(observations.oriented.any()) and observations.distances is None
-    names = [
-        name
-        for key in ('base', 'tool')
-        if not chain.frame(key).fixed
-        for name in parameters_of(key)
-        if oriented or key == 'base' or name.is_length
-    ]
+    every = movable(chain, ('base', 'tool'))
+    names = [name for name in every if oriented or name.owner == 'base' or name.is_length]
     if not names:
         return chain
     if observations.socket:
-        return _in_socket(chain, observations)
+        return next(closed_forms(chain, observations))
     subset = observations.spread()
-    system = System((Samples(subset, sigma_position, sigma_orientation),))
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(subset.joints, subset.approach)
-    determined: tuple[str, ...] = ()
-    if subset.plane:
-        best, least = chain, np.inf
-        for start in _on_plane(chain, arm, subset):
-            determined = excited(factor_of(start, names, system), names)
-            fitted = robust_fit(start, determined, system, loss).fit.chain
-            height = float(np.median(np.abs(residual_arrays(fitted, subset)[0])))
-            if height < least:
-                best, least = fitted, height
-        return best
-    if subset.distances is not None:
-        start = _trilaterated(chain, arm, subset, loss != 'none')
-        return robust_fit(start, names, system, loss).fit.chain
+    system = System((Samples(subset, *sigmas),))
+    if subset.distances is not None and not subset.plane:
+        start = _trilaterated(chain, _flange(chain, subset), subset)
+        lengths = [name for name in names if name.is_length]
+        return thorough_fit(start, lengths, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
-    best, best_error = chain, np.inf
-    cube = Rotation.create_group('O').as_matrix()
-    for candidates in (_closed_form(chain, arm, subset), cube):
-        for rotation in candidates:
-            start = _complete(chain, arm, subset, rotation)
+    determined: tuple[str, ...] = ()
+    best, least = chain, np.inf
+    for starts in _starts(chain, subset):
+        for start in starts:
             normal = normal_equations(start, names, system)
-            determined = determined or excited(factor_of(start, names, system, normal), names)
-            known = normal if len(determined) == len(names) else None
-            fitted = minimise(start, determined, system, tolerance=1e-3, normal=known).chain
-            error = _typical_error(fitted, subset)
-            if error < best_error:
-                best, best_error = fitted, error
-        if best_error <= GOOD * spread:
+            told = excited(factor_of(start, names, system, normal), names)
+            known = normal if len(told) == len(names) else None
+            fitted = minimise(start, told, system, tolerance=1e-3, normal=known).chain
+            # the median, which gross errors do not touch
+            error = np.median(np.linalg.norm(residual_arrays(fitted, subset)[0], axis=1))
+            if error < least:
+                best, least, determined = fitted, error, told
+        if least <= GOOD * spread:
             break
     return robust_fit(best, determined, system, loss).fit.chain
+
+
+def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
+    """Yield starts to polish, and further ones if none of those is good."""
+    arm = _flange(chain, observations)
+    if observations.plane:
+        yield _on_plane(chain, arm, observations)
+        return
+    yield closed_forms(chain, observations)
+    cube = Rotation.create_group('O').as_matrix()
+    yield (_complete(chain, arm, observations, rotation) for rotation in cube)
+
+
+def _flange(chain: Chain, observations: Observations) -> FloatArray:
+    """Return the poses (N, 4, 4) of the bare arm."""
+    arm = replace(chain, base=Frame(), tool=Frame())
+    return arm.forward(observations.joints, observations.approach)
+
+
+def movable(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
+    """Return the parameters of those of some frames that are not fixed."""
+    return [n for each in frames if not chain.frame(each).fixed for n in parameters_of(each)]
 
 
 def likened(
@@ -159,35 +153,9 @@ def likened(
 
 def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:
     """Yield the chain with base and tool for poses, positions or a socket, in closed form."""
-    if observations.socket:
-        yield _in_socket(chain, observations)
-        return
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
+    arm = _flange(chain, observations)
     for rotation in _closed_form(chain, arm, observations):
         yield _complete(chain, arm, observations, rotation)
-
-
-def _in_socket(chain: Chain, observations: Observations) -> Chain:
-    """Return the chain with its base moved, not turned, so that the tool stays at the origin.
-
-    0 = b + p_K + R_K t is linear in b and the tool's offset t.
-    """
-    arm = replace(chain, base=Frame(), tool=Frame()).forward(observations.joints)
-    tool, base = chain.frame('tool'), chain.frame('base')
-    tool_matrix, base_matrix = tool.matrix.copy(), np.eye(4)
-    if not tool.fixed:
-        turned = arm[:, :3, :3]
-        tool_matrix[:3, 3] += _shortest(turned, -(arm @ tool.matrix)[:, :3, 3], True)
-    base_matrix[:3, 3] = -(arm @ tool_matrix)[:, :3, 3].mean(axis=0)
-    return replace(
-        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
-    )
-
-
-def _typical_error(chain: Chain, observations: Observations) -> float:
-    """Return the median distance [m], which gross errors do not touch."""
-    predicted = chain.forward(observations.joints, observations.approach)[:, :3, 3]
-    return float(np.median(np.linalg.norm(observations.positions - predicted, axis=1)))
 
 
 def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
@@ -196,61 +164,52 @@ def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iter
     With the tool as it is given, and with one that is told by the heights alone.
     """
     assert observations.distances is not None
-    base, tool = chain.frame('base'), chain.frame('tool')
+    tool = chain.frame('tool')
     tips = [tool.matrix[:3, 3]]
-    turned = arm[:, :3, :3].reshape(-1, 9)
-    columns = np.column_stack([arm[:, :3, 3], turned, np.ones(len(arm))])
+    columns = np.column_stack([arm[:, :3, 3], arm[:, :3, :3].reshape(-1, 9), np.ones(len(arm))])
     if not tool.fixed and len(columns) > columns.shape[1]:  # one touch more than unknowns
         least = np.linalg.svd(columns, full_matrices=False)[2][-1]
         normal = least[:3]
         tips.append(normal @ least[3:12].reshape(3, 3) / max(float(normal @ normal), 1e-12))
     for tip in tips:
-        matrix = tool.matrix.copy()
-        matrix[:3, 3] = tip
-        start = chain if tool.fixed else replace(chain, tool=replace(tool, matrix=matrix))
-        if not base.fixed:
-            points = arm[:, :3, 3] + arm[:, :3, :3] @ tip
-            axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
-            axes[2] = np.cross(axes[0], axes[1])
-            place = se3.transform(axes, -axes @ points.mean(axis=0))
-            place[2, 3] += observations.distances.mean()
-            start = replace(start, base=replace(base, matrix=place))
-        yield start
+        points = arm[:, :3, 3] + arm[:, :3, :3] @ tip
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        axes[2] = np.cross(axes[0], axes[1])
+        place = se3.transform(axes, -axes @ points.mean(axis=0))
+        place[2, 3] += observations.distances.mean()
+        yield _placed(chain, place, se3.transform(tool.matrix[:3, :3], tip))
 
 
-def _trilaterated(
-    chain: Chain, arm: FloatArray, observations: Observations, robust: bool
-) -> Chain:
+def _placed(chain: Chain, base: FloatArray, tool: FloatArray) -> Chain:
+    """Return the chain with other matrices (4, 4) of those frames that are not fixed."""
+    for key, matrix in (('base', base), ('tool', tool)):
+        if not chain.frame(key).fixed:
+            chain = chain.with_frame(key, replace(chain.frame(key), matrix=matrix))
+    return chain
+
+
+def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
     """Return the chain placed by distances from the world's origin.
 
     L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
-    world, because no distance from its origin tells. Against gross errors it is solved for the
-    half of the samples that fits best, by the least median of many draws (Rousseeuw 1984).
+    world, because no distance from its origin tells.
     """
-    if chain.frame('base').fixed:
-        return chain
     assert observations.distances is not None
-    points = arm[:, :3, 3] + arm[:, :3, :3] @ chain.frame('tool').matrix[:3, 3]
+    tool = chain.frame('tool').matrix
+    points = (arm @ tool)[:, :3, 3]
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
-    chosen = np.arange(len(points))
-    if robust and len(points) > TELLING:
-        order = np.random.default_rng(0).random((STARTS, len(points))).argsort(axis=1)
-        draws = order[:, :TELLING]
-        found = (np.linalg.pinv(columns[draws]) @ wanted[draws, np.newaxis])[:, :3, 0]
-        lengths = np.linalg.norm(points + found[:, np.newaxis], axis=2)
-        misfits = np.abs(lengths - observations.distances)
-        best = misfits[np.argmin(np.median(misfits, axis=1))]
-        chosen = np.argsort(best)[: max(len(points) // 2, TELLING)]
-    matrix = np.eye(4)
-    matrix[:3, 3] = np.linalg.lstsq(columns[chosen], wanted[chosen], rcond=None)[0][:3]
-    return replace(chain, base=replace(chain.frame('base'), matrix=matrix))
+    place = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
+    return _placed(chain, se3.transform(np.eye(3), place), tool)
 
 
 def _closed_form(
     chain: Chain, arm: FloatArray, observations: Observations
 ) -> Iterator[FloatArray]:
     """Yield rotations of the base (3, 3) from what is given and from closed forms."""
+    if observations.socket:
+        yield np.eye(3)  # the world's axes are the base's
+        return
     if chain.base is not None:
         yield chain.base.matrix[:3, :3]
         if chain.base.fixed:
@@ -264,14 +223,11 @@ def _closed_form(
                 np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
             )
         system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
-        right = np.linalg.svd(system)[2]
-        for sign in (1.0, -1.0):  # the singular vector's sign is open, its determinant is not
-            matrix = sign * right[0].reshape(3, 3, order='F')
-            if np.linalg.det(matrix) > 0.0:
-                yield se3.nearest_rotation(matrix)
+        matrix = np.linalg.svd(system)[2][0].reshape(3, 3, order='F')
+        # the singular vector's sign is open, its determinant is not
+        yield se3.nearest_rotation(np.sign(np.linalg.det(matrix)) * matrix)
     positions = observations.positions - observations.positions.mean(axis=0)
-    tool_point = chain.frame('tool').matrix[:3, 3]
-    reached = arm[:, :3, 3] + arm[:, :3, :3] @ tool_point
+    reached = (arm @ chain.frame('tool').matrix)[:, :3, 3]
     yield se3.nearest_rotation(positions.T @ (reached - reached.mean(axis=0)))
     if len(arm) >= 16 and chain.tool is None:
         columns = np.concatenate([arm[:, :3, :3].reshape(-1, 9), arm[:, :3, 3]], axis=1)
@@ -301,11 +257,8 @@ def _complete(
         shift = _shortest(turned, left, not base.fixed)
         tool_matrix[:3, 3] += shift
         wanted -= turned @ shift
-    if not base.fixed:
-        base_matrix[:3, 3] = wanted.mean(axis=0)
-    return replace(
-        chain, base=replace(base, matrix=base_matrix), tool=replace(tool, matrix=tool_matrix)
-    )
+    base_matrix[:3, 3] = wanted.mean(axis=0)
+    return _placed(chain, base_matrix, tool_matrix)
 
 
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:

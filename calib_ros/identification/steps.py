@@ -8,10 +8,9 @@ residuals, a group explains, of the remaining squares,
 
     e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
 
-Products of all columns are computed once, part by part of the session, and summed from its end;
-they serve every stop. Gross errors excluded by the robust fit are included with bounded influence,
-because a step may hide there. Known distances between sockets are not: they say nothing about
-time.
+Products of all columns are summed from the end of the session and serve every stop. Gross errors
+excluded by the robust fit are included with bounded influence, because a step may hide there;
+known distances between sockets are not, for they say nothing about time.
 
 Unmodelled effects follow the joints, and no step in time explains more than half of their
 residuals. A drift is no step: a few cosines over the session explain it better.
@@ -25,13 +24,12 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from calib_ros.identification.configurations import stops
 from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, gram
-from calib_ros.identification.levels import SURE
+from calib_ros.identification.levels import SURE, chance_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import Robust, weights_of
@@ -101,13 +99,7 @@ class Step:
 def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:
     """Return the step that explains more than half of the residuals of a fit, if there is one."""
     scan = _Scan(problem, names, robust)
-    some = _some_places(scan.stops)
-    near = scan.best(some, 0.5 * EXPLAINED) if len(some) else None
-    if near is None:
-        return None
-    before, after = some[some < near.stop], some[some > near.stop]
-    first, last = before.max(initial=LEAST_ASIDE), after.min(initial=scan.stops - LEAST_ASIDE)
-    found = scan.best(np.arange(first, last + 1), EXPLAINED)
+    found = scan.best()
     return None if found is None or scan.drifts(found) else scan.described(found)
 
 
@@ -153,16 +145,13 @@ class _Scan:
     """The linear model at a fit, with columns of all that may have moved."""
 
     def __init__(self, problem: Problem, names: Sequence[str], robust: Robust) -> None:
-        self._chain = robust.fit.chain
+        self._problem, self._chain = problem, robust.fit.chain
         self._groups = _groups(problem)
-        self._images = [None if s.pixels is None else s.images for s in problem.sets]
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
-        self._names = [*names, *(name for name in self._added if name not in names)]
+        self._names = list(dict.fromkeys([*names, *self._added]))
         share = -(-robust.system.count // SOME)
         self._chosen = [np.arange(0, len(each), share) for each in problem.sets]
-        self._sigmas = (problem.sigma_position, problem.sigma_orientation)
-        self._oriented = any(kind.oriented for kind in problem.kinds)
         far = [d[index] for d, index in zip(robust.distances, self._chosen, strict=True)]
         self._weights = [weights_of(each, robust.loss) for each in far]
         bounded = 'none' if robust.loss == 'none' else 'huber'
@@ -174,7 +163,7 @@ class _Scan:
         number = np.empty(len(order), dtype=np.intp)
         number[order] = stops(np.concatenate([each.joints for each in sets])[order])
         self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
-        self.stops = int(number.max(initial=-1)) + 1
+        self._stops = int(number.max(initial=-1)) + 1
         extra, offset = replace(few, separations=()).extra_rows(self._chain, names)
         whole = np.array([gram(rows) for rows in self._rows])
         matrix = whole.sum(axis=0)[: self._fitted]
@@ -185,8 +174,26 @@ class _Scan:
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
 
-    def best(self, places: NDArray[np.intp], least: float) -> _Found | None:
-        """Return the best step at one of the stops, if it explains that share of the squares."""
+    def _of(self, group: _Group) -> tuple[float, float, float]:
+        """Return the equations of a group's sets, their freedom, and the squares left there."""
+        sets = list(group.sets)
+        equations = float(self._equations[sets].sum())
+        freedom = equations * (1.0 - self._fitted / float(self._equations.sum()))
+        return equations, freedom, float(self._left[sets].sum())
+
+    def best(self) -> _Found | None:
+        """Return the best step at one of the stops, if it explains most of the squares."""
+        some = _some_places(self._stops)
+        near = self._best_of(some, 0.5 * EXPLAINED) if len(some) else None
+        if near is None:
+            return None
+        before, after = some[some < near.stop], some[some > near.stop]
+        first = before.max(initial=LEAST_ASIDE)
+        last = after.min(initial=self._stops - LEAST_ASIDE)
+        return self._best_of(np.arange(first, last + 1), EXPLAINED)
+
+    def _best_of(self, places: NDArray[np.intp], least: float) -> _Found | None:
+        """Return the best step at some stops, if it explains that share of the squares."""
         products = self._to_the_end(places)
         own = products[:, :, [self._names.index(name) for name in self._added]]
         cross = products[:, :, : self._fitted] @ self._root
@@ -194,7 +201,7 @@ class _Scan:
         vector = products[:, :, -1] - cross @ self._known
         scale = 1.0 / np.sqrt(np.maximum(np.einsum('bii->bi', own), 1e-300))
         found: _Found | None = None
-        lowest = np.inf
+        lowest, total = np.inf, float(self._left.sum())
         for group in self._groups:
             columns = [self._added.index(name) for name in group.names]
             size = scale[:, columns]
@@ -204,9 +211,7 @@ class _Scan:
             rank = good.sum(axis=1)
             along = np.einsum('bij,bi->bj', axes, size * vector[:, columns]) * good
             inverse = 1.0 / np.where(good, values, 1.0)
-            equations = self._equations[list(group.sets)].sum()
-            freedom = equations * (1.0 - self._fitted / self._equations.sum())
-            left = self._left[list(group.sets)].sum()
+            equations, freedom, left = self._of(group)
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
             gain = (along**2 * inverse).sum(axis=1)
@@ -214,22 +219,17 @@ class _Scan:
             k = int(np.argmax(share))
             rest = (1.0 - share[k]) / (freedom - rank[k])
             beyond = 1.0 - rest * freedom
-            chance = self.stops * len(self._groups) * self._chance(float(gain[k]), int(rank[k]))
+            # of the squares of all sets: those of one with few equations may be of no freedom
+            whole = float(self._equations.sum()) - self._fitted - float(rank[k])
+            squares = float(gain[k]) * whole / max(total - float(gain[k]), 1e-300)
+            trials = self._stops * len(self._groups)
+            by_chance = trials * chance_of(squares, max(int(rank[k]), 1), whole)
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
-            if beyond > least and chance < 1.0 - SURE and criterion < lowest:
+            if beyond > least and by_chance < 1.0 - SURE and criterion < lowest:
                 lowest = criterion
                 change = size[k] * (axes[k] @ (along[k] * inverse[k]))
                 found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))
         return found
-
-    def _chance(self, gain: float, rank: int) -> float:
-        """Return how probable it is that a step explains as many of the squares of white noise.
-
-        Of those of all sets: what is left of one with few equations may be no freedom at all.
-        """
-        freedom = float(self._equations.sum()) - self._fitted - rank
-        rest = max(float(self._left.sum()) - gain, 1e-300)
-        return float(special.fdtrc(max(rank, 1), freedom, gain / max(rank, 1) * freedom / rest))
 
     def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
         """Return (B, K, P + 1) the products of what may have moved with all columns.
@@ -250,7 +250,7 @@ class _Scan:
 
     def drifts(self, found: _Found) -> bool:
         """Tell whether a slow drift of the same group explains more than the step."""
-        slow = slow_cosines(self.stops)[1:]
+        slow = slow_cosines(self._stops)[1:]
         if not len(slow):
             return False
         columns = [self._names.index(name) for name in found.group.names]
@@ -263,24 +263,20 @@ class _Scan:
         own = matrix[self._fitted : -1, self._fitted : -1]
         root = inverse_root(own - cross.T @ cross, np.diag(own))
         gain = root.T @ (matrix[self._fitted : -1, -1] - cross.T @ self._known)
-        sets = list(found.group.sets)
-        equations = self._equations[sets].sum()
-        freedom = equations * (1.0 - self._fitted / self._equations.sum()) - root.any(axis=0).sum()
-        if freedom <= 0.0:
-            return False
-        return bool((self._left[sets].sum() - gain @ gain) / freedom < found.variance)
+        _, freedom, left = self._of(found.group)
+        freedom -= float(root.any(axis=0).sum())
+        return freedom > 0.0 and float(left - gain @ gain) / freedom < found.variance
 
     def described(self, found: _Found) -> Step:
         """Return a step with its first sample, and the size of what it did to the poses."""
-        group = found.group
+        group, problem = found.group, self._problem
         first: list[tuple[int, int, int]] = []
         moved: list[FloatArray] = []
         weights: tuple[list[FloatArray], list[FloatArray]] = ([], [])
         for number in group.sets:
             each = self._sets[number]
             after = self._numbers[number] >= found.stop
-            stamps = each.stamps_ns[after].tolist()
-            samples = self._chosen[number][after].tolist()
+            stamps, samples = each.stamps_ns[after].tolist(), self._chosen[number][after].tolist()
             first += [(stamp, number, k) for stamp, k in zip(stamps, samples, strict=True)]
             model = ErrorModel(self._chain, group.names, each.base, each.tool)
             moved.append(model.jacobian(each.joints[after]) @ found.size)
@@ -288,16 +284,15 @@ class _Scan:
                 side.append(self._weights[number][which])
         stamp, of_set, sample = min(first)
         change = np.sqrt((np.concatenate(moved) ** 2).mean(axis=0))
-        shift, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+        size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+        unit, oriented = 'm', any(kind.oriented for kind in problem.kinds)
         if group.kind == 'joint':
             size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
-        elif self._oriented and turn * self._sigmas[0] > shift * self._sigmas[1]:
+        elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'
-        else:
-            size, unit = shift, 'm'
         outside = not all(np.concatenate(side).any() for side in weights)
-        images = self._images[of_set]
-        image = None if images is None else int(images[sample])
+        seen = problem.sets[of_set]
+        image = None if seen.pixels is None else int(seen.images[sample])
         where = (of_set, sample, stamp)
         return Step(group.what, group.kind, *where, size, unit, found.share, outside, image)
 

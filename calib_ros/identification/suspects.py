@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from typing import TypeAlias
 
 import numpy as np
@@ -14,7 +15,7 @@ from calib_ros.identification.levels import NEARER
 from calib_ros.identification.misread import Turn, misread
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain import Chain, Convention
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -23,32 +24,39 @@ Change: TypeAlias = Callable[[Observations], Observations]
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
+NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
     """A mistake that may have been made, in words, and the option to give with a table.
 
-    `change` makes of the samples those that should have been given, `chain` is the nominal one as
-    it had to be; joint values stand so many `rows` below their measurement. Of those that explain
-    the same, the lowest in `rank` are named. `published` is what to do about messages, live or of
-    a bag. Mistakes of different parts, what is `measured` or a `joint`, may come together.
+    `changes`, one after the other, make of the samples those that should have been given, `chain`
+    is the nominal one as it had to be; joint values stand so many `rows` below their measurement.
+    Of those that explain the same, the lowest in `rank` are named. `published` is what to do about
+    messages, live or of a bag. Mistakes of different parts, what is `measured` or a `joint`, may
+    come together.
     """
 
     what: str
     remedy: str
-    change: Change
+    changes: tuple[Change, ...] = ()
     rank: int = 1
     chain: Chain | None = None
     rows: int = 0
     published: str = 'correct it where it is published'
     part: str = ''
 
+    def undone(self, sets: Sets) -> Sets:
+        """Return the samples that should have been given."""
+        for change in self.changes:
+            sets = tuple(map(change, sets))
+        return sets
+
 
 ORIENTATIONS = Suspect(
     'the positions fit the arm, the orientations do not',
     'check their convention, their units and their columns, or leave them out',
-    lambda each: each,
     published='check the orientations where they are published',
 )
 """What is left to say where no other mistake explains what was measured."""
@@ -66,20 +74,14 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
             yield replace(each, remedy=remedy)
         return
     if not any(each.socket for each in sets):
-        degrees = _turned(chain, np.radians(1.0))
-        yield from _measured(_units(chain, degrees))
-        if all(each.oriented.any() for each in sets):
-            whole = all(each.oriented.all() for each in sets)
-            in_mm = _lengths(chain, SCALES['mm'])
-            inverse = any(each.inverse for each in sets)
-            yield from _measured(_conventions(in_mm, degrees, inverse, whole))
-            yield from _misread(chain, sets[0])
-        yield Suspect(
-            'the axes of the measuring device are left-handed',
-            'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)',
-            _mirrored,
-            3,
-        )
+        (seen,) = sets
+        yield from _measured(_units(chain))
+        if seen.oriented.any():
+            yield from _measured(_conventions(chain, seen))
+            yield from _misread(chain, seen)
+        remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
+        what = 'the axes of the measuring device are left-handed'
+        yield Suspect(what, remedy, (_mirrored,), 3)
     yield from _of_places(chain)
 
 
@@ -95,194 +97,174 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
         ('radians', 'degrees', 'rad', np.degrees(1.0)),
     ):
         what = f'the joint values are in {one}, not {other}'
-        yield Suspect(what, f'--joint-angle {unit}', _turned(chain, size), part='measured')
+        change = _of_kind(chain, 'revolute', size)
+        yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
     yield from _of_joints(chain)
     yield from _of_arms(chain)
     for rows in (1, -1, 2, -2):
         where = 'below' if rows > 0 else 'above'
         count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
-        yield Suspect(
-            f'the joint values stand {count} {where} the measurement that they belong to',
-            f'--shift {rows}',
-            _as_it_is,
-            2,
-            rows=rows,
-            published='check the stamps, and delay',
-        )
+        what = f'the joint values stand {count} {where} the measurement that they belong to'
+        published = 'check the stamps, and delay'
+        yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
 
 
 def _of_boards(inverse: bool) -> Iterator[Suspect]:
     """Yield what may be wrong about a camera and its board."""
-    ways = (
-        ('the camera is on the flange', '--eye-in-hand (or eye_in_hand)', 'true'),
-        ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)', 'false'),
-    )
-    what, remedy, value = ways[inverse]
-    in_sources = f'set eye_in_hand={value} in sources'
-    yield Suspect(what, remedy, Observations.inverted, published=in_sources)
+    what, remedy = 'the camera is on the flange', '--eye-in-hand (or eye_in_hand)'
+    if inverse:
+        what, remedy = NOT_ON_FLANGE
+    yield Suspect(what, remedy, (Observations.inverted,), published=_in_sources(not inverse))
     for unit, size in SCALES.items():
         remedy = 'give square and marker in metres'
         what = f'the lengths of the board are in {unit}, not metres'
-        yield Suspect(what, remedy, _scaled(size), published=remedy)
+        yield Suspect(what, remedy, (_scaled(size),), published=remedy)
     remedy = 'give images and corners as the camera sees them, u to the right and v down'
-    yield Suspect('the images are mirrored', remedy, _mirrored, published=remedy)
+    yield Suspect('the images are mirrored', remedy, (_mirrored,), published=remedy)
 
 
-def _units(chain: Chain, degrees: Change) -> Iterator[Suspect]:
+def _in_sources(on_flange: bool) -> str:
+    return f'set eye_in_hand={str(on_flange).lower()} in sources'
+
+
+def _units(chain: Chain) -> Iterator[Suspect]:
     """Yield units of lengths, and of angles at the same time."""
-    linear = [k for k, joint in enumerate(chain.joints, 1) if joint.type == 'prismatic']
-    what = 'positions and linear joints' if linear else 'positions'
+    linear = [f'q{k}' for k, joint in enumerate(chain.joints, 1) if joint.type == 'prismatic']
+    whole = 'positions and linear joints' if linear else 'positions'
+    degrees = _of_kind(chain, 'revolute', np.radians(1.0))
     for unit, size in SCALES.items():
         for way, option, factor in (
             (f'in {unit}, not metres', f'--length {unit}', size),
             (f'in metres, not {unit}', '--length m', 1.0 / size),
         ):
-            scaled, positions = _lengths(chain, factor), _scaled(factor)
-            yield Suspect(f'the {what} are {way}', option, scaled)
-            yield Suspect(
-                f'the {what} are {way} and the joint values in degrees',
-                f'{option} --joint-angle deg',
-                _one_by_one(scaled, degrees),
-                2,
-            )
+            positions, travels = lengths = _lengths(chain, factor)
+            what = f'the {whole} are {way}'
+            yield Suspect(what, option, lengths)
+            both = f'{what} and the joint values in degrees'
+            yield Suspect(both, f'{option} --joint-angle deg', (*lengths, degrees), 2)
             if linear:
-                alone = _one_by_one(scaled, _scaled(1.0 / factor))
                 for name, columns, change in (
                     ('positions', 'xyz', positions),
-                    ('linear joints', [f'q{k}' for k in linear], alone),
+                    ('linear joints', linear, travels),
                 ):
                     option = ','.join(f'{each}={each}*{factor:g}' for each in columns)
-                    yield Suspect(f'the {name} are {way}', f'--columns {option}', change, 2)
+                    yield Suspect(f'the {name} are {way}', f'--columns {option}', (change,), 2)
 
 
-def _conventions(in_mm: Change, degrees: Change, inverse: bool, whole: bool) -> Iterator[Suspect]:
+def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too.
 
-    Only `whole` poses, all with an orientation, may be those of a camera on the flange.
+    Only poses that all have an orientation may be those of a camera on the flange.
     """
-    flange = (
-        'the poses are those of the world in the target, as by a camera on the flange',
-        '--eye-in-hand (or --inverse, where the device stands)',
-    )
-    in_sources = 'set eye_in_hand=true in sources'
-    if inverse:
-        flange = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
-        in_sources = 'set eye_in_hand=false in sources'
-    again: Change = Observations.inverted if inverse else _as_it_is
-    ways: tuple[tuple[str, str, Change], ...] = (
+    back = (Observations.inverted,) if seen.inverse else ()  # to the poses as they were measured
+    ways: list[tuple[str, str, tuple[Change, ...], str]] = [
         (
             'the quaternions are w x y z, not x y z w',
             '--quaternion wxyz',
-            _one_by_one(_reordered([1, 2, 3, 0]), again),
+            (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])), *back),
+            '',
         ),
         (
             'the quaternions are x y z w, not w x y z',
             '--quaternion xyzw',
-            _one_by_one(_reordered([3, 0, 1, 2]), again),
+            (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])), *back),
+            '',
         ),
         (
             'the rotations are transposed, those of the device in the target',
             '--columns qx=-qx,qy=-qy,qz=-qz',
-            _one_by_one(_transposed, again),
+            (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
+            '',
         ),
-        (*flange, _as_it_is if inverse else Observations.inverted),
-    )
-    for what, remedy, change in ways if whole else ways[:-1]:
+    ]
+    if seen.inverse:
+        ways.append((*NOT_ON_FLANGE, (), _in_sources(False)))
+    elif seen.oriented.all():
+        what = 'the poses are those of the world in the target, as by a camera on the flange'
+        remedy = '--eye-in-hand (or --inverse, where the device stands)'
+        ways.append((what, remedy, (Observations.inverted,), _in_sources(True)))
+    in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))
+    for what, remedy, changes, published in ways:
         for more, option, others in (
             ('', '', ()),
-            (', and the positions in mm', ' --length mm', (in_mm,)),
+            (', and the positions in mm', ' --length mm', in_mm),
             (', and the joint values in degrees', ' --joint-angle deg', (degrees,)),
             (
                 ', the positions in mm and the joint values in degrees',
                 ' --length mm --joint-angle deg',
-                (in_mm, degrees),
+                (*in_mm, degrees),
             ),
         ):
-            found = Suspect(
-                f'{what}{more}',
-                f'{remedy}{option}',
-                _one_by_one(_as_measured, *others, change),
-                2 if more else 1,
-            )
-            if (what, remedy) == flange:
+            rank = 2 if more else 1
+            found = Suspect(what + more, remedy + option, (*back, *others, *changes), rank)
+            if published:
                 rest = ', and correct the rest where it is published' if more else ''
-                found = replace(found, published=in_sources + rest)
+                found = replace(found, published=published + rest)
             yield found
 
 
-def _misread(chain: Chain, each: Observations) -> Iterator[Suspect]:
+def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     """Yield other conventions that the rotations may have been written in.
 
     Base and tool leave the angle between two poses as it is: it must be that between two flanges.
     """
-    arm = replace(chain, base=None, tool=None).forward(each.joints)[each.oriented, :3, :3]
+    arm = replace(chain, base=None, tool=None).forward(seen.joints)[seen.oriented, :3, :3]
     between = se3.angles_between(arm[:-1], arm[1:])
 
-    def away(rotations: FloatArray) -> float:
-        some = rotations[each.oriented]
+    def away(each: Observations) -> float:
+        some = each.rotations[each.oriented]
         return float(np.median(np.abs(se3.angles_between(some[:-1], some[1:]) - between)))
 
-    largest = NEARER * max(away(each.rotations), float(np.median(between)))
-    again: Change = Observations.inverted if each.inverse else _as_it_is
+    largest = NEARER * max(away(seen), float(np.median(between)))
+    back = (Observations.inverted,) if seen.inverse else ()
     for what, remedy, turn in misread():
-        change = _one_by_one(_as_measured, _with(turn), again)
-        if away(change(each).rotations) < largest:
-            yield Suspect(what, remedy, change, 2)
+        found = Suspect(what, remedy, (*back, _with(turn), *back), 2)
+        if away(*found.undone((seen,))) < largest:
+            yield found
 
 
 def _of_joints(chain: Chain) -> Iterator[Suspect]:
     """Yield signs, zeros, order and couplings of joints."""
     names = chain.joint_names
-    count = len(names)
+    same = np.eye(len(names))
     revolute = [joint.type == 'revolute' for joint in chain.joints]
-    for k in range(count):
-        for sign in (1.0, -1.0):
-            zeros = {'': 0.0, **(QUARTERS if revolute[k] else {})}
-            for degrees, angle in zeros.items():
-                if sign < 0.0 or degrees:
-                    yield _of_joint(chain, k, sign, degrees, angle)
-    for i in range(count):
-        for j in range(i + 1, count):
-            order = np.arange(count)
-            order[[i, j]] = j, i
-            yield Suspect(
-                f'{names[i]} and {names[j]} are swapped',
-                f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}',
-                _joints(np.eye(count)[order]),
-                2,
-                published='swap them in joint_names',
-            )
-    for k in range(1, count):
-        for sign in (1.0, -1.0) if revolute[k] and revolute[k - 1] else ():
-            coupled = np.eye(count)
-            coupled[k, k - 1] = sign
-            yield Suspect(
-                f'{names[k]} is not given against {names[k - 1]}: they are coupled',
-                f'--columns q{k + 1}=q{k + 1}{"+" if sign > 0.0 else "-"}q{k}',
-                _joints(coupled),
-                2,
-            )
+    for k in range(len(names)):
+        zeros = {'': 0.0, **(QUARTERS if revolute[k] else {})}
+        for sign, (degrees, angle) in product((1.0, -1.0), zeros.items()):
+            if sign < 0.0 or degrees:
+                yield _of_joint(chain, k, sign, degrees, angle)
+    for i, j in combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[i, j]] = j, i
+        what = f'{names[i]} and {names[j]} are swapped'
+        remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
+        published = 'swap them in joint_names'
+        yield Suspect(what, remedy, (_joints(same[order]),), 2, published=published)
+    for k in range(1, len(names)):
+        for way in '+-' if revolute[k] and revolute[k - 1] else '':
+            coupled = same.copy()
+            coupled[k, k - 1] = float(f'{way}1')
+            what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
+            remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
+            yield Suspect(what, remedy, (_joints(coupled),), 2)
 
 
 def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
     """Return that a joint counts the other way round, has another zero [rad], or both."""
-    whats, in_file, column = [], [], f'q{k + 1}'
+    parts, column = [], f'q{k + 1}'
     if sign < 0.0:
-        whats.append('counts the other way round')
-        in_file.append(f'sign: {-chain.joints[k].sign}')
+        parts.append(('counts the other way round', f'sign: {-chain.joints[k].sign}'))
         column = f'-{column}'
     if degrees:
-        whats.append(f'has its zero {degrees[1:]} degrees away')
-        in_file.append(f'theta {degrees} degrees')
+        parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
         column += f'{degrees[0]}{abs(angle):.16g}'
-    count = len(chain.joints)
-    matrix = np.eye(count)
-    matrix[k, k] = sign
+    whats, in_file = zip(*parts, strict=True)
+    own = np.eye(len(chain.joints))[k]
     remedy = f'{" and ".join(in_file)} in the chain file'
     return Suspect(
         f'{chain.joint_names[k]} {" and ".join(whats)}',
         f'{remedy}, or --columns q{k + 1}={column}',
-        _joints(matrix, angle * np.eye(count)[k]),
+        (_joints(np.diag(np.where(own, sign, 1.0)), angle * own),),
         len(whats),
         published=remedy,
         part=chain.joint_names[k],
@@ -292,64 +274,37 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, and other arms with the same kinds of joints."""
     small = [replace(j, a=SCALES['mm'] * j.a, d=SCALES['mm'] * j.d) for j in chain.joints]
+    what = 'the lengths of the chain file are in mm, not metres'
     remedy = 'give a and d in metres there'
-    yield Suspect(
-        'the lengths of the chain file are in mm, not metres',
-        remedy,
-        _as_it_is,
-        chain=replace(chain, joints=tuple(small)),
-        published=remedy,
-    )
-    other = 'modified' if chain.convention == 'standard' else 'standard'
-    yield Suspect(
-        f'the DH table is in the {other} convention, not the {chain.convention} one',
-        f'convention: {other} in the chain file',
-        _as_it_is,
-        3,
-        replace(
-            chain, convention='modified' if other == 'modified' else 'standard', parallel=None
-        ),
-        published=f'convention: {other} in the chain file',
-    )
+    arm = replace(chain, joints=tuple(small))
+    yield Suspect(what, remedy, chain=arm, published=remedy)
+    other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
+    what = f'the DH table is in the {other} convention, not the {chain.convention} one'
+    remedy = f'convention: {other} in the chain file'
+    arm = replace(chain, convention=other, parallel=None)
+    yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
     types = [joint.type for joint in chain.joints]
     for ours in shipped_chains():
         alike = [joint.type for joint in ours.joints] == types
         if alike and not np.allclose(ours.table, chain.table, atol=1e-6):
-            yield Suspect(
-                f'the arm is a {ours.name}, not a {chain.name}',
-                f'--chain {ours.name}',
-                _as_it_is,
-                2,
-                replace(ours, base=chain.base, tool=chain.tool),
-                published=f'set chain to {ours.name}',
-            )
-
-
-def _as_it_is(each: Observations) -> Observations:
-    return each
-
-
-def _one_by_one(*changes: Change) -> Change:
-    def changed(each: Observations) -> Observations:
-        for change in changes:
-            each = change(each)
-        return each
-
-    return changed
+            what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'
+            published = f'set chain to {ours.name}'
+            arm = replace(ours, base=chain.base, tool=chain.tool)
+            yield Suspect(what, remedy, rank=2, chain=arm, published=published)
 
 
 def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
     return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
 
 
-def _turned(chain: Chain, size: float) -> Change:
-    return _joints(np.diag([size if j.type == 'revolute' else 1.0 for j in chain.joints]))
+def _of_kind(chain: Chain, kind: str, size: float) -> Change:
+    """Return a change of the values of joints of one kind."""
+    return _joints(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
 
 
-def _lengths(chain: Chain, size: float) -> Change:
+def _lengths(chain: Chain, size: float) -> tuple[Change, Change]:
     """Return what `--length` changes: positions and the values of prismatic joints."""
-    sizes = [size if joint.type == 'prismatic' else 1.0 for joint in chain.joints]
-    return _one_by_one(_scaled(size), _joints(np.diag(sizes)))
+    return _scaled(size), _of_kind(chain, 'prismatic', size)
 
 
 def _scaled(size: float) -> Change:
@@ -358,18 +313,6 @@ def _scaled(size: float) -> Change:
 
 def _with(turn: Turn) -> Change:
     return lambda each: replace(each, rotations=turn(each.rotations))
-
-
-def _reordered(order: list[int]) -> Change:
-    return _with(lambda rotations: se3.from_quat(se3.to_quat(rotations)[:, order]))
-
-
-def _transposed(each: Observations) -> Observations:
-    return replace(each, rotations=np.swapaxes(each.rotations, 1, 2))
-
-
-def _as_measured(each: Observations) -> Observations:
-    return each.inverted() if each.inverse else each
 
 
 def _mirrored(each: Observations) -> Observations:

@@ -5,13 +5,12 @@
 Scale. A device with a scale error s makes all lengths of the arm seem to grow alike; so does its
 temperature. With L the derivative of the fitted lengths by s (the frames take their share), x
 their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s, with tau
-estimated from the scatter about the line (Paule and Mandel 1982). An arm's own offsets scatter and
-make s uncertain. No arm grows by more than LARGEST_SCALE: aluminium grows by 23 ppm a degree. A
-scale certainly beyond it is the device's, and the result is refused, because it is good in the
-device's metres only; a smaller one may be the arm's own growth, and a remark says so.
+estimated from the scatter about the line (Paule and Mandel 1982), as an arm's own offsets scatter.
+A scale certainly beyond what any arm grows by is the device's: the result is refused, because it
+is good in the device's metres only. A smaller one may be the arm's own growth.
 
-Sister. Among the shipped robots with as many joints, one may be much closer to the identified arm
-than the nominal one, by the positions that both reach in the best base and tool.
+Sister. One of the shipped robots may be much closer to the identified arm than the nominal one, by
+the positions that both reach in the best base and tool.
 
 Gravity. If effects of gravity are fitted, another direction may explain clearly more than the
 given one. The base frame found does not tell which way is up: the device may have any orientation.
@@ -40,7 +39,7 @@ from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
@@ -74,27 +73,16 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
 
     The freedom is zero where there are not three lengths to tell.
     """
-    chain = result.chain
-    arm = [n for n in chain.parameter_names if not chain.owns_frame(n)]
-    lengths = [n for n in arm if Parameter(n).is_length and chain.value(n) != 0.0]
-    fitted = [i for i, n in enumerate(result.names) if n in arm and Parameter(n).is_length]
+    chain, first = result.chain, problem.sets[0]
+    arm = [n for n in chain.parameter_names if n.is_length and not chain.owns_frame(n)]
+    lengths: dict[str, float] = {n: problem.model.value(n) for n in arm if chain.value(n) != 0.0}
+    fitted = [i for i, n in enumerate(result.names) if n in arm]
     if len(fitted) < 3 or not lengths:
         return 0.0, np.inf, 0.0
-    first = problem.sets[0]
-    grown = growth(
-        chain,
-        result.names,
-        {n: problem.model.value(n) for n in lengths},
-        (first.base, first.tool),
-        first.spread().joints,
-        bool(first.oriented.any()),
-    )
-    offsets: dict[str, float] = {p.name: p.offset for p in result.parameters}
-    return _common(
-        np.array([offsets[result.names[i]] for i in fitted]),
-        grown[fitted],
-        result.covariance[np.ix_(fitted, fitted)],
-    )
+    ends, joints = (first.base, first.tool), first.spread().joints
+    grown = growth(chain, result.names, lengths, ends, joints, bool(first.oriented.any()))
+    offsets = np.array([chain.offset(result.names[i], problem.model) for i in fitted])
+    return _common(offsets, grown[fitted], result.covariance[np.ix_(fitted, fitted)])
 
 
 def _common(
@@ -121,15 +109,14 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     if abs(scale) < limit:
         return '', False
     certain = abs(scale) - limit > LARGEST_SCALE
-    growth = f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by '
-    growth += f'{_percent(abs(scale))} (sigma {_percent(std)}): '
-    if certain:
-        return f'{growth}no arm does', True
-    return f'{growth}check the scale of the measuring device, and the temperature', False
-
-
-def _percent(share: float) -> str:
-    return f'{np.format_float_positional(100.0 * share, 2, fractional=False, trim="-")} %'
+    size, sigma = (
+        np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
+        for share in (abs(scale), std)
+    )
+    way = 'grow' if scale > 0.0 else 'shrink'
+    text = f'all lengths of the arm {way} alike, by {size} % (sigma {sigma} %): '
+    advice = 'check the scale of the measuring device, and the temperature'
+    return text + ('no arm does' if certain else advice), certain
 
 
 def _sister(problem: Problem, result: Identification) -> str:
@@ -140,10 +127,8 @@ def _sister(problem: Problem, result: Identification) -> str:
     types = [joint.type for joint in problem.chain.joints]
     joints = problem.sets[0].spread().joints
     nominal = _apart(problem.chain, result.chain, joints)
-    found = []
-    for each in shipped_chains():
-        if [joint.type for joint in each.joints] == types:
-            found.append((_apart(each, result.chain, joints), each.name))
+    alike = [each for each in shipped_chains() if [j.type for j in each.joints] == types]
+    found = [(_apart(each, result.chain, joints), each.name) for each in alike]
     distance, name = min(found, default=(np.inf, ''))
     if distance > NEARER * nominal:
         return ''
@@ -166,14 +151,12 @@ def _gravity(problem: Problem, result: Identification) -> str:
         return ''
     rest = [name for name in result.names if name not in bent]
     straight = result.chain.with_offsets({n: -result.chain.value(n) for n in bent})
-    size = float(np.linalg.norm(problem.chain.gravity))
-    explained = {}
-    for k, words in enumerate('xyz'):  # the sign is the coefficients'
-        x, y, z = (size * np.eye(3)[k]).tolist()
-        chain = replace(straight, gravity=(x, y, z))
-        explained[words] = _explained(problem, chain, rest, bent)
     given = _explained(problem, straight, rest, bent)
-    words, best = max(explained.items(), key=lambda pair: pair[1])
+    best, words = 0.0, ''
+    for axis, along in zip('xyz', np.linalg.norm(problem.chain.gravity) * np.eye(3), strict=True):
+        x, y, z = along.tolist()  # the sign is the coefficients'
+        share = _explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
+        best, words = max((best, words), (share, axis))
     if not best - given > EXPLAINED * (1.0 - given):
         return ''
     return (
@@ -213,15 +196,12 @@ def _explained(
     few = [each.spread() for each in problem.sets]
     rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
     count = len(fitted)
-    scale = np.linalg.norm(rows, axis=0)
-    scale[scale == 0.0] = 1.0
-    rows = rows / scale
     if len(rows) - count - len(added) < len(rows) // 3:
         return 0.0
-    factor = np.asarray(np.linalg.qr(rows, mode='r'))
+    scale = np.linalg.norm(rows, axis=0)
+    scale[scale == 0.0] = 1.0
+    factor = np.asarray(np.linalg.qr(rows / scale, mode='r'))
     rest = factor[count:, count:]  # what those fitted cannot follow
-    residual = rest[:, -1]
-    total = float(residual @ residual)
-    solution = np.linalg.lstsq(rest[:, :-1], residual, rcond=1e-6)[0]
-    gone = residual - rest[:, :-1] @ solution
+    gone = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
+    total = float(rest[:, -1] @ rest[:, -1])
     return 1.0 - float(gone @ gone) / total if total > 0.0 else 0.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from measured import bent
 
-from calib_ros.identification.device import bends
+from calib_ros.identification.considered import bends
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.identification.fingerprint import KEPT, Fingerprint, reused_in_words
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.records import KEPT, Fingerprint, reused_in_words
 
 
 def rows(count, seed=0):
