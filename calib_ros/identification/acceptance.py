@@ -26,6 +26,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import special
 
 from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
@@ -33,6 +35,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
 from calib_ros.identification.validation import COUNTS, Comparison, ParameterRow, log_gain
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
 
 
@@ -143,8 +146,10 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
     if validation.outliers:
         first, second = validation.figures_of_all
         pairs = (validation.before.position, validation.after.position)
-        gain, limit = log_gain(*pairs, validation.after.configurations, CERTAIN)
-        if second.mean_mm > first.mean_mm or gain < -max(limit, COUNTS):
+        numbers = validation.after.configurations
+        gain, limit = log_gain(*pairs, numbers, CERTAIN)
+        limit = max(limit, _loss_by_chance(*pairs, numbers), COUNTS)
+        if second.mean_mm > first.mean_mm or gain < -limit:
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
                 f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
@@ -170,6 +175,23 @@ def _of_harm(found: Findings, validation: Comparison) -> Iterator[Reason]:
                 f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
                 f'before, {after.rms_mrad:.3f} mrad after)',
             )
+
+
+def _loss_by_chance(
+    before: FloatArray, after: FloatArray, configurations: NDArray[np.intp]
+) -> float:
+    """Return how large chance could make the logarithm of RMS after / RMS before, with outliers.
+
+    A gross error far larger than the correction gets larger or smaller by it as chance will have
+    it: Student's t of the differences (N, 3) of squares, to which one outlier is one.
+    """
+    squares = np.stack([(each**2).sum(axis=1) for each in (before, after)])
+    known = ~np.isnan(squares).any(axis=0)
+    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+    error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(len(sizes))
+    likely = special.stdtrit(len(sizes) - 1, CERTAIN) * error
+    return 0.5 * float(likely / max(means[0].mean(), 1e-300))
 
 
 def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
