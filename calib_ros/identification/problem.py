@@ -8,6 +8,7 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,8 +114,15 @@ class Problem(Shown):
     def __post_init__(self) -> None:
         """Check what does not depend on the measured values."""
         for name, sigma in self.sigmas.items():
-            if not 0.0 < sigma < np.inf:
+            if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
+        if not isinstance(self.folds, Integral):
+            raise ConfigError(f'folds must be an integer, not {self.folds}')
+        for name in ('fixed', 'effects'):
+            if isinstance(getattr(self, name), str):
+                raise ConfigError(f'{name} must be a list of names, not "{getattr(self, name)}"')
+        if isinstance(self.more, Observations):
+            raise ConfigError('more must be a list of observations, not one of them')
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()
