@@ -276,6 +276,11 @@ class Observations(Shown):
         )
 
     @property
+    def moving(self) -> bool:
+        """Tell whether the arm moved while it was measured, so that a delay matters."""
+        return self.velocity is not None and bool(self.velocity.any())
+
+    @property
     def camera(self) -> str:
         """Return the frame of the camera that saw the pixels."""
         return self.tool if self.on_flange else self.base

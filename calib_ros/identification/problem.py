@@ -212,7 +212,7 @@ class Problem(Shown):
             identifiability.Kind(
                 bool(each.oriented.any()) or each.pixels is not None,
                 each.distances is not None,
-                each.velocity is not None,
+                each.moving,
                 each.base,
                 each.tool,
                 each.socket,
@@ -230,7 +230,7 @@ class Problem(Shown):
         chain = replace(chain, frames=tuple((known | dict.fromkeys(sorted(added))).items()))
         for each in self.sets:
             device = chain.frame(each.base)
-            if each.velocity is not None and device.delay is None:
+            if each.moving and device.delay is None:
                 start = 0.0 if each.delay is None else float(np.median(each.delay))
                 chain = chain.with_frame(each.base, replace(device, delay=start))
         wanted = [each for name in self.effects for each in effects.resolve(chain, name)]

@@ -293,3 +293,13 @@ def test_one_set_is_no_list_of_further_ones():
     _, _, seen = measured_arm(1, 12)
     with pytest.raises(ConfigError, match='more must be a list'):
         Problem(UR10E, seen, more=seen)
+
+
+def test_velocities_of_an_arm_that_stands_are_none():
+    """A log of the controller has a column of zeros at each stop: no delay is to be fitted."""
+    _, _, seen = measured_arm(2, 40)
+    still = replace(seen, velocity=np.zeros_like(seen.joints))
+    plain, found = (identify(Problem(UR10E, each)) for each in (seen, still))
+    assert found.accepted
+    assert found.names == plain.names
+    np.testing.assert_allclose(found.chain.table, plain.chain.table, rtol=0, atol=1e-12)
