@@ -57,6 +57,9 @@ LARGEST_SCALE = 1e-3
 LEAST_NOISE = 0.04
 """Residuals in units of the sigmas given below which these are wrong: devices repeat ten times as
 well as they measure, and mm are thousandths."""
+OUTWEIGHED = 5.0
+"""Ratio of what is left of orientations and of positions, in units of their sigmas, from which on
+the orientations spoil an arm: 9 make it 2.8 times worse, 30 eight times (docs/mistakes.md)."""
 SIMULATED = 1e-6
 """Residuals [m or rad] below which no device measured them."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
@@ -196,7 +199,7 @@ def _gravity(problem: Problem, result: Identification) -> str:
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:
-    """Return in words which sigmas are far larger than what is left."""
+    """Return in words which sigmas are far larger than what is left, or that of turns smaller."""
     noise, found = result.noise, []
     if noise.consistent or any(each.pixels is not None for each in problem.sets):
         return ''
@@ -207,15 +210,21 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         ('orientation', 'rad', noise.orientation, problem.largest_angle),
     )
     for k, (what, unit, size, most) in enumerate(kinds):
+        if size is None:
+            continue
         each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
         given = float(np.sqrt(np.median(each.mean(axis=1))))
-        if size is None or not SIMULATED < size * given < given:
-            continue
-        if size < LEAST_NOISE or given > most:
-            own = not np.isclose(given, sigmas[k])
-            name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
-            left = f'only {1e3 * size * given:.2g} m{unit} are left'
-            found.append(f'{name} {given:.2g} {unit}, and {left}: was m{unit} meant?')
+        own = not np.isclose(given, sigmas[k])
+        name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
+        name = f'{name} {given:.2g} {unit}'
+        left = f'{1e3 * size * given:.2g} m{unit} are left'
+        if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
+            found.append(f'{name}, and only {left}: was m{unit} meant?')
+        elif k and size > OUTWEIGHED * max(noise.position, 1.0) and size * given < most:
+            found.append(
+                f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
+                f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'
+            )
     return '; '.join(found)
 
 

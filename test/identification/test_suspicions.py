@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identification import Problem, identify
@@ -123,6 +124,25 @@ def test_sigmas_in_millimetres_are_named(sigma, oriented):
         result = identify(Problem(chain, seen, **sigmas))
         assert result.accepted
         assert not any('sigma' in each for each in result.remarks)
+
+
+@pytest.mark.parametrize('turns', [5e-3, 1e-2])
+def test_orientations_far_worse_than_their_sigma_are_named(turns):
+    """Of a camera or a small rigid body of markers: by default they spoil the positions."""
+    rng = np.random.default_rng(4)
+    chain = load_chain('ur10e')
+    true = faulty(chain, Cell(), rng)
+    seen = measure(true, chain.random_joints(40, rng), rng, 1e-4, turns)
+    result = identify(Problem(chain, seen))
+    said = result.remarks[-1] if result.accepted else result.refusals[0]
+    assert 'the orientations outweigh the positions and spoil them' in said
+    value = float(said.rpartition(' ')[2])
+    assert value == pytest.approx(turns, rel=0.2)
+    mended = identify(Problem(chain, seen, sigma_orientation=value))
+    assert mended.accepted
+    assert not any('sigma' in each for each in mended.remarks)
+    q = chain.random_joints(300, rng)
+    assert rms(mended.chain, true, q) < 0.4 * rms(result.chain, true, q)
 
 
 def test_covariances_in_square_millimetres_are_named():
