@@ -25,6 +25,7 @@ import numpy as np
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER
+from calib_ros.identification.lost_rows import lost
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -128,6 +129,7 @@ def explained(problem: Problem) -> Explained | None:
         return None
     found = (
         _named(problem, chain, sets, few, given)
+        or _of_a_lost_row(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
         or _several(problem, chain, few, given)
     )
@@ -168,6 +170,23 @@ def _named(
     named += [e for share, _, e, _ in tried if ALIKE * best.share < share <= best.share / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
     return Explained(tuple(unlike.values())[:3], given.error, best.error)
+
+
+def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+    """Return that a row is missing in one of two tables side by side, if that explains all."""
+    if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
+        return None
+
+    def framed(part: Observations) -> Chain | None:
+        found = _tried(chain, (_few(part),))
+        return None if found is None else _polished(problem, found).chain
+
+    largest = problem.largest_error + LEVER * problem.largest_angle / 3.0
+    found = lost(_moved(problem, sets[0], 0), framed, _errors, largest)
+    if found is None or found.error > NEARER * given.error:
+        return None
+    remedy = 'is a row missing, or there twice, in one of two tables? Mend that'
+    return Explained((Suspect(found.what, remedy, lambda e: e),), given.error, found.error)
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
@@ -325,15 +344,17 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
 
 def _error(chain: Chain, sets: Sets) -> float:
     """Return the median of the samples' errors [m]."""
-    sizes = []
-    for each in sets:
-        found = chain.forward(each.joints, base=each.base, tool=each.tool)
-        away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
-        if each.oriented.any():
-            turns = se3.angles_between(found[:, :3, :3], each.rotations)
-            away = away + LEVER * np.where(each.oriented, turns, 0.0)
-        sizes.append(away)
-    return float(np.median(np.concatenate(sizes)))
+    return float(np.median(np.concatenate([_errors(chain, each) for each in sets])))
+
+
+def _errors(chain: Chain, each: Observations) -> FloatArray:
+    """Return the errors (N,) [m] of samples."""
+    found = chain.forward(each.joints, base=each.base, tool=each.tool)
+    away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
+    if each.oriented.any():
+        turns = se3.angles_between(found[:, :3, :3], each.rotations)
+        away = away + LEVER * np.where(each.oriented, turns, 0.0)
+    return np.asarray(away)
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
