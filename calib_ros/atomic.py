@@ -89,6 +89,8 @@ def whole_folder(
     must be no earlier one, and never another process that writes the same folder.
     """
     place = Path(os.path.realpath(path))
+    if not place.name:
+        raise InputError(f'{path} is the root of all folders: choose a folder in it')
     place.parent.mkdir(parents=True, exist_ok=True)
     work = place.with_name(f'.{place.name}.partial')
     new, old = work / place.name, work / f'{place.name}.old'

@@ -36,6 +36,10 @@ EXACT = Limits.largest_position_error
 orientation be wrong of arms that can reach every one."""
 
 
+BESIDE = 0.1
+"""Distance [m] from the tool at which what a turn does is told: the length of small tools."""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensator(Shown, Limits):
     """The arm the controller assumes, the real arm, and the limits of a correction (`Limits`).
@@ -182,6 +186,14 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
     text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
     text += f'{1e3 * result.orientation[kept].max():.3f} mrad'
+    turn, turned = result.orientation[kept].max(), result.orientation_before[kept].max()
+    if not compensator.follower.complete and turn > turned:
+        x, y, z = compensator.tool
+        text += (
+            f'; this arm cannot keep every orientation: the position corrected is that of the '
+            f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m from it '
+            f'may be {1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
+        )
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'
     return text

@@ -222,6 +222,9 @@ def _compared(
     before, after = arm.before, arm.chain
     wanted = sets
     if commanded is not None:
+        commanded = before.joint_values(commanded)
+        if not np.isfinite(commanded).all():
+            raise InputError('the commanded joint values are not all finite numbers')
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
@@ -255,6 +258,7 @@ def _check(
             f'{tolerance} and {confidence}'
         )
     for each in sets:
+        chain.joint_values(each.joints)
         if each.distances is not None or each.socket:
             raise InputError('to verify, poses or positions must be measured, not distances')
         if not {each.base, each.tool} <= set(chain.frame_names):

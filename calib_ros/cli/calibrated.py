@@ -90,5 +90,6 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
         contents |= {each.name: each.content for each in found}
     for each in found:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
-        screen.say(f'{options.out / each.name}: {exact}')
+        beyond = f' with what its first line says, {each.beyond}' if each.beyond else ''
+        screen.say(f'{options.out / each.name}: {exact}{beyond}')
     return 0

@@ -71,6 +71,9 @@ WAY = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    for name in ('stdout', 'stderr'):  # closed by who started this: no file may get its number
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115
     try:
         options = _options(given)
         options.typed = shlex.join(('calib_ros', *given))

@@ -78,12 +78,12 @@ def _lost(expected: int | None, found: int) -> float:
     return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
-def replay(path: Path, session: CalibrationSession, told: Told = nobody) -> Replayed:
+def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
         Takes the messages; its settings name topics where the types leave a choice.
@@ -91,6 +91,7 @@ def replay(path: Path, session: CalibrationSession, told: Told = nobody) -> Repl
         Of the share of the messages that are read.
 
     """
+    path = Path(path)
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
     session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True

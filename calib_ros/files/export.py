@@ -54,11 +54,15 @@ class ExportError(CalibrationError):
 
 @dataclass(frozen=True)
 class Export:
-    """A file, and the largest position error [m] of the arm that it describes."""
+    """A file, and the largest position error [m] of the arm that it describes.
+
+    `beyond` says in words what its rows cannot hold of the way from base to flange.
+    """
 
     name: str
     content: str
     error: float
+    beyond: str = ''
 
 
 def exports(
@@ -82,9 +86,11 @@ def exports(
     for convention in get_args(Convention):
         form = converted(arm, convention)
         what = f'{convention} Denavit-Hartenberg table'
-        text = _csv(form, what, lost, digest)
+        beyond = cut_off(arm, convention)
+        text = _csv(form, f'{what}{beyond and f" ({beyond})"}', lost, digest)
         again = _read_csv(text, form)
-        found.append(checked(f'dh_{convention}.csv', text, again.forward(q), wanted, lost))
+        of_table = checked(f'dh_{convention}.csv', text, again.forward(q), wanted, lost)
+        found.append(replace(of_table, beyond=beyond))
         text = head(form, what, lost, digest) + dump_chain(form, origin)
         again = parse_chain(text)
         found.append(checked(f'dh_{convention}.yaml', text, again.forward(q), wanted, lost))
@@ -122,6 +128,23 @@ def converted(chain: Chain, convention: Convention) -> Chain:
     joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))
     frames: dict[str, Any] = {'base': base, 'tool': tool, 'frames': ()}
     return replace(chain, convention=convention, joints=joints, parallel=None, **frames)
+
+
+def cut_off(chain: Chain, convention: Convention) -> str:
+    """Return in words the poses before and after the rows of another convention, if any.
+
+    A modified table has no a and alpha after the last joint, a standard one none before the
+    first.
+    """
+    form = converted(replace(chain, base=Frame(), tool=Frame(), frames=()), convention)
+    places = {'from the base to the first row': 'base', 'from the last row to the flange': 'tool'}
+    found = []
+    for words, frame in places.items():
+        matrix = form.frame(frame).matrix
+        if np.abs(matrix - np.eye(4)).max() > SAME:
+            numbers = [f'{kind} {number:.10g}' for kind, number in xyz_rpy(matrix).items()]
+            found.append(f'{words}: {" ".join(numbers)}')
+    return ', '.join(found)
 
 
 def _tail(a: float, alpha: float, beta: float) -> FloatArray:

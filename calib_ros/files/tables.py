@@ -58,7 +58,7 @@ class Table(Measured):
 
 
 def read_table(
-    path: Path,
+    path: Path | str,
     joints: int,
     sessions: Sequence[str] = (),
     sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
@@ -70,7 +70,7 @@ def read_table(
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
         The file.
     joints : int
         Number of joints.
@@ -92,6 +92,7 @@ def read_table(
         measurements of one device in different frames. The message names the line.
 
     """
+    path = Path(path)
     if foreign is not None:
         made, warnings = foreign.convert(path)
         return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)

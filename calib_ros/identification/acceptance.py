@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
@@ -143,7 +144,8 @@ def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
     if validation.outliers:
         first, second = validation.figures_of_all
         gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
-        if second.mean_mm > first.mean_mm or gain < -max(limit, COUNTS):
+        limit = max(limit, _loss_by_chance(validation), COUNTS)
+        if second.mean_mm > first.mean_mm or gain < -limit:
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
                 f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
@@ -162,6 +164,23 @@ def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
                 f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
                 f'before, {after.rms_mrad:.3f} mrad after)',
             )
+
+
+def _loss_by_chance(validation: Comparison) -> float:
+    """Return how large chance could make the logarithm of RMS after / RMS before, with outliers.
+
+    A gross error far larger than the correction gets larger or smaller by it as chance will have
+    it: Student's t of the differences of squares, to which one outlier is one.
+    """
+    both = (validation.before.position, validation.after.position)
+    squares = np.stack([(each**2).sum(axis=1) for each in both])
+    known = ~np.isnan(squares).any(axis=0)
+    numbers = validation.after.configurations[known]
+    _, group, sizes = np.unique(numbers, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+    error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(len(sizes))
+    likely = special.stdtrit(len(sizes) - 1, CERTAIN) * error
+    return 0.5 * float(likely / max(means[0].mean(), 1e-300))
 
 
 def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.acceptance import refusals, remarks
 from calib_ros.identification.configurations import distinct
@@ -147,6 +147,8 @@ class Identification(Shown):
         By the F distribution where the size of the noise was estimated from the residuals, by
         chi-squared (its limit) where the sigmas given are right.
         """
+        if not 0.0 < level < 1.0:
+            raise ConfigError(f'level must be between 0 and 1, as 0.95, not {level}')
         jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
         sources = self.uncertainty.parts
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])

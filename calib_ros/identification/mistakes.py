@@ -26,6 +26,7 @@ import numpy as np
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
 from calib_ros.identification.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER
+from calib_ros.identification.lost_rows import lost
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
@@ -37,6 +38,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
     from calib_ros.identification.identification import Identification
@@ -123,6 +125,7 @@ def explained(problem: Problem) -> Explained | None:
     given = _polished(problem, given)
     found = (
         _named(problem, chain, sets, given)
+        or _of_a_lost_row(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
@@ -166,6 +169,22 @@ def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explain
 def _largest(problem: Problem) -> float:
     """Return the typical error [m] beyond which an arm is not a faulty one."""
     return problem.largest_error + LEVER * problem.largest_angle / 3.0
+
+
+def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+    """Return that a row is missing in one of two tables side by side, if that explains all."""
+    if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
+        return None
+
+    def framed(part: Observations) -> Chain | None:
+        found = _tried(chain, (part.spread(),))
+        return None if found is None else _polished(problem, found).chain
+
+    found = lost(_moved(problem, sets[0], 0), framed, _errors, _largest(problem))
+    if found is None or found.error > NEARER * given.error:
+        return None
+    remedy = 'is a row missing, or there twice, in one of two tables? Mend that'
+    return Explained((Suspect(found.what, remedy),), given.error, found.error)
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
@@ -255,14 +274,7 @@ class _Trial:
     @cached_property
     def error(self) -> float:
         """Return the median of the samples' errors [m]."""
-        sizes = []
-        for each in self.sets:
-            found = self.chain.forward(each.joints, base=each.base, tool=each.tool)
-            away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
-            if each.oriented.any():
-                turns = se3.angles_between(found[:, :3, :3], each.rotations)
-                away = away + LEVER * np.where(each.oriented, turns, 0.0)
-            sizes.append(away)
+        sizes = [_errors(self.chain, each) for each in self.sets]
         return float(np.median(np.concatenate(sizes)))
 
     @property
@@ -300,6 +312,16 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
     known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
     return min(trial, _Trial(fitted, sets, trial.spread), key=lambda one: one.error)
+
+
+def _errors(chain: Chain, each: Observations) -> FloatArray:
+    """Return the errors (N,) [m] of samples."""
+    found = chain.forward(each.joints, base=each.base, tool=each.tool)
+    away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
+    if each.oriented.any():
+        turns = se3.angles_between(found[:, :3, :3], each.rotations)
+        away = away + LEVER * np.where(each.oriented, turns, 0.0)
+    return np.asarray(away)
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:

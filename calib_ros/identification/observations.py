@@ -27,6 +27,8 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     'pixels': (2,),
 }
 """Shapes of a pair's share of each array; None for the number of joints."""
+NO_ROTATION = 0.05
+"""Difference of R^T R from the identity from which R is no rotation: two digits leave 0.02."""
 SOME_POSES = 200
 """Poses that stand for many: random ones for the joint range, even ones for those measured."""
 
@@ -124,15 +126,27 @@ class Observations(Shown):
     def from_arrays(
         cls, joints: FloatArray, positions: FloatArray, rotations: FloatArray | None = None
     ) -> Observations:
-        """Make observations (N) from arrays; position only when `rotations` is None."""
-        count = len(joints)
-        return cls(
-            np.arange(1, count + 1, dtype=np.int64) * 1_000_000_000,
-            np.asarray(joints, dtype=np.float64),
-            np.asarray(positions, dtype=np.float64),
-            np.broadcast_to(np.eye(3), (count, 3, 3)) if rotations is None else rotations,
-            np.full(count, rotations is not None),
-        )
+        """Make observations (N) from arrays; position only when `rotations` is None.
+
+        Raises
+        ------
+        InputError
+            For what is no numbers, has another shape, or no rotations; masked values are missing.
+
+        """
+        joints, positions = _numbers('joints', joints), _numbers('positions', positions)
+        if joints.ndim != 2:
+            raise InputError(f'joints must have the shape (N, n), not {joints.shape}')
+        count, oriented = len(joints), rotations is not None
+        if oriented:
+            turns = _numbers('rotations', rotations)
+        else:
+            turns = np.broadcast_to(np.eye(3), (count, 3, 3))
+        stamps = np.arange(1, count + 1, dtype=np.int64) * 1_000_000_000
+        found = cls(stamps, joints, positions, turns, np.full(count, oriented))
+        if oriented:
+            _refuse_other_than_rotations(turns)
+        return found
 
     @classmethod
     def from_pixels(
@@ -248,6 +262,11 @@ class Observations(Shown):
         return replace(self, joints=joints, velocity=velocity, delay=delays)
 
     @property
+    def moving(self) -> bool:
+        """Tell whether the arm moved while it was measured, so that a delay matters."""
+        return self.velocity is not None and bool(self.velocity.any())
+
+    @property
     def camera(self) -> str:
         """Return the frame of the camera that saw the pixels."""
         return self.tool if self.on_flange else self.base
@@ -269,6 +288,29 @@ class Observations(Shown):
     def stops(self) -> NDArray[np.intp]:
         """Return (N,) the number of the stop, in sequence, at which each pair was taken."""
         return stops(self.joints)
+
+
+def _numbers(name: str, values: object) -> FloatArray:
+    """Return values as an array; NaN where a masked array has none."""
+    try:
+        array = np.ma.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as err:
+        raise InputError(f'{name} must be numbers in an array: {err}') from err
+    return np.asarray(array.filled(np.nan)) if np.ma.is_masked(array) else np.asarray(array.data)
+
+
+def _refuse_other_than_rotations(turns: FloatArray) -> None:
+    """Refuse matrices (N, 3, 3) of which one is far from any rotation."""
+    square = np.einsum('nij,nik->njk', turns, turns)
+    wrong = np.abs(square - np.eye(3)).max(axis=(1, 2), initial=0.0) > NO_ROTATION
+    wrong |= np.linalg.det(turns) < 0.0
+    if wrong.any():
+        k = int(wrong.argmax())
+        what = 'left-handed' if np.linalg.det(turns[k]) < 0.0 else 'not orthogonal'
+        raise InputError(
+            f'the rotation of pair {k} (counted from 0) is {what}: {np.count_nonzero(wrong)} of '
+            f'{len(turns)} are no rotation matrices'
+        )
 
 
 def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:

@@ -8,6 +8,7 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Integral, Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,8 +112,15 @@ class Problem(Shown):
         """Check what does not depend on the measured values."""
         priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
         for name, sigma in (self.sigmas | priors).items():
-            if not 0.0 < sigma < np.inf:
+            if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
+        if not isinstance(self.folds, Integral):
+            raise ConfigError(f'folds must be an integer, not {self.folds}')
+        for name in ('fixed', 'effects'):
+            if isinstance(getattr(self, name), str):
+                raise ConfigError(f'{name} must be a list of names, not "{getattr(self, name)}"')
+        if isinstance(self.more, Observations):
+            raise ConfigError('more must be a list of observations, not one of them')
         if self.loss not in LOSSES:
             raise UnknownNameError('loss', self.loss, LOSSES)
         self._check_sets()
@@ -196,7 +204,7 @@ class Problem(Shown):
             identifiability.Kind(
                 bool(each.oriented.any()) or each.pixels is not None,
                 each.distances is not None,
-                each.velocity is not None,
+                each.moving,
                 each.base,
                 each.tool,
                 each.socket,
@@ -214,7 +222,7 @@ class Problem(Shown):
         chain = replace(chain, frames=tuple((known | dict.fromkeys(sorted(added))).items()))
         for each in self.sets:
             device = chain.frame(each.base)
-            if each.velocity is not None and device.delay is None:
+            if each.moving and device.delay is None:
                 start = 0.0 if each.delay is None else float(np.median(each.delay))
                 chain = chain.with_frame(each.base, replace(device, delay=start))
         wanted = [each for name in self.effects for each in effects.resolve(chain, name)]

@@ -72,6 +72,7 @@ class Region(Shown):
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
         """Tell (N,) at which joint values (N, n) the calibration may be used."""
+        joints = self.chain.joint_values(joints)
         if np.isinf(self.limit):
             return np.ones(len(joints), dtype=bool)
         return np.asarray(self.sigma(joints) <= self.limit)

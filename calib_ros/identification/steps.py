@@ -100,6 +100,9 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     """Return the step that explains more than half of the residuals of a fit, if there is one."""
     scan = _Scan(problem, names, robust)
     found = scan.best()
+    if found is not None and scan.few_gross(found):
+        scan = _Scan(problem, names, robust, gross=False)
+        found = scan.best()
     return None if found is None or scan.drifts(found) else scan.described(found)
 
 
@@ -144,7 +147,9 @@ class _Found:
 class _Scan:
     """The linear model at a fit, with columns of all that may have moved."""
 
-    def __init__(self, problem: Problem, names: Sequence[str], robust: Robust) -> None:
+    def __init__(
+        self, problem: Problem, names: Sequence[str], robust: Robust, gross: bool = True
+    ) -> None:
         self._problem, self._chain = problem, robust.fit.chain
         self._groups = _groups(problem)
         self._fitted = len(names)
@@ -154,7 +159,7 @@ class _Scan:
         self._chosen = [np.arange(0, len(each), share) for each in problem.sets]
         far = [d[index] for d, index in zip(robust.distances, self._chosen, strict=True)]
         self._weights = [weights_of(each, robust.loss) for each in far]
-        bounded = 'none' if robust.loss == 'none' else 'huber'
+        bounded = 'huber' if gross and robust.loss != 'none' else robust.loss
         few = robust.system.select(self._chosen).weighted([weights_of(d, bounded) for d in far])
         self._equations = np.array([float(samples.rows) for samples in few.sets])
         self._rows = few.rows_of(self._chain, self._names)
@@ -247,6 +252,21 @@ class _Scan:
                 flat = ordered[:, :, first:last].reshape(len(rows), -1)
                 found[k] += flat[own] @ flat.T
         return np.asarray(np.cumsum(found[::-1], axis=0)[::-1])
+
+    def few_gross(self, found: _Found) -> bool:
+        """Tell whether some stops on the shorter side are gross errors, too few for a step.
+
+        The freedoms of a frame explain one or two positions whatever is wrong with them.
+        """
+        sets = found.group.sets
+        kept = np.concatenate([self._weights[k] > 0.0 for k in sets])
+        numbers = np.concatenate([self._numbers[k] for k in sets])
+        used, gross = np.unique(numbers[kept]), np.unique(numbers[~kept])
+        gross = np.setdiff1d(gross, used)
+        every = np.union1d(used, gross)
+        late = np.count_nonzero(every >= found.stop)
+        after = 2 * late < len(every)
+        return 0 < int(np.count_nonzero((gross >= found.stop) == after)) < LEAST_ASIDE
 
     def drifts(self, found: _Found) -> bool:
         """Tell whether a slow drift of the same group explains more than the step."""

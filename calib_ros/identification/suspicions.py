@@ -16,6 +16,10 @@ Gravity. If effects of gravity are fitted, another direction may explain clearly
 given one. The base frame found does not tell which way is up: the device may have any orientation.
 
 Coupling. Joint values without the couplings of a wrist leave residuals that these explain.
+
+Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
+the poses tell less of the arm than is known before. It is said where a sigma is larger than the
+errors that any result may leave, or the residuals are hardly any part of it.
 """
 
 from __future__ import annotations
@@ -49,6 +53,14 @@ LEAST_SCALE = 0.5 * SCALE
 """Of a device of which it is told: half of what those of good ones scatter by."""
 LARGEST_SCALE = 1e-3
 """Growth of an arm by 40 degrees, if all of it is of aluminium (23 ppm a degree)."""
+LEAST_NOISE = 0.04
+"""Residuals in units of the sigmas given below which these are wrong: devices repeat ten times as
+well as they measure, and mm are thousandths."""
+OUTWEIGHED = 5.0
+"""Ratio of what is left of orientations and of positions, in units of their sigmas, from which on
+the orientations spoil an arm: 9 make it 2.8 times worse, 30 eight times (docs/mistakes.md)."""
+SIMULATED = 1e-6
+"""Residuals [m or rad] below which no device measured them."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths that are tried."""
 
@@ -63,7 +75,10 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
     refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
-    found = (scale, sister, _gravity(problem, result), _coupling(result))
+    sigmas = _sigmas(problem, result)
+    if refusals and sigmas:
+        refusals, sigmas = (Reason(Rule.MISTAKE, sigmas), *refusals), ''
+    found = (scale, sister, _gravity(problem, result), _coupling(result), sigmas)
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
 
@@ -164,6 +179,36 @@ def _gravity(problem: Problem, result: Identification) -> str:
         f'along the direction given {100.0 * given:.0f} %: is the arm mounted on a wall? Set '
         'gravity in the chain file'
     )
+
+
+def _sigmas(problem: Problem, result: Identification) -> str:
+    """Return in words which sigmas are far larger than what is left, or that of turns smaller."""
+    noise, found = result.noise, []
+    if noise.consistent or any(each.pixels is not None for each in problem.sets):
+        return ''
+    sigmas = problem.sigma_position, problem.sigma_orientation
+    variances = [np.einsum('nii->ni', s.spread().covariances(sigmas)) for s in problem.sets]
+    kinds = (
+        ('position', 'm', noise.position, problem.largest_error),
+        ('orientation', 'rad', noise.orientation, problem.largest_angle),
+    )
+    for k, (what, unit, size, most) in enumerate(kinds):
+        if size is None:
+            continue
+        each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
+        given = float(np.sqrt(np.median(each.mean(axis=1))))
+        own = not np.isclose(given, sigmas[k])
+        name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
+        name = f'{name} {given:.2g} {unit}'
+        left = f'{1e3 * size * given:.2g} m{unit} are left'
+        if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
+            found.append(f'{name}, and only {left}: was m{unit} meant?')
+        elif k and size > OUTWEIGHED * max(noise.position, 1.0) and size * given < most:
+            found.append(
+                f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
+                f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'
+            )
+    return '; '.join(found)
 
 
 def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:

@@ -255,16 +255,20 @@ class Chain(Shown):
         `approach` (N, n) holds the signs of the velocities before, for backlash; `base` and `tool`
         choose among the frames.
         """
+        rows = np.ascontiguousarray(self.joint_values(q).T)
+        came = None if approach is None else np.ascontiguousarray(approach.T)
+        axes, origin = self.trace(self.effective(rows, came), base=base, tool=tool)
+        return se3.transform(axes.transpose(2, 1, 0), origin.T)
+
+    def joint_values(self, q: FloatArray) -> FloatArray:
+        """Return joint values (N, n) as an array; refuse those of another shape."""
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2 or q.shape[1] != len(self.joints):
             raise ConfigError(
                 f'joint values must have the shape (N, {len(self.joints)}) for chain '
                 f'"{self.name}", not {q.shape}'
             )
-        rows = np.ascontiguousarray(q.T)
-        came = None if approach is None else np.ascontiguousarray(approach.T)
-        axes, origin = self.trace(self.effective(rows, came), base=base, tool=tool)
-        return se3.transform(axes.transpose(2, 1, 0), origin.T)
+        return q
 
     def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the joint values (n, B) that the effects make of those reported (n, B)."""

@@ -168,7 +168,7 @@ class ErrorModel:
         Rows 0-2 are the target's position in the world. Rows 3-5 are its rotation as a vector
         in world axes: the turned orientation is exp(J[3:] dx) R.
         """
-        rows = np.ascontiguousarray(np.asarray(q, dtype=float).T)
+        rows = np.ascontiguousarray(self.chain.joint_values(q).T)
         came = None if approach is None else np.ascontiguousarray(approach.T)
         moving = None if velocity is None else np.ascontiguousarray(velocity.T)
         _, _, shift, turn = self.linearise(rows, came, moving)

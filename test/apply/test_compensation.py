@@ -379,3 +379,20 @@ def test_chains_of_other_joints_are_refused():
 def test_wrong_joint_values_are_refused(joints, complaint):
     with pytest.raises(InputError, match=complaint):
         compensate(Compensator(UR, UR_TRUE), joints)
+
+
+def test_an_arm_of_five_joints_says_what_its_tool_loses():
+    """The flange keeps its place by turning: what sits beside it is off by more than before."""
+    nominal = ROBOTS['kuka_youbot']
+    true = faulty(nominal, CELL, np.random.default_rng(3))
+    q = nominal.random_joints(60, np.random.default_rng(4))
+    compensator = Compensator(nominal, true, largest_orientation_error=0.1)
+    result = compensate(compensator, q)
+    kept = ~np.isnan(result.joints).any(axis=1)
+    turn, turned = result.orientation[kept].max(), result.orientation_before[kept].max()
+    assert turn > turned
+    words = in_words(compensator, result)
+    assert 'that of the point 0 0 0 m in the flange (--tool)' in words
+    assert f'{100.0 * turn:.3f} mm off, {100.0 * turned:.3f} mm before' in words
+    compensator = Compensator(UR, UR_TRUE)
+    assert '--tool' not in in_words(compensator, compensate(compensator, regular(UR, 10)))

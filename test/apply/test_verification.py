@@ -125,6 +125,14 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
     moved[3, 5] += 0.3
     with pytest.raises(InputError, match=r'measurement 10 was taken 0\.[23]\d* rad or m from'):
         verify(arm, [measured(true, moved)], 1e-3, commanded=meant)
+    with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+        verify(arm, seen, 5e-4, commanded=meant[:, :5])
+    with pytest.raises(InputError, match='not all finite'):
+        verify(arm, seen, 5e-4, commanded=meant * np.nan)
+    again = verify(arm, seen, 5e-4, commanded=meant.tolist())
+    assert again.verdict == verify(arm, seen, 5e-4, commanded=meant).verdict
+    with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+        verify(arm, [replace(seen[0], joints=seen[0].joints[:, :5])], 5e-4)
 
 
 def test_pass_fail_and_undecided(cell, arm, program):

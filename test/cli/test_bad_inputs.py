@@ -47,6 +47,7 @@ def bad_inputs():
     names = ('--joint-names', 'a,a,b,c,d,e,f')
     yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'
+    yield 'out is the root', (*good, '--out', '/'), '/ is the root of all folders: choose'
     yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
     yield 'csv2bag, bad table', ('csv2bag', 'number.csv', 'b', '--chain', 'ur5e'), 'line 4: q2'
     yield 'csv2bag, bag exists', ('csv2bag', 'good.csv', 'folder', '--chain', 'ur5e'), 'exists al'

@@ -12,9 +12,16 @@ from hypothesis import given, strategies as st
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.cli.main import main
 from calib_ros.files import export
-from calib_ros.files.export import ExportError, converted, exports, forward_of, kinematics_yaml
+from calib_ros.files.export import (
+    ExportError,
+    converted,
+    exports,
+    forward_of,
+    kinematics_yaml,
+    pose_matrix,
+)
 from calib_ros.files.programs import joints_csv
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import (
     calibration_record,
     dump_chain,
@@ -22,6 +29,7 @@ from calib_ros.kinematics.chain_file import (
     parse_chain,
     shipped_robots,
 )
+from calib_ros.kinematics.parameter import DH_KINDS
 
 KEYS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')
 ROBOTS = sorted(shipped_robots())
@@ -77,6 +85,36 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
     assert f'{1e3 * offsets.error:.3f} mm off' in offsets.content.splitlines()[0]
     # Beta can be given up where no axes are parallel, and only there.
     assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
+
+
+@pytest.mark.parametrize('name', ['scara', 'kinova'])
+def test_a_table_says_what_its_rows_cut_off(name):
+    """A flange 0.1 m after the last joint is in no modified table, a base in no standard one."""
+    rows = (Joint('j1', alpha=np.pi, d=-0.3), Joint('j2', a=0.2, alpha=np.pi / 2.0, d=0.1))
+    arm = Chain('kinova', 'modified', rows)
+    if name == 'scara':
+        arm = replace(
+            scara(), joints=(*scara().joints[:3], Joint('j4', a=0.1, alpha=np.pi, d=0.05))
+        )
+    other = 'standard' if name == 'kinova' else 'modified'
+    chain = replace(faulty(arm, Cell(), np.random.default_rng(1)), base=Frame(), tool=Frame())
+    by_name = {each.name: each for each in exports(chain, arm)}
+    assert not by_name[f'dh_{chain.convention}.csv'].beyond
+    found = by_name[f'dh_{other}.csv']
+    first, _, table = found.content.partition('\n')
+    words = (
+        'from the last row to the flange' if name == 'scara' else 'from the base to the first row'
+    )
+    place = re.search(rf'\({words}: ((?:[a-z]+ [-+.e0-9]+ ?){{6}})\)', first).group(1).split()
+    pose = pose_matrix(dict(zip(place[::2], map(float, place[1::2]), strict=True)))
+    joints = tuple(
+        Joint(r['joint'], r['type'], *(float(r[kind]) for kind in DH_KINDS), int(r['sign']))
+        for r in csv.DictReader(table.splitlines())
+    )
+    q = chain.random_joints(20, np.random.default_rng(2))
+    reached = Chain('', other, joints).forward(q)
+    reached = reached @ pose if name == 'scara' else pose @ reached
+    np.testing.assert_allclose(reached, chain.forward(q), rtol=0, atol=1e-8)
 
 
 def test_kinematics_tell_a_changed_robot_by_their_hash():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import UR10E, measured_arm
+from fits import SIGMAS, UR10E, measured_arm
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification.identification import Problem, identify
@@ -127,3 +127,17 @@ def test_few_poses_and_priors_of_an_arm_without_errors_gain_nothing():
         seen = measure(true, UR10E.random_joints(8, rng), rng, 5e-5, 2e-4)
         accepted += identify(Problem(UR10E, seen, priors=TOLERANCES)).accepted
     assert accepted <= 2  # of 10 by a one-sided test of 95 %
+
+
+def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing():
+    """Of half a metre, it grows by the millimetres that the arm is corrected by, or shrinks."""
+    _, _, seen = measured_arm(5, 40, oriented=False)
+    clean = identify(Problem(UR10E, seen, **SIGMAS)).fitted
+    correction = (clean.before.position - clean.after.position)[20]
+    positions = seen.positions.copy()
+    positions[20] -= 0.4 * correction / np.linalg.norm(correction)
+    result = identify(Problem(UR10E, replace(seen, positions=positions), **SIGMAS))
+    before, after = result.validation.figures_of_all
+    assert after.rms_mm > 1.005 * before.rms_mm
+    assert after.mean_mm < before.mean_mm
+    assert result.accepted

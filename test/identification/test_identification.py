@@ -270,3 +270,36 @@ def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given(fa
             abs(row.value - true.value(row.name)) < row.half_width() for row in rows if row.std
         ]
     assert np.mean(inside) > 0.935
+
+
+@pytest.mark.parametrize(
+    ('setting', 'value'),
+    [
+        ('sigma_position', '1e-4'),
+        ('sigma_position', None),
+        ('sigma_orientation', np.array([1e-4, 1e-4])),
+        ('folds', 2.5),
+        ('fixed', 'shoulder_pan_joint.a'),
+        ('effects', 'gravity'),
+    ],
+)
+def test_settings_of_another_type_are_refused(setting, value):
+    _, _, seen = measured_arm(1, 12)
+    with pytest.raises(ConfigError, match=setting):
+        Problem(UR10E, seen, **{setting: value})
+
+
+def test_one_set_is_no_list_of_further_ones():
+    _, _, seen = measured_arm(1, 12)
+    with pytest.raises(ConfigError, match='more must be a list'):
+        Problem(UR10E, seen, more=seen)
+
+
+def test_velocities_of_an_arm_that_stands_are_none():
+    """A log of the controller has a column of zeros at each stop: no delay is to be fitted."""
+    _, _, seen = measured_arm(2, 40)
+    still = replace(seen, velocity=np.zeros_like(seen.joints))
+    plain, found = (identify(Problem(UR10E, each)) for each in (seen, still))
+    assert found.accepted
+    assert found.names == plain.names
+    np.testing.assert_allclose(found.chain.table, plain.chain.table, rtol=0, atol=1e-12)

@@ -8,6 +8,7 @@ import pytest
 from calib_ros.errors import InputError
 from calib_ros.identification.configurations import STILL, configurations
 from calib_ros.identification.observations import Observations
+from calib_ros.kinematics import se3
 
 
 def test_standing_still_is_one_configuration(rng):
@@ -43,6 +44,56 @@ def test_numbers_that_are_none_are_refused(name, bad):
     arrays[name][1, 2] = bad
     with pytest.raises(InputError, match=f'{name} .* NaN or infinite'):
         Observations.from_arrays(**arrays)
+
+
+def test_lists_will_do_as_arrays(rng):
+    joints, positions = rng.normal(size=(5, 6)), rng.normal(size=(5, 3))
+    rotations = se3.exp_rotation(rng.normal(size=(5, 3)))
+    seen = Observations.from_arrays(joints.tolist(), positions.tolist(), rotations.tolist())
+    np.testing.assert_array_equal(seen.rotations, rotations)
+    np.testing.assert_array_equal(seen.joints, joints)
+
+
+@pytest.mark.parametrize(
+    ('joints', 'positions', 'complaint'),
+    [
+        (None, None, r'joints must have the shape \(N, n\)'),
+        ([['a'] * 6], [[0.0] * 3], 'joints must be numbers'),
+        (1.0, 2.0, r'joints must have the shape \(N, n\)'),
+        ([0.0] * 6, [0.0] * 3, r'joints must have the shape \(N, n\)'),
+        ([], [], r'joints must have the shape \(N, n\)'),
+    ],
+)
+def test_what_is_no_array_is_refused(joints, positions, complaint):
+    with pytest.raises(InputError, match=complaint):
+        Observations.from_arrays(joints, positions)
+
+
+def test_masked_values_are_missing():
+    positions = np.ma.masked_array(np.zeros((3, 3)), mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
+    with pytest.raises(InputError, match='positions of the observations hold NaN'):
+        Observations.from_arrays(np.zeros((3, 6)), positions)
+
+
+@pytest.mark.parametrize(
+    ('turn', 'complaint'),
+    [
+        (np.diag([1.0, 1.0, -1.0]), 'pair 1 .* left-handed: 1 of 3'),
+        (np.zeros((3, 3)), 'pair 1 .* not orthogonal'),
+        (1.1 * np.eye(3), 'pair 1 .* not orthogonal'),
+    ],
+)
+def test_matrices_that_are_no_rotations_are_refused(turn, complaint):
+    with pytest.raises(InputError, match=complaint):
+        Observations.from_arrays(
+            np.zeros((3, 6)), np.zeros((3, 3)), np.stack([np.eye(3), turn, np.eye(3)])
+        )
+
+
+def test_rotations_rounded_to_two_digits_are_rotations(rng):
+    rotations = np.round(se3.exp_rotation(rng.normal(size=(200, 3))), 2)
+    seen = Observations.from_arrays(np.zeros((200, 6)), np.zeros((200, 3)), rotations)
+    assert seen.oriented.all()
 
 
 def test_select_keeps_the_rows_together(rng):

@@ -61,6 +61,15 @@ def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
     assert found.accepted
     assert found.region.whole
     assert found.region.covers(UR10E.random_joints(50, np.random.default_rng(1))).all()
+    q = UR10E.random_joints(7, np.random.default_rng(1))
+    for wrong in (q[0], q[:, :5], q.T):  # one answer a row, or none
+        with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+            found.region.covers(wrong)
+        with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+            found.pose_covariance(wrong)
+    for level in (0.0, 1.0, 95):
+        with pytest.raises(ConfigError, match='level must be between 0 and 1'):
+            found.confidence_ellipsoid(q, level)
     assert 'valid over the whole joint range' in summary(found)
     for share, text in ((0.0, 'under 1'), (0.4, '40'), (0.999, '99')):
         part = replace(found.region, limit=1e-3, share=share).in_words()

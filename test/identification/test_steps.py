@@ -236,3 +236,15 @@ def test_nothing_moves_between_fewer_stops_than_a_step_has_on_both_sides():
     problem = Problem(UR10E, seen, fixed=('*_joint.*',))
     _, _, fit = fitting.fit(problem)
     assert find_step(problem, fit.names, fit.robust) is None
+
+
+@pytest.mark.parametrize(('seed', 'row'), [(8, -2), (11, 1)])
+def test_a_gross_error_at_the_begin_or_end_is_no_step(seed, row):
+    """The six freedoms of a base explain three positions, whatever is wrong with one of them."""
+    _, seen = session(seed, oriented=False, count=40)
+    positions = seen.positions.copy()
+    positions[row] += [0.3, -0.2, 0.1]
+    result = identify(Problem(UR10E, replace(seen, positions=positions), **SIGMAS))
+    assert result.step is None
+    assert [outlier.sample for outlier in result.outliers] == [row % 40]
+    assert result.accepted

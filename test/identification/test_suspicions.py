@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.reasons import Rule
 from calib_ros.identification.suspicions import _common, scale_of
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, summary
@@ -101,6 +103,58 @@ def test_an_arm_on_a_wall_is_noticed(gravity, axis):
     assert f'gravity along {axis} of the base explains' in ''.join(result.remarks)
     right = Problem(replace(UR, gravity=gravity), seen, effects=('gravity',))
     assert identify(right).remarks == ()
+
+
+@pytest.mark.parametrize('sigma', [0.05, 5e-3])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_sigmas_in_millimetres_are_named(sigma, oriented):
+    """They make the arm's errors smaller than any noise: nothing else may be blamed for it."""
+    rng = np.random.default_rng(3)
+    chain = load_chain('ur10e')
+    true = faulty(chain, Cell(), rng)
+    seen = measure(true, chain.random_joints(40, rng), rng, 5e-5, 2e-4, oriented=oriented)
+    sigmas = {'sigma_position': sigma, 'sigma_orientation': 4.0 * sigma}
+    result = identify(Problem(chain, seen, **sigmas))
+    said = result.remarks[-1] if result.accepted else result.refusals[0]
+    assert f'sigma_position is {sigma:g} m, and only' in said
+    assert said.count('meant?') == 1 + oriented
+    assert result.accepted or result.refusals[0].rule is Rule.MISTAKE
+    for good in (5e-5, 5e-4):
+        sigmas = {'sigma_position': good, 'sigma_orientation': 4.0 * good}
+        result = identify(Problem(chain, seen, **sigmas))
+        assert result.accepted
+        assert not any('sigma' in each for each in result.remarks)
+
+
+@pytest.mark.parametrize('turns', [5e-3, 1e-2])
+def test_orientations_far_worse_than_their_sigma_are_named(turns):
+    """Of a camera or a small rigid body of markers: by default they spoil the positions."""
+    rng = np.random.default_rng(4)
+    chain = load_chain('ur10e')
+    true = faulty(chain, Cell(), rng)
+    seen = measure(true, chain.random_joints(40, rng), rng, 1e-4, turns)
+    result = identify(Problem(chain, seen))
+    said = result.remarks[-1] if result.accepted else result.refusals[0]
+    assert 'the orientations outweigh the positions and spoil them' in said
+    value = float(said.rpartition(' ')[2])
+    assert value == pytest.approx(turns, rel=0.2)
+    mended = identify(Problem(chain, seen, sigma_orientation=value))
+    assert mended.accepted
+    assert not any('sigma' in each for each in mended.remarks)
+    q = chain.random_joints(300, rng)
+    assert rms(mended.chain, true, q) < 0.4 * rms(result.chain, true, q)
+
+
+def test_covariances_in_square_millimetres_are_named():
+    rng = np.random.default_rng(3)
+    chain = load_chain('ur10e')
+    true = faulty(chain, Cell(), rng)
+    seen = measure(true, chain.random_joints(40, rng), rng, 5e-5, 2e-4)
+    wrong = np.tile(np.diag([2.5e-3] * 3 + [4e-8] * 3), (40, 1, 1))
+    result = identify(Problem(chain, replace(seen, covariance=wrong)))
+    assert not result.accepted
+    assert result.refusals[0].rule is Rule.MISTAKE
+    assert 'by the covariances the position is known to 0.05 m, and only' in result.refusals[0]
 
 
 def test_motor_angles_are_noticed():

@@ -1,0 +1,121 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A row that is missing in one of two tables put side by side: from there on no pair is one.
+
+Base and tool are known from the pairs of a third of the session, the first or the last. By these
+each measurement i is held against the joint values i + s, for small shifts s: before a row k the
+one shift fits, from there on another, and one of them is zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.identification.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+SHIFTS = (0, 1, -1, 2, -2)
+LEAST, ENOUGH = 18, 0.9
+"""Rows of a table, and the share of them that a loss must explain."""
+MOST = 2000
+"""Rows that are looked at."""
+
+Errors = Callable[[Chain, Observations], FloatArray]
+Framed = Callable[[Observations], Chain | None]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """From `row` on (counted from 0) joint values stand `after` rows below their measurement.
+
+    Before it they stand `before` rows below. `error` [m] is the typical one so.
+    """
+
+    row: int
+    before: int
+    after: int
+    error: float
+
+    @property
+    def what(self) -> str:
+        """Return what happened, in words."""
+        rows, late = (self.after, True) if self.after else (self.before, False)
+        count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
+        where = f'from pose {self.row + 1} on' if late else f'before pose {self.row + 1}'
+        return (
+            f'{where} the joint values stand {count} {"below" if rows > 0 else "above"} the '
+            'measurement that they belong to'
+        )
+
+
+def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> Loss | None:
+    """Return the loss that explains nearly all pairs (N) in their order, if one does.
+
+    `framed` returns the chain in the frames that suit some pairs, `errors` (N,) [m] those of
+    pairs; up to `largest` they are those of a faulty arm.
+    """
+    count = len(seen)
+    if not LEAST <= count <= MOST:
+        return None
+    best: Loss | None = None
+    good = ENOUGH * count
+    for chain in _frames(seen, framed):
+        tables = {s: _shifted(chain, seen, s, errors) for s in SHIFTS}
+        for before, after in product(SHIFTS, SHIFTS):
+            if before == after or (before and after):
+                continue
+            row = _where(tables[before] <= largest, tables[after] <= largest)
+            pieced = np.concatenate([tables[before][:row], tables[after][row:]])
+            fitting = int(np.count_nonzero(pieced <= largest))
+            if fitting >= good and _apart(tables[before], tables[after], row, largest):
+                good = fitting + 1
+                best = Loss(row, before, after, float(np.median(pieced[np.isfinite(pieced)])))
+    return best
+
+
+def _frames(seen: Observations, framed: Framed) -> Iterator[Chain]:
+    """Yield the chain in the frames by the first and the last third, for each shift."""
+    third = len(seen) // 3
+    for part, shift in product((slice(third), slice(-third, None)), SHIFTS):
+        rows = np.arange(len(seen))[part]
+        rows = rows[(rows + shift >= 0) & (rows + shift < len(seen))]
+        chain = framed(_paired(seen, rows, shift))
+        if chain is not None:
+            yield chain
+
+
+def _paired(seen: Observations, rows: NDArray[np.intp], shift: int) -> Observations:
+    """Return measurements of some rows with the joint values of `shift` rows below."""
+    return replace(seen.select(rows), joints=seen.joints[rows + shift])
+
+
+def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> FloatArray:
+    """Return (N,) the errors [m] of each measurement at joint values so many rows below."""
+    rows = np.arange(len(seen))
+    inside = (rows + shift >= 0) & (rows + shift < len(seen))
+    found = np.full(len(seen), np.inf)
+    found[inside] = errors(chain, _paired(seen, rows[inside], shift))
+    return found
+
+
+def _where(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> int:
+    """Return the row at which most fit before and from there on."""
+    gain = before.astype(int) - after.astype(int)
+    return int(np.argmax(np.concatenate([[0], np.cumsum(gain)])))
+
+
+def _apart(before: FloatArray, after: FloatArray, row: int, largest: float) -> bool:
+    """Tell whether either side fits by its own shift and not by that of the other."""
+    sides = (before[:row], after[:row]), (after[row:], before[row:])
+    return all(
+        len(own) >= 3
+        and np.mean(own <= largest) > ENOUGH - 0.1
+        and np.mean(other <= largest) < 0.5
+        for own, other in sides
+    )
