@@ -85,7 +85,7 @@ def test_a_folder_that_came_back_by_other_hands_is_not_lost(tmp_path):
     make(path, 'A')
     number = 1
     while path.exists():  # until it is killed between the two renames
-        assert killed_at(number, tmp_path, lambda: make(path, 'B'))
+        assert killed_at(number, tmp_path, lambda: make(path, 'B'), ('os.rename',))
         number += 1
     path.mkdir()
     (path / 'new.txt').write_text('by hand')

@@ -14,6 +14,8 @@ from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import numbered
 
+pytestmark = pytest.mark.usefixtures('unsearched')
+
 
 def test_targets_of_one_stop_are_one_configuration(rng):
     true = arm(rng)
