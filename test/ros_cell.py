@@ -61,12 +61,14 @@ LATCHED = QoSProfile(
 )
 node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
 node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
-node_module.JOIN_TIMEOUT = 60.0  # what was begun ends, however busy the machine is
+node_module.JOIN_TIMEOUT = 120.0  # what was begun ends, however busy the machine is
 advisor_module.CLOUD = 500  # a cloud costs more than the identification before it
 BURST_NS = 600_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
 START = 1_700_000_000_000_000_000
 STOPS = 24
+PATIENCE = 120.0
+"""Time [s] after which nothing more is waited for: a busy machine takes its own."""
 
 
 class Cell:
@@ -120,7 +122,7 @@ class Cell:
     def __exit__(self, *error):
         self.close()
 
-    def spin_until(self, predicate, timeout=20.0):
+    def spin_until(self, predicate, timeout=PATIENCE):
         end = time.monotonic() + timeout
         while not predicate():
             assert time.monotonic() < end, 'timed out'
@@ -255,7 +257,7 @@ class Child:
         if self._lock is not None:
             self._lock.close()
 
-    def wait_for(self, text, timeout=20.0):
+    def wait_for(self, text, timeout=PATIENCE):
         """Wait until it has printed a text; return all that it has printed."""
         end = time.monotonic() + timeout
         while text not in self.output:
@@ -265,7 +267,7 @@ class Child:
             self.output += part.decode()
         return self.output
 
-    def end(self, number=None, timeout=20.0):
+    def end(self, number=None, timeout=PATIENCE):
         """Send a signal and wait for the end; return the exit status."""
         if number is not None:
             self.process.send_signal(number)

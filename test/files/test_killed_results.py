@@ -55,6 +55,7 @@ def test_a_bag_whose_writing_is_killed_is_absent(tmp_path, monkeypatch, storage)
             assert replay(path, session).warnings == ()
             assert len(session.samples) == 3
             shutil.rmtree(path)
+        truth.unlink(missing_ok=True)
 
     write()  # here first, so that no child has to load the message types
     check()

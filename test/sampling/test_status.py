@@ -138,7 +138,7 @@ def test_poses_that_do_not_follow_the_arm_are_told():
     still = {'position': np.full(3, 1e-16), 'rotation': np.eye(3)}
     made.restore([replace(each, **still) for each in good[8:]])
     assert '22 poses are one and the same: is the device frozen?' in made.status()
-    assert '22 poses are at ' in made.warnings[0]
+    assert '22 poses are at 0, 0, 0 m' in made.warnings[0]
 
 
 def test_the_status_is_never_an_error():
