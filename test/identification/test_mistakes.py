@@ -234,7 +234,7 @@ def test_another_robot_in_messages_is_named_as_the_chain_to_set():
 
 def test_large_errors_of_an_arm_are_no_mistake(rng):
     true = faulty(UR, Cell(5e-3, 1e-2), rng)
-    seen = measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4)
+    seen = measure(true, UR.random_joints(60, rng), rng, 5e-5, oriented=False)
     assert identify(Problem(UR, seen)).accepted
 
 

@@ -159,14 +159,10 @@ def test_samples_that_early_ones_speak_against_come_back(rng):
     assert apart(said[-1].chain, knocked, rng) < 3.0 * said[-1].sigma
 
 
-def test_good_samples_are_not_flagged_where_the_noise_is_larger_than_given():
+def test_good_samples_are_not_flagged_where_the_noise_is_larger_than_given(rng):
     given = {name: sigma / 5.0 for name, sigma in SIGMAS.items()}
-    flagged = 0
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        live, _ = growing(seen(faulty(UR10E, Cell(), rng), 60, rng), **given)
-        flagged += len(live.suspicious)
-    assert flagged == 0
+    live, _ = growing(seen(faulty(UR10E, Cell(), rng), 60, rng), **given)
+    assert live.suspicious == []
 
 
 def test_several_devices_and_targets(rng):
