@@ -232,7 +232,8 @@ def test_another_robot_in_messages_is_named_as_the_chain_to_set():
     assert 'set chain to ur10e (' in str(explained(problem))
 
 
-def test_large_errors_of_an_arm_are_no_mistake(rng):
+def test_large_errors_of_an_arm_are_no_mistake():
+    rng = np.random.default_rng(0)
     true = faulty(UR, Cell(5e-3, 1e-2), rng)
     seen = measure(true, UR.random_joints(60, rng), rng, 5e-5, oriented=False)
     assert identify(Problem(UR, seen)).accepted
