@@ -63,7 +63,7 @@ node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
 node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
 node_module.JOIN_TIMEOUT = 120.0  # what was begun ends, however busy the machine is
 advisor_module.CLOUD = 500  # a cloud costs more than the identification before it
-BURST_NS = 600_000_000
+BURST_NS = 900_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
 START = 1_700_000_000_000_000_000
 STOPS = 24
@@ -197,14 +197,16 @@ class Cell:
             stream = 'joints' if isinstance(messages[0], JointState) else 'measurements'
             late = 0 if stream == 'joints' else late_ns
             queue += [(stamp_ns(m) + late, stream, publisher, m) for m in messages]
+        burst_ns = BURST_NS - late_ns
         if jitter is not None:
+            burst_ns -= 300_000_000
             late = jitter.integers(0, 300_000_000, len(queue))
             queue = [
                 (item[0] + int(more), *item[1:]) for item, more in zip(queue, late, strict=True)
             ]
         queue.sort(key=lambda item: item[0])
         with self.without_reports():
-            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
+            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // burst_ns):
                 wanted = node.session.received.copy() if node else {}
                 for _, stream, publisher, message in burst:
                     publisher.publish(message)
