@@ -28,6 +28,12 @@ def rng():
 
 
 @pytest.fixture
+def unsearched(monkeypatch):
+    """Let no mistakes be looked for, which takes far longer than the identification."""
+    monkeypatch.setattr('calib_ros.identification.mistakes.explained', lambda problem: None)
+
+
+@pytest.fixture
 def run(capsys, tmp_path, monkeypatch):
     """Return a function that runs a command in `tmp_path`: status, output and errors."""
     from calib_ros.cli.main import main

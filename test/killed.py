@@ -35,7 +35,7 @@ def status_of(child):
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def killed_at(number, where, work):
+def killed_at(number, where, work, calls_of=('open', 'os.', 'shutil.')):
     """Run some work that is killed just before its n-th call that touches files below `where`.
 
     Returns whether it was: False when it has ended before.
@@ -46,7 +46,7 @@ def killed_at(number, where, work):
 
         def count(event, arguments):
             nonlocal calls
-            touched = event.partition('.')[0] in ('open', 'os', 'shutil') and arguments
+            touched = event.startswith(calls_of) and arguments
             if touched and str(arguments[0]).startswith(str(where)):
                 calls += 1
                 if calls == number:

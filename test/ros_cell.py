@@ -60,12 +60,14 @@ LATCHED = QoSProfile(
 )
 node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
 node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
-node_module.JOIN_TIMEOUT = 60.0  # what was begun ends, however busy the machine is
+node_module.JOIN_TIMEOUT = 120.0  # what was begun ends, however busy the machine is
 advisor_module.CLOUD = 500  # a cloud costs more than the identification before it
-BURST_NS = 600_000_000
+BURST_NS = 900_000_000
 """Time of the stamps that are published at once; less than measurements may be late."""
 START = 1_700_000_000_000_000_000
 STOPS = 24
+PATIENCE = 120.0
+"""Time [s] after which nothing more is waited for: a busy machine takes its own."""
 
 
 class Cell:
@@ -119,7 +121,7 @@ class Cell:
     def __exit__(self, *error):
         self.close()
 
-    def spin_until(self, predicate, timeout=20.0):
+    def spin_until(self, predicate, timeout=PATIENCE):
         end = time.monotonic() + timeout
         while not predicate():
             assert time.monotonic() < end, 'timed out'
@@ -194,14 +196,16 @@ class Cell:
             stream = 'joints' if isinstance(messages[0], JointState) else 'measurements'
             late = 0 if stream == 'joints' else late_ns
             queue += [(stamp_ns(m) + late, stream, publisher, m) for m in messages]
+        burst_ns = BURST_NS - late_ns
         if jitter is not None:
+            burst_ns -= 300_000_000
             late = jitter.integers(0, 300_000_000, len(queue))
             queue = [
                 (item[0] + int(more), *item[1:]) for item, more in zip(queue, late, strict=True)
             ]
         queue.sort(key=lambda item: item[0])
         with self.without_reports():
-            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
+            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // burst_ns):
                 wanted = node.session.received.copy() if node else {}
                 for _, stream, publisher, message in burst:
                     publisher.publish(message)
@@ -254,7 +258,7 @@ class Child:
         if self._lock is not None:
             self._lock.close()
 
-    def wait_for(self, text, timeout=20.0):
+    def wait_for(self, text, timeout=PATIENCE):
         """Wait until it has printed a text; return all that it has printed."""
         end = time.monotonic() + timeout
         while text not in self.output:
@@ -264,7 +268,7 @@ class Child:
             self.output += part.decode()
         return self.output
 
-    def end(self, number=None, timeout=20.0):
+    def end(self, number=None, timeout=PATIENCE):
         """Send a signal and wait for the end; return the exit status."""
         if number is not None:
             self.process.send_signal(number)

@@ -200,7 +200,7 @@ def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, sessi
     """
     problem = measured_problem(name, session)
     squares = []
-    for column in problem.observations.joints.T[::3]:
+    for column in problem.observations.joints.T[::5]:
         order = np.argsort(column)
         fifth = len(order) // 5
         for out in (order[:fifth], order[-fifth:]):

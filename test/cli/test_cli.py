@@ -155,7 +155,7 @@ def test_the_corrected_chain_is_a_chain_that_predicts(identified, table, written
     assert before == pytest.approx(after, abs=1e-4)
 
 
-def test_rows_marked_test_never_influence_the_fit(identified, tmp_path):
+def test_rows_marked_test_never_influence_the_fit(unsearched, identified, tmp_path):
     rows = rows_of(measured())
     _, expected = identified('--csv', write_csv(tmp_path / 'a.csv', rows), '--chain', 'ur5e')
     rng = np.random.default_rng(1)

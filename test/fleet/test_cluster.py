@@ -49,7 +49,7 @@ def served(tmp_path):
     """Return a plant whose bag is at a URL, and whose tables are in an archive."""
     place = tmp_path / 'elsewhere'
     place.mkdir()
-    plant = json.loads(plants.write_plant(place, ['B', 'C'], 12).read_text())
+    plant = json.loads(plants.write_plant(place, ['B', 'C'], 8).read_text())
     with zipfile.ZipFile(place / 'nights.zip', 'w') as archive:
         for path in (place / 'nights').rglob('*.csv'):
             archive.write(path, path.relative_to(place))
@@ -86,11 +86,11 @@ def test_whatever_is_killed_each_result_is_filed_once(served):
             client.kill()
             client.wait()
         left = filed()
-        assert left < 25
+        assert left < 17
         assert main(command) == 0
-        assert filed() == 25
+        assert filed() == 17
     rows = [row for serial in 'ABC' for row in History(history).rows(serial)]
-    assert len({row.key for row in rows}) == len({row.source for row in rows}) == 25
+    assert len({row.key for row in rows}) == len({row.source for row in rows}) == 17
     assert all(row.accepted for row in rows)
     frame = pandas.read_parquet(history)
     assert sorted(frame.key) == sorted(row.key for row in rows)

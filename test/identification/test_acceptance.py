@@ -13,6 +13,8 @@ from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import load_chain
 
+pytestmark = pytest.mark.usefixtures('unsearched')
+
 
 def test_held_out_pairs_never_influence_the_fit():
     rng, true, seen = measured_arm(8, 50, (1e-4, 1e-4))

@@ -53,8 +53,8 @@ def session(seed, errors, kind, count=96, width=0.8, shuffled=False, true=None):
 
 @pytest.mark.parametrize('kind', DRIFTS)
 def test_a_drift_is_no_gain_of_the_arm(kind):
-    """At 95 %: of 8 arms without any error two or more are accepted once in 17 times."""
-    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(8)]
+    """At 95 %: of 6 arms without any error two or more are accepted once in 30 times."""
+    results = [identify(Problem(UR10E, session(seed, 0.0, kind), **SIGMAS)) for seed in range(6)]
     assert sum(result.accepted for result in results) <= 1
     # by held-out poses alone most of them would be
     alone = [all(each.rule is Rule.DRIFT for each in result.refusals) for result in results]
@@ -67,11 +67,11 @@ def test_an_arm_with_errors_is_accepted_though_the_tracker_drifts():
     So does an arm whose lengths err alike by chance: the device may have a scale.
     """
     accepted = 0
-    for seed, kind in product(range(4), DRIFTS):
+    for seed, kind in product(range(3), DRIFTS):
         accepted += identify(Problem(UR10E, session(seed, 1.0, kind), **SIGMAS)).accepted
         shuffled = session(seed, 0.3, kind, width=None, shuffled=True)
         accepted += identify(Problem(UR10E, shuffled, **SIGMAS)).accepted
-    assert accepted >= 28
+    assert accepted >= 21
 
 
 def test_the_chance_is_uniform_where_there_is_nothing_to_gain():

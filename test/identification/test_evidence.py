@@ -16,6 +16,7 @@ from calib_ros.identification.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.parameter import Parameter
 
+pytestmark = pytest.mark.usefixtures('unsearched')
 EFFECTS = [name for group in ('eccentricity', 'gravity') for name in effects.members(UR10E, group)]
 
 

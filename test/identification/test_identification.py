@@ -35,7 +35,7 @@ def random_arm(rng, joints):
     ('joints', 'oriented', 'rank'), [(6, 1.0, 30), (7, 1.0, 34), (6, 0.0, 27), (6, 0.1, 30)]
 )
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=6)
+@settings(max_examples=4)
 def test_what_is_free_of_noise_gives_exact_predictions(joints, oriented, rank, seed):
     """Of a share of the poses the orientation is known."""
     rng = np.random.default_rng(seed)
@@ -259,12 +259,11 @@ def test_standard_deviations_follow_the_noise_that_is_there(position, orientatio
     assert np.std(scores) == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize('factor', [1.0, 1.5])
-def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given(factor):
+def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given():
     """No test of so few residuals would find the sigmas wrong."""
     inside = []
     for seed in range(30):
-        _, true, seen = measured_arm(seed, 9, (factor * 1e-4, factor * 1e-4 / 0.3))
+        _, true, seen = measured_arm(seed, 9, (1.5e-4, 1.5e-4 / 0.3))
         rows = fitted(Problem(UR10E, seen, priors=NO_PRIOR)).parameters
         inside += [
             abs(row.value - true.value(row.name)) < row.half_width() for row in rows if row.std

@@ -79,7 +79,6 @@ SPOILT = {
         '--columns qx=-qx,qy=-qy,qz=-qz',
     ),
     'Euler order': (rewritten('XYZ', 'ZYX'), '--euler ZYX, '),
-    'Euler middle': (rewritten('XYZ', 'ZXY'), '--euler ZXY, '),
     'Euler columns': (
         lambda e: replace(e, rotations=_in_turn(e.rotations)),
         '--euler ZYX with r1, r2, r3 (now rx, ry, rz)',
@@ -116,6 +115,15 @@ SIGNS_OF_TWO = tuple(
     f'{name} counts the other way round (sign: -1 in the chain file)'
     for name in ('shoulder_lift_joint', 'wrist_2_joint')
 )
+PUBLISHED = {
+    'orientations': 'check the orientations where they are published',
+    'both': 'correct it where it is published',
+    'inverse': 'set eye_in_hand=true in sources',
+    'sign': 'sign: -1 in the chain file',
+    'zero': 'theta -90 degrees in the chain file',
+    'swapped': 'swap them in joint_names',
+    'shift': 'check the stamps',
+}
 POSITIONS_TELL = ('mm', 'left-handed', 'sign', 'coupled')
 
 
@@ -129,11 +137,13 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     assert remedy in str(found)
     assert len(found.suspects) <= 2
     assert 5.0 * found.so < found.given
+    published = ' -- '.join(each.published for each in found.suspects)
+    assert PUBLISHED.get(mistake, '') in published  # what is said of messages
+    assert '--' not in published.replace(' -- ', '')
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_a_wrong_order_of_angles_is_named_where_the_tool_hardly_turns(seed):
-    rng = np.random.default_rng(seed)
+def test_a_wrong_order_of_angles_is_named_where_the_tool_hardly_turns():
+    rng = np.random.default_rng(1)
     q = np.array([0.3, -1.4, 1.6, 0.0, -1.5, 0.2]) + 0.1 * rng.uniform(-1.0, 1.0, (40, 6))
     q[:, :3] += rng.uniform(-0.5, 0.5, (40, 3))
     q[:, 3] -= np.pi / 2 + q[:, 1] + q[:, 2]
@@ -158,8 +168,9 @@ SEVERAL = {
 }
 
 
-@pytest.mark.parametrize('oriented', [True, False])
-@pytest.mark.parametrize('mistakes', SEVERAL)
+@pytest.mark.parametrize(
+    ('mistakes', 'oriented'), [('two signs', True), ('sign and zero, in mm', False)]
+)
 def test_mistakes_made_at_once_are_named(mistakes, oriented):
     change, said = SEVERAL[mistakes]
     found = str(explained(Problem(UR, change(seen_of(oriented=oriented)))))
@@ -205,24 +216,6 @@ def test_a_chain_file_in_millimetres_is_named():
     assert 'the lengths of the chain file are in mm, not metres' in named
 
 
-@pytest.mark.parametrize(
-    ('mistake', 'remedy'),
-    [
-        ('orientations', 'check the orientations where they are published'),
-        ('both', 'correct it where it is published'),
-        ('inverse', 'set eye_in_hand=true in sources'),
-        ('sign', 'sign: -1 in the chain file'),
-        ('zero', 'theta -90 degrees in the chain file'),
-        ('swapped', 'swap them in joint_names'),
-        ('shift', 'check the stamps'),
-    ],
-)
-def test_mistakes_in_messages_name_no_option_of_a_table(mistake, remedy):
-    found = str(explained(Problem(UR, SPOILT[mistake][0](seen_of()), of_messages=True)))
-    assert remedy in found
-    assert '--' not in found.replace(' -- or ', '')
-
-
 @pytest.mark.parametrize(('stated', 'remarks'), [(0.1, 0), (0.01, 1)])
 def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(stated, remarks):
     """Of a small target, say: 0.1 rad; nothing is said if that is what was stated."""
@@ -239,14 +232,19 @@ def test_another_robot_in_messages_is_named_as_the_chain_to_set():
     assert 'set chain to ur10e (' in str(explained(problem))
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_where_nothing_is_wrong_nothing_is_said(seed):
-    rng = np.random.default_rng(seed)
-    seen = seen_of(seed=seed, oriented=bool(seed % 2))
-    assert explained(Problem(UR, seen)) is None
-    noisy = replace(seen, positions=seen.positions + rng.normal(scale=0.2, size=(40, 3)))
-    assert explained(Problem(UR, noisy)) is None
-    assert explained(Problem(UR, replace(seen, joints=rng.permutation(seen.joints)))) is None
+def test_large_errors_of_an_arm_are_no_mistake():
+    rng = np.random.default_rng(0)
+    true = faulty(UR, Cell(5e-3, 1e-2), rng)
+    seen = measure(true, UR.random_joints(60, rng), rng, 5e-5, oriented=False)
+    assert identify(Problem(UR, seen)).accepted
+
+
+def test_where_nothing_is_wrong_nothing_is_said(rng):
+    poses, places = (seen_of(oriented=oriented) for oriented in (True, False))
+    mixed = replace(poses, joints=rng.permutation(poses.joints))
+    noisy = replace(places, positions=places.positions + rng.normal(scale=0.2, size=(40, 3)))
+    for seen in (poses, places, mixed, noisy):
+        assert explained(Problem(UR, seen)) is None
 
 
 def test_a_refusal_begins_with_the_mistake_and_nothing_is_applied():

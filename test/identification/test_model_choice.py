@@ -54,7 +54,7 @@ def chosen(result):
         *(('gravity', False), ('compliance', False), ('backlash', True)),
     ],
 )
-def test_auto_finds_what_is_there_and_predicts_better(group, oriented):
+def test_auto_finds_what_is_there_and_predicts_better(unsearched, group, oriented):
     rng = np.random.default_rng(3)
     nominal = LOADED if group == 'compliance' else UR10E
     true = arm_with(group, rng, nominal)

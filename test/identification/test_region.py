@@ -19,6 +19,7 @@ from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, summary
 
+pytestmark = pytest.mark.usefixtures('unsearched')
 HOME = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
 
 

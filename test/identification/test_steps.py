@@ -22,6 +22,7 @@ from calib_ros.report.words import as_document, remarks
 
 COUNT, AT = 60, 26
 DESIGNS = ('random', 'path', 'sweep')
+pytestmark = pytest.mark.usefixtures('unsearched')
 
 
 def poses(design, rng, count=COUNT):

@@ -168,7 +168,7 @@ def test_motor_angles_are_noticed():
     )
 
 
-def test_couplings_that_the_model_lacks_are_uncertainty_elsewhere():
+def test_couplings_that_the_model_lacks_are_uncertainty_elsewhere(unsearched):
     wrist = ('wrist_3_joint.coupling_wrist_2_joint', 'wrist_2_joint.coupling_wrist_1_joint')
     coupled = dict(zip(wrist, (2e-3, 1e-3), strict=True))
     true = arm().with_effects(list(coupled)).with_offsets(coupled)

@@ -175,7 +175,7 @@ def observed(poses, q, approach, rng):
 
 
 @pytest.mark.parametrize('group', effects.GROUPS)
-def test_a_group_is_recovered_on_poses_that_were_not_fitted(group):
+def test_a_group_is_recovered_on_poses_that_were_not_fitted(unsearched, group):
     rng = np.random.default_rng(1)
     nominal, values = truth(group, rng)
     true = faulty(nominal, Cell(), rng)

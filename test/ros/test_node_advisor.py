@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
-from ros_cell import STOPS, Cell, joint_messages, pose_messages, topics, values_of
+from ros_cell import PATIENCE, STOPS, Cell, joint_messages, pose_messages, topics, values_of
 from sensor_msgs.msg import JointState, PointCloud2, Range
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -342,7 +342,7 @@ def test_messages_are_taken_while_it_computes(tmp_path, recording, monkeypatch):
 
     def slow(*arguments):
         entered.set()
-        assert taken.wait(20.0)
+        assert taken.wait(PATIENCE)
         return real(*arguments)
 
     monkeypatch.setattr(guide_module, 'compensate_program', slow)
@@ -364,7 +364,7 @@ def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
 
     def stuck(*arguments):
         begun.set()
-        free.wait(20.0)
+        free.wait(PATIENCE)
         raise InputError('too late')
 
     monkeypatch.setattr(guide_module, 'compensate_program', stuck)
@@ -381,4 +381,4 @@ def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
         assert 'refused: 2 others wait already' in cell.node._guide._last_trajectory
         assert not cell.node._guide.join(0.05)
         free.set()
-        assert cell.node._guide.join(20.0)
+        assert cell.node._guide.join(PATIENCE)

@@ -58,25 +58,24 @@ def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
     assert ' ... ' in found
 
 
-@pytest.mark.parametrize('rule', Rule)
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])
-def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path, rule, folder):
-    step = rules()[rule].steps[0]
+def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path, folder):
     identifying = cell.node._identifying
-    identifying._advice = step
     cell.node._archive._path = tmp_path / folder / 'ur10e_SN-0042_20260102T030405000006Z.csv'
     cell.node._archive._path.parent.mkdir()
     reasons, figures = 'no gain on held-out poses; ' * 20, '60 poses, RMS 1 -> 2 mm; ' * 20
-    text = f'NOT accepted: {reasons}. To do first: {step} {figures}'
-    _, found = identifying.shortened((False, text))
-    assert len(found) <= 200
-    assert found.startswith('NOT accepted: no gain')
-    said, _, name = found.partition(' ... all of it: ')
-    assert said.endswith(step)
-    assert (tmp_path / folder / name).read_text() == f'{text}\n'
+    for rule in Rule:
+        step = identifying._advice = rules()[rule].steps[0]
+        text = f'NOT accepted: {reasons}. To do first: {step} {figures}'
+        _, found = identifying.shortened((False, text))
+        assert len(found) <= 200
+        assert found.startswith('NOT accepted: no gain')
+        said, _, name = found.partition(' ... all of it: ')
+        assert said.endswith(step)
+        assert (tmp_path / folder / name).read_text() == f'{text}\n'
 
 
-def test_a_refusal_leaves_its_report(cell, recording):
+def test_a_refusal_leaves_its_report(unsearched, cell, recording):
     moved = pose_messages(recording.poses)
     for message, x in zip(
         moved, np.random.default_rng(0).uniform(size=STOPS).repeat(4), strict=True

@@ -116,7 +116,7 @@ def slow(file):
         saved.append(name)
         if len(saved) > 2:  # the settings and the calibration of the first time
             print('in the middle of saving', flush=True)
-            time.sleep(60.0)
+            time.sleep(600.0)
 os.fsync = slow
 """
 SLOW_IDENTIFICATION = """
@@ -124,7 +124,7 @@ import time
 from calib_ros.ros import identifying, node
 def identify_model(problem, model, progress):
     print('identifying', flush=True)
-    time.sleep(60.0)
+    time.sleep(600.0)
 identifying.identify_model = identify_model
 close = node.CalibrationNode.close
 def noisy(self):

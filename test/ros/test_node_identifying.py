@@ -6,7 +6,7 @@ import queue
 import threading
 
 import pytest
-from ros_cell import STOPS, Cell, topics
+from ros_cell import PATIENCE, STOPS, Cell, topics
 from std_msgs.msg import String
 
 from calib_ros.identification.identification import identify
@@ -21,7 +21,7 @@ def held(monkeypatch):
     def slow(problem, model, progress):
         result = identify(problem)
         problems.append(problem)
-        assert release.wait(20.0)
+        assert release.wait(PATIENCE)
         return result
 
     monkeypatch.setattr(identifying_module, 'identify_model', slow)
@@ -69,7 +69,7 @@ def stages(monkeypatch):
             progress(stage)
             if isinstance(stage, str):  # no share of the work
                 reached.append(stage)
-                release.get(timeout=20.0)
+                release.get(timeout=PATIENCE)
 
         return identify_model(problem, model, at)
 

@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from ros_cell import START, Cell, header, joint_messages, stamp_ns
+from ros_cell import PATIENCE, START, Cell, header, joint_messages, stamp_ns
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -226,7 +226,7 @@ class Slow:
         self.go_on = threading.Event()
 
     def look(self, message):
-        assert self.go_on.wait(20.0)
+        assert self.go_on.wait(PATIENCE)
         return Refusal('blurred', 'it is blurred')
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy: what it publishes."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
     with Cell(**parameters) as cell:
         diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
         corrected = cell.listen(PoseStamped, 'calibration_node/corrected_pose', 10)
+        begun = time.monotonic()
         cell.play(topics(recording, joint_states=twice))
         assert cell.call('identify').success
         cell.play({'joint_states': joints[-1:]})
@@ -44,7 +46,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         assert values['dropped joints: same stamp twice'] == '2'
         assert values['last identification'].startswith('accepted')
         assert float(values['rate of /joint_states [Hz]']) >= 0.0
-        assert float(values['age of /measured_pose [s]']) < 20.0
+        assert 0.0 <= float(values['age of /measured_pose [s]']) <= time.monotonic() - begun + 0.1
         words = cell.listen(String, 'calibration_node/status')
         cell.spin_until(lambda: words)
         assert words[0].data.startswith('the arm ')

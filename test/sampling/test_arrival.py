@@ -29,7 +29,7 @@ LATE = 'measurements: later than lateness allows'
 # Order of arrival
 
 
-@settings(max_examples=16)
+@settings(max_examples=10)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from(['dwell', 'continuous']),

@@ -40,7 +40,7 @@ def point(stamp_ns, position):
     return written(CAMERA, point_stamped(stamp_ns, position))
 
 
-def shift(rng, stops=5):
+def shift(rng, stops=3):
     """Return messages of a shift with what may go wrong, in the order in which they come."""
     cell = Cell(joint_rate=100.0, move=0.7, dwell=0.6)
     true = faulty(ARM, Cell(), rng)
