@@ -220,14 +220,12 @@ def test_a_fold_left_out_is_a_fit_to_the_others():
         for k, chain in enumerate(found):
             alone = minimise(start, names, system.select([each != k for each in folds])).chain
             away = [chain.offset(name, alone) for name in names]
-            assert np.abs(away).max() < (
-                6e-6 if wrong else 1e-8
-            )  # a step is of SMALL_STEP at most
+            assert np.abs(away).max() < (6e-6 if wrong else 1e-8)  # steps are small, or refined
 
 
 @pytest.mark.parametrize('scale', [1.0, 1e-6])
 def test_the_factor_is_refused_where_the_normal_matrix_has_lost_its_digits(scale):
-    start, names, system = still_joint('ur10e', 0)
+    start, _, system = still_joint('ur10e', 0)
     normal = normal_equations(start, ['base.x', 'base.y', 'base.z'], system)
     skewed = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, scale]])
     matrix = skewed.T @ normal.matrix @ skewed

@@ -421,3 +421,34 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
     assert min(ways, 1.0) <= found <= min(60.0 * ways, 1.0)
     second.fit.normal.cost = 0.0  # too small for a float
     assert 0.0 <= robust._chance(['a', 'b', 'c', 'd'], system, second, second) < 1e-200
+
+
+@pytest.mark.parametrize('loss', ['redescending', 'huber'])
+def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(loss, monkeypatch):
+    """One more reweighting by 1 / distance hardly moves the start of the last phase."""
+    rng, true, clean, _ = cell(0)
+    seen, _ = spoiled(clean, rng, 0.3, shift=(5e-3, 50e-3))
+    system = problem(seen).system([seen])
+    names = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
+    steps, starts, reweighted = [], [], robust.reweighted
+
+    def counted(*arguments, **options):
+        found = minimise(*arguments, **options)
+        steps.append(found.iterations)
+        return found
+
+    def kept(chain, *arguments):
+        starts.append(chain)
+        return reweighted(chain, *arguments)
+
+    monkeypatch.setattr(robust, 'minimise', counted)
+    monkeypatch.setattr(robust, 'reweighted', kept)
+    found = robust.robust_fit(true, names, system, loss)
+    assert found.iterations == sum(steps)
+    assert found.settled
+    (last,) = distances_of(starts[0], names, system)
+    bounded = system.weighted([1.0 / np.maximum(last, 1.0)])
+    (again,) = distances_of(minimise(starts[0], names, bounded).chain, names, system)
+    np.testing.assert_allclose(again, last, rtol=0.1, atol=0.1)
+    weights = weights_of(distances_of(found.fit.chain, names, system)[0], loss)
+    np.testing.assert_allclose(found.system.sets[0].weights ** 2, weights, rtol=0, atol=1e-3)
