@@ -232,8 +232,9 @@ def test_a_redundant_arm_does_without_the_joint_at_its_limit(name):
 def test_a_command_beyond_a_limit_is_refused(side):
     q = regular(UR, 3)
     q[1, 2] = side * 3.2
-    compensator = Compensator(UR, UR_TRUE)
-    refusal = only_refusal(compensate(compensator, q))
+    compensator, shares = Compensator(UR, UR_TRUE), []
+    refusal = only_refusal(compensate(compensator, q, told=shares.append))
+    assert shares
     assert refusal.sample == 1
     assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
         refusal.reason

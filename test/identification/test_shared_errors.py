@@ -7,6 +7,7 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, along_path, fitted, measured_arm
 from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
+from scipy.stats import norm
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification import samples as samples_module, shared_errors
@@ -381,3 +382,47 @@ def test_too_few_stops_share_nothing():
     assert (found.successive, found.near, found.found, found.middles) == (0.0, 0.0, (), {})
     weightless = system.weighted([np.zeros(7)])
     assert not len(shared_errors._gather(true, names, weightless, 1, 20))
+
+
+@pytest.mark.parametrize('most', [400, 20])
+def test_the_middle_is_the_sum_of_all_that_a_test_finds(most, monkeypatch):
+    """White, near and successive errors by their sizes; a score decides, at 99 % of all tests."""
+    monkeypatch.setattr(shared_errors, 'MOST_STOPS', most)
+    rng = np.random.default_rng(5)
+    seen = measure(UR10E, UR10E.random_joints(24, rng), rng, *NOISE)
+    system, names = System((samples_module.Samples(seen, *NOISE),)), UR10E.parameter_names[:9]
+    fit = minimise(UR10E, names, system)
+    limit = norm.ppf(1.0 - 0.01 / 4)
+    scores = {('successive', 0): limit + 1e-6, ('near', 0): 9.0, ('near', 1): limit - 1e-6}
+    scores |= {('successive', 1): 9.0}
+    kinds = iter(['successive'] * 2 + ['near'] * 2)
+    sizes = {0: np.array([2.0, 0, 0, 0.3, 0, 0, 0, 0.0, 0.7]), 1: np.zeros(6)}
+
+    def test(_, part, __):
+        kind = next(kinds)
+        return 0.1 * (1 + part) * (1 if kind == 'near' else -1), scores[kind, part]
+
+    def sized(_, kernels):
+        successive = [('successive', length) for length in (1.0, 3.0, 10.0, 30.0, 100.0)]
+        assert kernels == {
+            0: [*successive, *(('near', x) for x in (0.3, 1.0, 3.0))],
+            1: successive,
+        }
+        return sizes
+
+    monkeypatch.setattr(shared_errors._Forms, 'test', test)
+    monkeypatch.setattr(shared_errors._Forms, 'sizes', sized)
+    found = shared_errors.shared_errors(fit, names, system)
+    assert (found.successive, found.near) == (0.0, 0.2)
+    assert found.found == ('successive', 'near')
+    rows = system.rows_of(fit.chain, names)[0][:-1, :3]
+    time = np.arange(24)
+    place = np.concatenate([np.cos(seen.joints), np.sin(seen.joints)], axis=1)
+    share = 1 if most > 24 else 2  # every second one of 24 stops, at most 20
+    kept = time % share == 0
+    near = 0.7 * share * np.exp(-cdist(place, place) / 3.0)
+    near = near * np.outer(kept, kept) * np.where(np.eye(24, dtype=bool), 1.0, share)
+    kernel = 2.0 * np.eye(24) + 0.3 * np.exp(-np.abs(np.subtract.outer(time, time)) / 10.0) + near
+    expected = np.einsum('pcn,nm,rcm->pr', rows, kernel, rows)
+    assert list(found.middles) == [0]
+    np.testing.assert_allclose(found.middles[0], expected, rtol=1e-9, atol=1e-6)
