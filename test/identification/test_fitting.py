@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a fit does before and after its least squares: priors that guard it, rows, statuses."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,11 +12,12 @@ from fits import UR10E, measured_arm
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import fitting
-from calib_ros.identification.fitting import Simpler, parameter_rows
+from calib_ros.identification.fitting import Fitted, Simpler, parameter_rows
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.jacobian import ErrorModel
 
 
 def seen(count=12):
@@ -147,3 +148,96 @@ def test_parameters_that_some_poses_do_not_excite_may_be_by_all(count, monkeypat
     names, factor = fitting._excited_names(problem, wanted, UR10E)
     assert names == tuple(n for n in problem.free if n in wanted)
     assert factor.shape == (len(names), len(names))
+
+
+@dataclass(frozen=True)
+class Done:
+    """A fit that is told: its factor, its noise, and what its data tell."""
+
+    factor: np.ndarray
+    noise: Noise
+    size: float
+    chain: object
+    told: dict
+
+    def posterior(self, size, judging):
+        assert (size, judging) == (self.noise.size, False)
+        return SimpleNamespace(priors=self.told, held=lambda name: float(name == 'elbow_joint.a'))
+
+
+def test_a_fit_is_repeated_with_guards_and_with_what_it_tells(monkeypatch):
+    """Without its outliers a session tells less; priors are no wider than common sense."""
+    names, chains = ('base.x', 'elbow_joint.a', 'elbow_joint.theta'), iter('abc')
+    problem, length = Problem(UR10E, seen()), 0.05 / 3.0
+    told, calls = {'elbow_joint.a': 1.0, 'elbow_joint.theta': 2e-3}, []
+    poor = np.diag([1.0, 0.9 / length, 100.0])
+
+    def fit(problem, simpler, chain, names, again=False):
+        calls.append((problem.learned, chain, again))
+        size = 2.0 + len(calls)
+        return Done(poor, noise(size, True), size, next(chains), told)
+
+    monkeypatch.setattr(fitting, '_fit', fit)
+    found = fitting._fit_all(problem, names, UR10E, 100.0 * np.eye(3), None)
+    guards, priors = {'elbow_joint.a': length}, {**told, 'elbow_joint.a': length}
+    assert calls == [
+        (None, UR10E, False),
+        (Learned(guards, 1.0), UR10E, False),
+        (Learned(priors, 4.0), 'b', True),
+    ]
+    assert (found.chain, found.size) == ('c', 4.0)
+    calls.clear()
+    chains = iter('ab')
+    told['elbow_joint.theta'] = 1.0
+    poor = 100.0 * np.eye(3)
+    found = fitting._fit_all(problem, names, UR10E, poor, None)
+    priors['elbow_joint.theta'] = 0.1 / 3.0
+    assert calls == [(None, UR10E, False), (Learned(priors, 3.0), 'a', True)]
+
+
+@pytest.mark.parametrize('held', ['elbow_joint.a', None])
+def test_where_nothing_tells_the_size_of_the_arm_a_length_is_held(held, monkeypatch):
+    asked, problem = [], Problem(UR10E, seen())
+
+    def independent(chain, names, *_):
+        asked.append(tuple(names))
+        return tuple(names[:20])
+
+    monkeypatch.setattr(fitting.identifiability, 'structurally_independent', independent)
+    monkeypatch.setattr(fitting.identifiability, 'untold_size', lambda *_: held)
+    monkeypatch.setattr(fitting, 'start_frames', lambda *_: 'start')
+    monkeypatch.setattr(fitting, '_excited_names', lambda *_: (('base.x',), np.eye(1)))
+    monkeypatch.setattr(fitting, '_fit_all', lambda *_: 'fitted')
+    monkeypatch.setattr(fitting, '_sized', lambda fitted, name: (fitted, name))
+    others = tuple(name for name in problem.free if name != held)
+    assert len(others) == len(problem.free) - bool(held)
+    found = ('fitted', held) if held else 'fitted'
+    assert fitting.fit(problem) == (others[:20], 'start', found)
+    assert asked == ([problem.free, others] if held else [problem.free])
+
+
+def test_a_length_held_for_the_size_of_the_arm_makes_all_others_uncertain():
+    """As all lengths grow with it: each by its own size."""
+    held = 'shoulder_lift_joint.a'
+    every = [n for j in UR10E.joints for n in j.parameters if n.is_length and n != held]
+
+    class Told(Fitted):
+        def posterior(self, noise, more=(), doubts=None, judging=True):
+            assert (noise, judging) == (3.0, False)
+            return SimpleNamespace(sizes={'length': 3e-4})
+
+    before = Uncertainty(np.eye(len(every))[np.newaxis], np.array([7.0]))
+    robust = SimpleNamespace(fit=SimpleNamespace(chain=UR10E))
+    problem = Problem(UR10E, seen())
+    told = Told(problem, tuple(every), robust, None, noise(1.0), before, 3.0)
+    after = fitting._sized(told, held)
+    name, slope = after.held
+    assert name == held
+    q = UR10E.random_joints(20, np.random.default_rng(1))
+    columns = ErrorModel(UR10E, [*every, held]).jacobian(q)[:, :3]
+    grown = UR10E.forward(q)[:, :3, 3] / UR10E.value(held)
+    np.testing.assert_allclose(columns @ [*slope, 1.0], grown, atol=1e-9)
+    shared = 3e-4**2 * np.outer(slope, slope)
+    np.testing.assert_allclose(after.uncertainty.parts[1], shared, atol=1e-15)
+    np.testing.assert_array_equal(after.uncertainty.parts[0], before.parts[0])
+    assert after.uncertainty.freedom.tolist() == [7.0, np.inf]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -452,3 +452,49 @@ def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(lo
     np.testing.assert_allclose(again, last, rtol=0.1, atol=0.1)
     weights = weights_of(distances_of(found.fit.chain, names, system)[0], loss)
     np.testing.assert_allclose(found.system.sets[0].weights ** 2, weights, rtol=0, atol=1e-3)
+
+
+@dataclass(frozen=True)
+class Found:
+    """A robust fit of so many iterations, with outliers or none and residuals of a size."""
+
+    iterations: int
+    size: float = 1.0
+    out: bool = False
+
+    def rms(self, _):
+        return self.size
+
+    @property
+    def outliers(self):
+        return np.array([False, self.out])
+
+    @property
+    def fit(self):
+        return SimpleNamespace(chain=self, normal=self)
+
+
+@pytest.mark.parametrize(
+    ('out', 'rms', 'loss', 'sums', 'chance', 'second'),
+    [
+        (True, 1.0, 'redescending', 2.26, 0.9e-3, True),
+        (False, 1.21, 'redescending', 2.26, 0.9e-3, True),
+        (False, 1.19, 'redescending', 2.26, 0.9e-3, False),  # nothing suspicious
+        (True, 1.0, 'huber', 2.26, 0.9e-3, False),
+        (True, 1.0, 'redescending', 2.24, 0.9e-3, False),  # a detail of the first
+        (True, 1.0, 'redescending', 2.26, 1.1e-3, False),  # it may be chance
+    ],
+)
+def test_a_second_fit_is_kept_where_it_shrinks_half_of_the_residuals(
+    out, rms, loss, sums, chance, second, monkeypatch
+):
+    """By more than ALIKE, and by more than chance allows at 99.9 %."""
+    fits = Found(3, rms, out), Found(4)
+    monkeypatch.setattr(robust, 'robust_fit', lambda *_: fits[0])
+    monkeypatch.setattr(robust, 'reweighted', lambda *_: fits[1])
+    monkeypatch.setattr(robust, 'trimmed_start', lambda *_: None)
+    size = {id(fits[0]): sums, id(fits[1]): 1.0}
+    monkeypatch.setattr(robust, 'trimmed_sum', lambda chain, _: size[id(chain)])
+    monkeypatch.setattr(robust, '_chance', lambda *_: chance)
+    found = robust.thorough_fit(None, [], SimpleNamespace(count=10), loss)
+    assert found.iterations == (7 if second else 3)
