@@ -10,11 +10,13 @@ import pytest
 from fits import UR10E, measured_arm
 
 from calib_ros.identification import linear_model
+from calib_ros.identification.drift import Shifts
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import log_gain
 from calib_ros.kinematics import effects
+from calib_ros.progress import nobody
 
 NAMES = (
     *(name for name in UR10E.parameter_names if UR10E.owns_frame(name)),
@@ -47,7 +49,7 @@ def model(request, monkeypatch):
         chain=problem.model,
         names=NAMES,
         posterior=SimpleNamespace(
-            priors={'elbow_joint.a': 1e-4, 'elbow_joint.sin_1': 1.0}, sizes=SIZES
+            priors={'elbow_joint.a': 3e-5, 'elbow_joint.sin_1': 1.0}, sizes=SIZES
         ),
         noise=SimpleNamespace(size=NOISE),
         fitted=SimpleNamespace(judged=judged),
@@ -57,7 +59,7 @@ def model(request, monkeypatch):
     chosen = [[k for k in part if k not in OUTLIERS][::share] for part in parts]
     triples = zip(problem.sets, chosen, parts, strict=True)
     sets = [each.select(np.array(which) - part[0]) for each, which, part in triples]
-    told = replace(problem, learned=Learned({'elbow_joint.a': 1e-4}, NOISE))
+    told = replace(problem, learned=Learned({'elbow_joint.a': 3e-5}, NOISE))
     return told, sets, LinearModel(problem, geometric)
 
 
@@ -97,7 +99,7 @@ def left_out(told, sets, dealing, names, sizes):
 def test_what_is_left_out_is_predicted_by_fits_to_the_rest(model):
     """Effects have priors as large as usual, as the data show, or as is asked for."""
     told, sets, linear = model
-    prior = {'elbow_joint.a': 1e-4}
+    prior = {'elbow_joint.a': 3e-5}
     usual = dict.fromkeys(FIRST, 5e-4) | {SECOND[0]: 5e-4}  # of a drive: what couplings may be
     for dealing in (0, 1):
         for chosen, new, size in (
@@ -153,3 +155,58 @@ def test_effects_that_depend_on_others_are_not_useful(model):
 def test_every_revolute_joint_has_harmonics_from_the_third_to_the_fortieth(model):
     expected = [n for j in UR10E.joint_names for k in range(3, 41) for n in effects.waves(j, k)]
     assert model[-1].harmonics == expected
+
+
+def test_residuals_moved_in_time_are_explained_as_by_columns_made_at_once(model):
+    """Columns of all harmonics are made joint by joint, of those chosen as well."""
+    told, sets, linear = model
+    waves, steps = ['wrist_3_joint.sin_7', 'wrist_3_joint.cos_7'], []
+    linear._of(FIRST)
+    groups = [waves, [*SECOND, 'elbow_joint.ratio']]
+    linear._of(groups[1])
+    for chosen in ((), FIRST):
+        names = [*NAMES, *chosen, *waves, *groups[1]]
+        chain = told.model.with_effects([n for n in names if n not in NAMES])
+        rows = told.system(sets).rows_of(chain, names)
+        shifts = Shifts(told.system(sets), [each[-1] for each in rows])
+        usual = {'elbow_joint.a': 3e-5, **dict.fromkeys((*FIRST, *SECOND), 5e-4)}
+        usual |= dict.fromkeys((*waves, 'elbow_joint.ratio'), 5e-4)
+        inverse = np.array([NOISE / usual[n] if n in usual else 0.0 for n in names])
+        columns = shifts.columns([[each[:-1] for each in rows]], inverse)
+        count = len(NAMES) + len(chosen)
+        expected = shifts.shares(
+            columns, range(count), [[count, count + 1], [count + 2, count + 3]]
+        )
+        found = linear._shares(chosen, groups, steps.append)
+        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9)
+    stages = [step for step in steps if isinstance(step, str)]
+    assert stages == [f'harmonics of {joint}' for joint in UR10E.joint_names]
+    shares = [step for step in steps if not isinstance(step, str)]
+    assert shares == pytest.approx([k / 7.0 for k in range(1, 7)])
+
+
+@pytest.mark.parametrize('few', [True, False])
+@pytest.mark.parametrize('often', [0, 1, 2])
+def test_the_strongest_harmonic_must_not_be_explained_by_chance(few, often, model, monkeypatch):
+    """Of the shifts one in a hundred may explain as much, of all harmonics one in twenty."""
+    linear = model[-1]
+    pairs = [pair for pair in linear._pairs if 'elbow_joint.sin_5' not in pair]
+    monkeypatch.setattr(linear, '_equations', 456 if few else 457)
+    shares = np.full((len(pairs), 151), 1e-4)
+    shares[:, 0] = 2e-4
+    shares[9, 0] = 0.5
+    shares[3, 10 : 10 + often] = 0.6  # the strongest one of another shift
+
+    def moved(chosen, groups, progress):
+        assert chosen == ['elbow_joint.sin_5']
+        assert groups == pairs
+        return shares
+
+    monkeypatch.setattr(linear, '_shares', moved)
+    found, several = linear.strongest_harmonic(['elbow_joint.sin_5'], nobody)
+    assert found == (pairs[9] if often < 2 else ())
+    assert several is not few
+    shares[:, 20:28] = 0.1
+    assert linear.strongest_harmonic(['elbow_joint.sin_5'], nobody)[1] is False
+    monkeypatch.setattr(linear, '_shifts', None)
+    assert linear.strongest_harmonic([], nobody) == ((), False)
