@@ -341,7 +341,6 @@ def _whitening(
     """Return W (6, 6, N) with W^T W the inverse covariance; zero rows for what is not measured."""
     covariance = observations.covariances((sigma_position, sigma_orientation))
     covariance[~observations.oriented, 3:, :] = 0.0
-    covariance[~observations.oriented, :, 3:] = 0.0
     covariance[~observations.oriented, 3:, 3:] = np.eye(3)
     whitening = np.linalg.inv(np.linalg.cholesky(covariance))
     whitening[~observations.oriented, 3:, :] = 0.0

@@ -19,7 +19,7 @@ from commanded import (
 from hypothesis import given, strategies as st
 from scipy.optimize import least_squares
 
-from calib_ros.apply.compensation import Compensator, compensate, in_words
+from calib_ros.apply.compensation import EXACT, Compensator, compensate, in_words
 from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import faulty, random_frame
 from calib_ros.errors import ConfigError, InputError
@@ -228,14 +228,21 @@ def test_a_redundant_arm_does_without_the_joint_at_its_limit(name):
         assert missed(compensator, q[None], result.joints).max() < 1e-8
 
 
-def test_a_command_beyond_a_limit_is_refused():
+@pytest.mark.parametrize('side', [1.0, -1.0])
+def test_a_command_beyond_a_limit_is_refused(side):
     q = regular(UR, 3)
-    q[1, 2] = 3.2
-    refusal = only_refusal(compensate(Compensator(UR, UR_TRUE), q))
+    q[1, 2] = side * 3.2
+    compensator, shares = Compensator(UR, UR_TRUE), []
+    refusal = only_refusal(compensate(compensator, q, told=shares.append))
+    assert shares
     assert refusal.sample == 1
-    assert 'the command 3.2 of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
+    assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
         refusal.reason
     )
+    for beyond, said in ((0.5, False), (2.0, True)):  # of what a command may lie beyond a limit
+        q[1, 2] = side * (np.pi + beyond * EXACT)
+        reasons = ' '.join(each.reason for each in compensate(compensator, q).refusals)
+        assert ('the command' in reasons) is said
 
 
 def test_a_singular_command_is_refused_and_not_jumped():
@@ -353,6 +360,7 @@ def test_approaches_are_the_last_moves():
     ('setting', 'complaint'),
     [
         ({'largest_turn': 0.0}, 'largest_turn must be a positive number, not 0.0'),
+        ({'largest_shift': np.inf}, 'largest_shift must be a positive number, not inf'),
         ({'largest_change': np.nan}, 'largest_change must be a positive number, not nan'),
         ({'orientation_weight': -1.0}, 'orientation_weight must be a positive number'),
         ({'tool': (0.0, np.inf, 0.0)}, 'tool must be three finite numbers'),

@@ -25,6 +25,7 @@ from calib_ros.kinematics.se3 import invert, to_quat
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
+_UNIT = ['(mean', '+', '3', 'sigma)']
 
 
 @pytest.fixture(scope='module')
@@ -137,8 +138,10 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
 
 def test_pass_fail_and_undecided(cell, arm, program):
     true = cell[0]
-    seen = [measured(true, program)]
-    rms = verify(arm, seen, 1.0).rms
+    seen, shares = [measured(true, program)], []
+    rms = verify(arm, seen, 1.0, told=shares.append).rms
+    assert all(0.0 < share < 1.0 for share in shares)
+    assert shares
     found = {scale: verify(arm, seen, scale * rms) for scale in (0.4, 1.0, 3.0)}
     assert [each.verdict for each in found.values()] == ['FAIL', 'UNDECIDED', 'PASS']
     assert all(each.lower < rms < each.upper for each in found.values())
@@ -146,7 +149,13 @@ def test_pass_fail_and_undecided(cell, arm, program):
     near = verify(arm, seen, 1.2 * rms)
     assert near.verdict == 'UNDECIDED'
     assert 5 < near.needed < 500
-    assert f'about {near.needed} poses' in in_words(near)
+    text = in_words(near)
+    assert f'about {near.needed} poses' in text
+    heads = [line.split() for line in text.splitlines()]
+    table = heads[heads.index(['pose', 'measured', 'before', 'after', 'repeatability', *_UNIT]) :]
+    for k, (pose, row) in enumerate(zip(near.each, table[1:6], strict=True), 1):
+        figures = (pose.before, pose.after, pose.repeatability)
+        assert row == [str(k), '3', *(f'{each:.4f}' for each in figures)]
 
 
 @pytest.mark.parametrize('shape', [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.1, 0.1)])

@@ -4,6 +4,7 @@
 
 from dataclasses import replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ from fits import NOISE, SIGMAS, UR10E, along_path, arm, measured_arm, rms
 from scipy.signal import lfilter
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification.drift import chance_of_gain
+from calib_ros.identification import drift as drift_module
+from calib_ros.identification.drift import Shifts, chance, chance_of_gain
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.model_choice import identify_model
@@ -153,3 +155,90 @@ def test_the_report_tells_the_chance():
     result = identify(Problem(UR10E, session(0, 0.0, 'swing'), **SIGMAS))
     assert as_document(result, {})['chance_of_gain'] == result.chance > 0.05
     assert f'{100 * result.chance:.1f} %' in chance_in_words(result.chance)
+
+
+def slow_part(count):
+    """Return the projection (N, N) onto the constant and the slowest cosines of a series."""
+    orders = np.arange(1 + min(3, count // 10))
+    waves = np.cos(np.pi * np.outer(np.arange(count) + 0.5, orders) / count)
+    basis = np.linalg.qr(waves)[0]
+    return basis @ basis.T
+
+
+@pytest.mark.parametrize('lengths', [(24,), (35, 12), (7,), (300,)])
+def test_shares_are_those_of_fits_to_residuals_that_were_moved(lengths):
+    """Every shift by itself, by least squares with priors; stops have one to three samples."""
+    rng = np.random.default_rng(0)
+    repeats = [rng.integers(1, 4, size=count) for count in lengths]
+    numbers = [np.repeat(np.arange(len(each)), each) for each in repeats]
+    sets = [SimpleNamespace(observations=Stops(each, None)) for each in numbers]
+    residuals = [rng.normal(size=(c, len(n))) for c, n in zip((3, 1), numbers, strict=False)]
+    columns = [rng.normal(size=(5, *each.shape)) for each in residuals]
+    for each in columns:
+        each[4] = each[3] - 2.0 * each[0]  # one that tells nothing of its own
+    inverse = np.array([0.0, 0.5, 0.0, 3.0, 0.0])
+    shifts = Shifts(SimpleNamespace(sets=sets), residuals)
+    found = shifts.shares(shifts.columns([columns], inverse), [0, 1], [[2, 3], [3, 4]])
+    lots = [[each[:3] for each in columns], [each[3:] for each in columns]]
+    again = shifts.shares(shifts.columns(lots, inverse), [0, 1], [[2, 3], [3, 4]])
+    np.testing.assert_allclose(again, found, rtol=1e-9, atol=1e-12)
+    count = min(400, 2 * max(lengths))
+    assert found.shape == (2, count)
+    for k in {0, 1, 2, count // 3, count // 2, count - 1}:
+        rows, moved = [], []
+        for every, repeat, residual, column in zip(
+            lengths, repeats, residuals, columns, strict=True
+        ):
+            begins = np.cumsum(repeat) - repeat
+            sums = np.add.reduceat(np.vstack([residual[np.newaxis], column]), begins, axis=2)
+            sums /= np.sqrt(repeat)
+            circle = np.concatenate([sums[0], sums[0][:, ::-1]], axis=1)
+            by = int(2 * every * k / count)
+            rest = np.eye(every) - slow_part(every)
+            moved.append((np.roll(circle, -by, axis=1)[:, :every] @ rest).ravel())
+            rows.append((sums[1:] @ rest).reshape(5, -1))
+        r, x = np.concatenate(moved), np.concatenate(rows, axis=1)
+
+        def explained(which, r=r, x=x):
+            own = x[which]
+            matrix = own @ own.T + np.diag(inverse[which] ** 2)
+            return own @ r @ np.linalg.solve(matrix, own @ r)
+
+        known = explained([0, 1])
+        for group, share in zip(([2, 3], [3, 4]), found[:, k], strict=True):
+            expected = (explained([0, 1, *group]) - known) / (r @ r - known)
+            assert share == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+class Stops:
+    """Observations of which the stops (N,) are known, and where they are in an image."""
+
+    def __init__(self, stops, pixels):
+        self.stops, self.pixels = stops, pixels
+
+    def __len__(self):
+        return len(self.stops)
+
+
+def test_the_chance_is_the_share_of_shifts_that_explain_as_much():
+    assert chance(np.array([0.5, 0.1, 0.5, 0.7, 0.2])) == 0.5
+    assert chance_of_gain(UR10E, ['base.x'], [], None) == 1.0
+
+
+def test_corners_of_an_image_move_with_their_first_moments():
+    """Weights of mean square 1 over the corners of each image, but for a root of their number."""
+    rng = np.random.default_rng(0)
+    pixels = rng.normal(size=(7, 2)) * [300.0, 200.0] + [640.0, 480.0]
+    pixels[3:, 1] = 100.0  # a line
+    begins, counts = np.array([0, 3]), np.array([3, 4])
+    found = drift_module._weights(Stops(np.repeat([0, 1], counts), pixels), begins)
+    assert found.shape == (3, 7)
+    for part, count in ((slice(0, 3), 3), (slice(3, 7), 4)):
+        np.testing.assert_allclose(found[0, part], count**-0.5)
+        np.testing.assert_allclose(found[1:, part].sum(axis=1), 0.0, atol=1e-12)
+        line = count == 4
+        np.testing.assert_allclose((found[1:, part] ** 2).sum(axis=1), [1.0, 0.0 if line else 1.0])
+        centred = pixels[part] - pixels[part].mean(axis=0)
+        ratio = found[1:, part].T @ np.diag(1.0 / found[1:, part].max(axis=1).clip(1e-9))
+        expected = centred @ np.diag(1.0 / centred.max(axis=0).clip(1e-9))
+        np.testing.assert_allclose(ratio, expected, atol=1e-9)

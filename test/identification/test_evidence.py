@@ -8,12 +8,13 @@ from fits import NO_PRIOR, UR10E, arm, rms
 
 from calib_ros.apply.simulation import measure
 from calib_ros.identification.considered import considered
+from calib_ros.identification.evidence import Posterior, _device, group_of
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.sizes import TYPICAL
-from calib_ros.kinematics import effects
+from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.parameter import Parameter
 
 pytestmark = pytest.mark.usefixtures('unsearched')
@@ -185,3 +186,82 @@ def test_what_few_parameters_tell_is_judged_by_other_sizes_as_well(seed):
         for told in (few, many)
     ]
     assert spans[0] > 10.0 * spans[1]
+
+
+def told(rng, size=3):
+    names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta')[:size]
+    root, other = rng.normal(size=(2, size, size))
+    return Posterior(
+        UR10E,
+        names,
+        rng.normal(size=size),
+        rng.normal(size=size),
+        root @ root.T,
+        rng.normal(size=(size, 2)),
+        {'elbow_joint.a': 2.0, 'elbow_joint.theta': 0.5},
+        {'length': 3e-4, 'angle': 1e-3},
+        ((0.25, rng.normal(size=size), other @ other.T), (0.75, np.zeros(size), np.eye(size))),
+    )
+
+
+def test_a_length_held_nominal_is_as_uncertain_as_lengths_are(rng):
+    """What grows with it, the fitted parameters before considered ones, errs with it."""
+    before, slope = told(rng), np.array([0.5, -2.0])
+    after = before.held_at('wrist_1_joint.d', slope)
+    assert after.names == (*before.names, 'wrist_1_joint.d')
+    along = 3e-4 * np.array([0.5, -2.0, 0.0, 1.0])
+    change = after.covariance - np.pad(before.covariance, (0, 1))
+    np.testing.assert_allclose(change, np.outer(along, along), atol=1e-15)
+    for (w, m, c), (weight, mean, covariance) in zip(after.doubted, before.doubted, strict=True):
+        assert w == weight
+        np.testing.assert_array_equal(m, [*mean, 0.0])
+        np.testing.assert_allclose(c - np.pad(covariance, (0, 1)), change, atol=1e-12)
+    for whole, part in ((after.offsets, before.offsets), (after.shift, before.shift)):
+        np.testing.assert_array_equal(whole, [*part, 0.0])
+    np.testing.assert_array_equal(after.device, [*before.device, [0.0, 0.0]])
+
+
+def test_the_expected_error_is_that_of_shift_and_covariance(rng):
+    """By central differences; and what share of its variance a prior has is that of both."""
+    found = told(rng)
+    q = UR10E.random_joints(2, rng)
+    columns = []
+    for name in found.names:
+        less, more = (UR10E.with_offsets({name: step}).forward(q) for step in (-1e-6, 1e-6))
+        turn = se3.log_rotation(more[:, :3, :3] @ np.swapaxes(less[:, :3, :3], 1, 2))
+        columns.append(np.concatenate([(more - less)[:, :3, 3], turn], axis=1) / 2e-6)
+    rows = np.stack(columns, axis=2)
+    square = found.covariance + np.outer(found.shift, found.shift)
+    expected = np.einsum('nip,pq,njq->nij', rows, square, rows)
+    np.testing.assert_allclose(found.expected(q), expected, rtol=0, atol=1e-6)
+    assert found.held('base.x') == 0.0
+    assert found.held('elbow_joint.theta') == pytest.approx(found.covariance[2, 2] / 0.25)
+
+
+def test_errors_are_of_one_size_by_group():
+    for name, group in (
+        ('base.x', None),
+        ('elbow_joint.a', 'length'),
+        ('elbow_joint.beta', 'angle'),
+        ('elbow_joint.ratio', 'drive'),
+        ('elbow_joint.sin_1', 'drive'),
+        ('wrist_1_joint.coupling_elbow_joint', 'coupling'),
+        ('elbow_joint.gravity_wrist_1_joint', 'gravity'),
+    ):
+        assert group_of(UR10E, name) == group
+
+
+def test_what_another_device_adds_is_what_marginalising_leaves(rng):
+    """With a scale of its own and smooth errors, against the inverse of the whole matrix."""
+    count, size = 4, 7  # a scale, and two smooth errors after the arm's parameters
+    rows = rng.normal(size=(40, size))
+    whole = rows.T @ rows
+    precision = rng.uniform(0.5, 2.0, count + 1)
+    inner = count + 1
+    cross, doubtful = whole[:inner, inner:], whole[inner:, inner:] + np.eye(2)
+    matrix = whole[:inner, :inner]
+    found = _device(matrix, cross, doubtful, precision, count)
+    full = np.block([[matrix + np.diag(precision), cross], [cross.T, doubtful]])
+    alone = np.linalg.inv(full[:count, :count])
+    expected = np.linalg.inv(full)[:count, :count] - alone
+    np.testing.assert_allclose(found @ found.T, expected, rtol=1e-9, atol=1e-12)

@@ -9,19 +9,24 @@ import pytest
 from fits import NO_PRIOR, UR10E, measured_arm
 from scipy.optimize import least_squares
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification import leastsquares
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.identification import Problem, identify, residuals
 from calib_ros.identification.leastsquares import (
+    SEPARATION_SIGMA,
+    Prior,
     System,
+    factor_of_some,
     minimise,
     normal_equations,
     triangular_factor,
+    without_each,
 )
 from calib_ros.identification.samples import BLOCK, Samples
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 
 
 def test_the_minimum_is_that_of_an_independent_solver():
@@ -129,3 +134,106 @@ def test_normal_equations_and_triangular_factor_agree_over_blocks():
     left = residuals(true, seen)
     cost = ((left.position / 1e-4) ** 2).sum() + ((left.orientation / 3e-4) ** 2).sum()
     assert normal.cost == pytest.approx(cost, rel=1e-10)
+
+
+def dampings(monkeypatch, gains):
+    """Return the dampings of steps, with costs lowered by these gains, in units foreseen."""
+    start, names, system = still_joint('ur10e', 0)
+    real, solve = normal_equations(start, names[:1], system), leastsquares._solve
+    used, left, cost, foreseen = [], [*gains], 1e8, 0.0
+    best = cost
+
+    def equations(*_):
+        nonlocal cost, best
+        cost = best - left.pop(0) * foreseen if used else cost
+        best = min(best, cost)
+        return replace(real, matrix=np.eye(1), gradient=np.full(1, 500.0), cost=cost)
+
+    def solved(matrix, gradient, damping=0.0):
+        nonlocal foreseen
+        step = solve(matrix, gradient, damping)
+        foreseen = float(step @ (2.0 * gradient - matrix @ step))
+        if damping:
+            used[-1] = damping
+        else:
+            used.append(damping)
+        return step
+
+    monkeypatch.setattr(leastsquares, 'normal_equations', equations)
+    monkeypatch.setattr(leastsquares, '_solve', solved)
+    minimise(start, names[:1], system, iterations=len(gains))
+    return np.array(used) / HALF_THE_DIGITS
+
+
+def test_steps_are_damped_as_nielsen_does(monkeypatch):
+    """Twice, four times, ... as much where they fail, else by the gain over the one foreseen."""
+    found = dampings(monkeypatch, [*[-1.0] * 7, 0.75, -1.0, 1.0, 0.5, 0.0, 1.0])
+    assert found[:4].tolist() == [0.0] * 4
+    expected = np.cumprod([1.0, 4.0, 8.0, 16.0, 1.0 - 0.5**3, 2.0, 1.0 / 3.0, 1.0, 2.0])
+    np.testing.assert_allclose(found[4:], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('gains', 'first'),
+    [('llllll', 4), ('ssssss', 6), ('mmmmmm', 6), ('llslllll', 7), ('fffff', 4), ('ffmfffff', 7)],
+)
+def test_steps_that_gain_less_than_armijo_asks_for_are_damped(gains, first, monkeypatch):
+    """Once patience has ended, which a step that gains enough renews."""
+    sizes = {'f': -1.0, 'l': 0.5e-4, 's': 2e-4, 'm': 0.9}
+    found = dampings(monkeypatch, [sizes[each] for each in gains])
+    assert np.flatnonzero(np.append(found, 1.0))[0] == first
+
+
+def test_rows_of_priors_and_separations_are_central_differences():
+    rng = np.random.default_rng(0)
+    nominal = UR10E
+    for name in ('base_A', 'base_B'):
+        nominal = nominal.with_frame(name, random_frame(rng, 1.0))
+    names = ['base_A.z', 'elbow_joint.theta', 'base_B.x', 'base_B.y', 'base_A.rx', 'elbow_joint.a']
+    prior = Prior(nominal, {'elbow_joint.theta': 2e-3, 'elbow_joint.a': 1e-3}, noise=3.0)
+    system = System((), prior, (('base_A', 'base_B', 1.5),))
+    chain = nominal.with_offsets({'elbow_joint.theta': 4e-3, 'elbow_joint.a': -2e-3})
+    rows, left = system.extra_rows(chain, names)
+    ends = [chain.frame(name).matrix[:3, 3] for name in ('base_A', 'base_B')]
+    apart = (1.5 - np.linalg.norm(ends[1] - ends[0])) / SEPARATION_SIGMA
+    np.testing.assert_allclose(left, [0.0, -6.0, 0.0, 0.0, 0.0, 6.0, apart])
+    for k, name in enumerate(names):
+        less, more = (
+            system.extra_rows(chain.with_offsets({name: step}), names)[1] for step in (-1e-6, 1e-6)
+        )
+        np.testing.assert_allclose(rows[:, k], (less - more) / 2e-6, rtol=1e-6, atol=1e-3)
+
+
+def test_a_fold_left_out_is_a_fit_to_the_others():
+    """Near the fit to all by one step of it, else on the samples themselves."""
+    _, true, seen = measured_arm(3, 24)
+    names = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
+    prior = Prior(true, {'base.x': 1e-4})
+    folds = [np.arange(14) % 3, np.arange(10) % 2]
+    for wrong in (0.0, 0.5):  # [m] by which one sample is off
+        seen.positions[23, 0] += wrong
+        parts = [seen.select(np.arange(14)), seen.select(np.arange(14, 24))]
+        system = System(tuple(Samples(each, 1e-4, 3e-4) for each in parts), prior)
+        start = minimise(true, names, system).chain
+        found = list(without_each(start, names, system, folds))
+        assert len(found) == 3
+        for k, chain in enumerate(found):
+            alone = minimise(start, names, system.select([each != k for each in folds])).chain
+            away = [chain.offset(name, alone) for name in names]
+            assert np.abs(away).max() < (6e-6 if wrong else 1e-8)  # steps are small, or refined
+
+
+@pytest.mark.parametrize('scale', [1.0, 1e-6])
+def test_the_factor_is_refused_where_the_normal_matrix_has_lost_its_digits(scale):
+    start, _, system = still_joint('ur10e', 0)
+    normal = normal_equations(start, ['base.x', 'base.y', 'base.z'], system)
+    skewed = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, scale]])
+    matrix = skewed.T @ normal.matrix @ skewed
+    factor = replace(normal, matrix=matrix).factor()
+    assert (factor is None) is (scale < 1.0)
+    if factor is not None:
+        np.testing.assert_allclose(factor.T @ factor, matrix, rtol=1e-9)
+        some = factor_of_some(factor, [2, 0])
+        np.testing.assert_allclose(some.T @ some, matrix[[2, 0]][:, [2, 0]], rtol=1e-9)
+    for value in (np.nan, np.inf, 0.0):
+        assert replace(normal, matrix=value * np.eye(3)).factor() is None

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,12 +9,14 @@ from fits import NOISE, SIGMAS, UR10E, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.identification import model_choice
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.effects import group_of
+from calib_ros.kinematics.effects import Verdict, group_of
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.settings import Settings
 
 GEAR = ('shoulder_lift_joint.sin_17', 'shoulder_lift_joint.cos_17')
@@ -258,3 +261,136 @@ def test_few_poses_leave_the_geometric_result(rng):
     seen = measure(true, UR10E.random_joints(12, rng), rng, *NOISE)
     auto = identify_model(Problem(UR10E, seen, **SIGMAS), 'auto')
     assert auto.chain.effects == ()
+
+
+class Told:
+    """A linear model that judges as it is told: by group or harmonic, whether it pays and how."""
+
+    harmonics = ('a.sin_3', 'a.cos_3', 'a.sin_4', 'a.cos_4', 'a.sin_5', 'a.cos_5')
+
+    def __init__(self, found=(), everything=False, gains=None):
+        self._found, self._all, self._gains, self.tried = [*found], everything, gains or {}, []
+
+    def useful(self, groups):
+        names = {
+            'ratio': ['a.ratio'],
+            'gravity': ['a.gravity_a', 'a.gravity_b'],
+            'coupling': ['x'],
+        }
+        return {group: names.get(group, []) for group in groups}
+
+    def judge(self, chosen, names, what):
+        self.tried.append((tuple(chosen), what))
+        gain = self._gains.get(what, 1.0 if what.endswith('+') else 0.0)
+        return Verdict(what, 1.0, 1.0 - gain, gain > 0.0)
+
+    def judge_all_harmonics(self, chosen):
+        self.tried.append((tuple(chosen), 'all'))
+        return Verdict('all', 1.0, 0.5, self._all)
+
+    def strongest_harmonic(self, chosen, progress):
+        pair, several = self._found.pop(0) if self._found else ((), False)
+        return tuple(Parameter(f'a.{wave}_{pair}') for wave in ('sin', 'cos')) if pair else (), (
+            several
+        )
+
+
+WAVES = {f'a, {k} per turn': 1.0 for k in '345'}
+
+
+@pytest.mark.parametrize(
+    ('found', 'everything', 'gains', 'tried', 'chosen'),
+    [
+        ([], False, {}, '', ''),
+        ([('3', False), ('4', False)], False, {'a, 3 per turn': 1.0}, '34', '3'),
+        ([('3', False), ('4', False), ('5', False)], False, WAVES, '345', '345'),
+        ([('3', True)], True, {}, '3*', '345'),
+        ([('3', True)], False, {}, '3*', ''),
+        ([('', True)], True, {}, '*', '345'),
+        ([('', False)], True, {}, '', ''),
+        ([('3', True), ('4', True), ('5', True)], True, WAVES, '345*', '345'),
+        ([('3', True), ('4', True)], True, {'a, 3 per turn': 1.0}, '34*', '345'),
+        # the third time all are tried though it pays, and if they do not, the search goes on
+        ([('3', True), ('4', True), ('5', True), ('3', True)], False, WAVES, '345*3', '345'),
+        ([('3', False)] * 4 + [('4', True)], True, {'a, 3 per turn': 1.0}, '33334', '3'),
+    ],
+)
+def test_all_harmonics_are_tried_after_a_few_or_where_one_does_not_pay(
+    found, everything, gains, tried, chosen
+):
+    model, verdicts = Told(found, everything, gains), [Verdict('ratio', 1.0, 0.5, True)]
+    names, told = model_choice._with_harmonics(model, ['b.ratio'], verdicts, lambda _: None)
+    assert ''.join('*' if what == 'all' else what[3] for _, what in model.tried) == tried
+    assert names == ('b.ratio', *(f'a.{wave}_{k}' for k in chosen for wave in ('sin', 'cos')))
+    assert [verdict.what for verdict in told[1:]] == [
+        verdict.replace('*', 'all') if verdict == '*' else f'a, {verdict} per turn'
+        for verdict in tried
+    ]
+
+
+def test_groups_are_added_the_best_first(monkeypatch):
+    """Each round tries the others again; the first verdict of what pays is that of its round."""
+    gains = {'ratio': 0.2, 'gravity': 0.5, 'coupling': 0.0}
+    model = Told(gains=gains)
+    monkeypatch.setattr(model_choice, 'LinearModel', lambda *_: model)
+    problem = SimpleNamespace(chain=UR10E)
+    chosen, verdicts = model_choice._chosen(problem, None, lambda _: None)
+    assert chosen == ('a.gravity_a', 'a.gravity_b', 'a.ratio')
+    assert [(v.what, v.pays) for v in verdicts] == [
+        ('ratio', True),
+        ('coupling', False),
+        ('gravity', True),
+    ]
+    first, second = (), ('a.gravity_a', 'a.gravity_b')
+    third = (*second, 'a.ratio')
+    assert model.tried == [
+        *((first, group) for group in ('ratio', 'coupling', 'gravity')),
+        *((second, group) for group in ('ratio', 'coupling')),
+        (third, 'coupling'),
+    ]
+
+
+@dataclass(frozen=True)
+class Result:
+    accepted: bool = True
+    converged: bool = True
+    refusals: tuple = ()
+    remarks: tuple = ()
+    verdicts: tuple = ()
+    richer: bool = False
+
+
+@pytest.mark.parametrize(
+    ('before', 'richer', 'reason'),
+    [
+        (Result(), Result(), None),
+        (Result(), Result(converged=False, refusals=('no',)), 'its fit has not converged'),
+        (Result(), Result(accepted=False, refusals=('no', 'never')), 'no; never'),
+        (Result(accepted=False), Result(accepted=False, refusals=('no',)), None),
+        (Result(accepted=False), Result(converged=False), 'its fit has not converged'),
+    ],
+)
+def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monkeypatch, rng):
+    """And its work is told in shares: by the entries of all columns that are made."""
+    problem = Problem(UR10E, measure(UR10E, UR10E.random_joints(3, rng), rng, *NOISE))
+    shares, verdicts = [], (Verdict('ratio', 1.0, 0.5, True),)
+
+    def identified(given, simpler=None, progress=None):
+        assert (simpler is before) == bool(given.effects)
+        progress(0.5)
+        return replace(richer, richer=True) if given.effects else before
+
+    def chosen(given, result, progress):
+        progress(0.5)
+        return ('elbow_joint.ratio',), verdicts
+
+    monkeypatch.setattr(model_choice, 'identify', identified)
+    monkeypatch.setattr(model_choice, '_chosen', chosen)
+    found = identify_model(problem, 'auto', lambda told: shares.append(told))
+    assert found.richer is (reason is None)
+    assert found.verdicts == verdicts
+    remark = f'the richer model is not used, because {reason}'
+    assert found.remarks == ((remark,) if reason else ())
+    fit, tried = len(problem.free) * 3, 2 * 38 * 6 * 3
+    done = np.array([0.5 * fit, fit + 0.5 * tried, 1.5 * fit + tried]) / (2 * fit + tried)
+    assert [share for share in shares if not isinstance(share, str)] == pytest.approx([*done])

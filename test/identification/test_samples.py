@@ -68,9 +68,21 @@ def test_rows_of_positions_among_poses_are_those_of_each_alone(correlated):
     if correlated:
         seen = replace(seen, covariance=1e-8 * np.tile(SPREAD, (4, 1, 1)))
     names = UR10E.parameter_names[:4]
-    found = Samples(seen, 3e-4, 7e-4).rows_of(UR10E, names)
+    samples = Samples(seen, 3e-4, 7e-4)
+    found = samples.rows_of(UR10E, names)
+    assert samples.rows == 4 * 3 + 2 * 3
+    errors = np.concatenate(residual_arrays(UR10E, seen), axis=1)
+    everything = residual_arrays(UR10E, replace(seen, oriented=np.ones(4, dtype=bool)))
+    covariances = seen.covariances((3e-4, 7e-4))
+    whitened = np.concatenate(samples.whitened_residuals(UR10E), axis=1)
     for k, oriented in enumerate(seen.oriented):
         alone = Samples(seen.select(np.array([k])), 3e-4, 7e-4).rows_of(UR10E, names)
         same = slice(0, 6 if oriented else 3)
         np.testing.assert_allclose(found[:, same, k], alone[:, same, 0], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(found[:, same.stop :, k], 0.0)
+        expected = np.concatenate([part[k] for part in everything])
+        np.testing.assert_array_equal(errors[k, same], expected[same])
+        assert np.isnan([errors[k, same.stop :], whitened[k, same.stop :]]).all()
+        square = expected[same] @ np.linalg.solve(covariances[k, same, same], expected[same])
+        assert whitened[k, same] @ whitened[k, same] == pytest.approx(square)
+        assert found[-1, :, k] @ found[-1, :, k] == pytest.approx(square)

@@ -7,11 +7,12 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, along_path, fitted, measured_arm
 from scipy.signal import lfilter
 from scipy.spatial.distance import cdist
+from scipy.stats import norm
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification import samples as samples_module, shared_errors
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.leastsquares import System
+from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.report.words import as_document, neighbours_in_words
 
 
@@ -260,3 +261,168 @@ def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
         sizes = forms.sizes({0: kernels})[0]
         assert np.isfinite(sizes).all()
         assert (sizes >= 0.0).all()
+
+
+def test_neighbours_are_the_next_stop_and_the_three_nearest():
+    """Within a set: those of another are far away in both senses."""
+    rng = np.random.default_rng(0)
+    count, far = 14, shared_errors.ELSEWHERE
+    number = np.repeat([0.0, 1.0], [9, 5])
+    place = np.column_stack([rng.normal(size=(count, 2)), far * number])
+    time = np.array([0, 1, 2, 4, 5, 6, 7, 9, 10, 3, 4, 5, 7, 8]) + far * number
+    units = shared_errors._Stops([], np.arange(1.0, 15.0), place, time)
+    assert len(units) == count
+    apart = cdist(place, place)
+    nearest = np.argsort(apart, axis=1)[:, 1:4]
+    expected = np.zeros((count, count))
+    expected[np.arange(count)[:, np.newaxis], nearest] = 1.0
+    expected = np.maximum(expected, expected.T)
+    np.testing.assert_array_equal(units.links('near').toarray(), expected)
+    assert not expected[:9, 9:].any()
+    follows = np.abs(np.subtract.outer(time, time)) == 1.0
+    np.testing.assert_array_equal(units.links('successive').toarray(), follows)
+    for kind, distance in (('near', apart), ('successive', np.abs(np.subtract.outer(time, time)))):
+        root = np.sqrt(np.outer(units.count, units.count))
+        np.testing.assert_allclose(units.kernel(kind, 0.7), root * np.exp(-distance / 0.7))
+
+
+@pytest.mark.parametrize(('share', 'run'), [(1, 1), (2, 3)])
+def test_stops_have_the_sums_of_their_samples(share, run):
+    """Over the root of their number, of all sets; weightless samples are none."""
+    rng = np.random.default_rng(1)
+    repeats = rng.integers(1, 4, size=14)
+    stops = np.repeat(np.arange(14), repeats)
+    q = UR10E.random_joints(14, rng)[stops]
+    poses = measure(UR10E, q, rng, *NOISE)
+    points = measure(UR10E, q[stops < 9], rng, *NOISE, oriented=False)
+    weights = np.where(np.arange(len(q)) == 3, 0.0, rng.uniform(0.5, 1.0, len(q)))
+    sets = (
+        samples_module.Samples(points, *NOISE),
+        samples_module.Samples(poses, *NOISE).weighted(weights),
+    )
+    names = UR10E.parameter_names[:8]
+    units = shared_errors._gather(UR10E, names, System(sets), share, run)
+    parts, counts, places, times = [[], []], [], [], []
+    for number, samples in enumerate(sets):
+        rows = samples.rows_of(UR10E, names)
+        rows = np.pad(rows, ((0, 0), (0, 6 - rows.shape[1]), (0, 0)))
+        good = np.ones(samples.count) if samples.weights is None else samples.weights > 0.0
+        for stop in range(9 if number == 0 else 14):
+            which = np.flatnonzero((stops[: samples.count] == stop) & (good > 0))
+            if stop // run % share == 0 and len(which):
+                whole = rows[..., which].sum(axis=2) / np.sqrt(len(which))
+                parts[0].append(whole[:, :3])
+                parts[1].append(whole[:, 3:])
+                counts.append(len(which))
+                here = q[which[0]]
+                far = shared_errors.ELSEWHERE * number
+                places.append([*np.cos(here), *np.sin(here), far])
+                times.append(stop + far)
+    for found, expected in zip(units.parts, parts, strict=True):
+        np.testing.assert_allclose(found, np.stack(expected, axis=2), rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(units.count, counts)
+    np.testing.assert_allclose(units.place, places, atol=1e-12)
+    np.testing.assert_array_equal(units.time, times)
+
+
+def drawn(rng, count=20, width=4):
+    parts = [rng.normal(size=(width + 1, 3, count)) for _ in range(2)]
+    parts[1][:, :, ::3] = 0.0
+    place = rng.normal(size=(count, 2))
+    return shared_errors._Stops(parts, np.ones(count), place, np.arange(count, dtype=float))
+
+
+def test_errors_near_in_joint_space_have_the_kernel_of_their_distance():
+    """From every third stop: sums over stops grow by three, sums over pairs by nine."""
+    units = drawn(np.random.default_rng(2))
+    kernel = np.exp(-cdist(units.place, units.place) / 0.8)
+    for part, rows in enumerate(units.parts):
+        own = rows[:-1]
+        for share in (1, 3):
+            whole = share**2 * kernel
+            np.fill_diagonal(whole, share)
+            expected = np.einsum('pcn,nm,rcm->pr', own, whole, own)
+            found = shared_errors._near(units, part, 0.8, share)
+            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(monkeypatch):
+    """Forms of exactly the expected values give back the sizes, of both parts."""
+    units, extra = drawn(np.random.default_rng(3)), np.random.default_rng(4).normal(size=(2, 4))
+    forms = shared_errors._Forms(units, extra)
+    assert forms.parts == [0, 1]
+    kernels = {0: [('successive', 5.0), ('near', 0.5)], 1: [('near', 0.5)]}
+    truth = [np.array([2.0, 0.0, 0.7]), np.array([0.3, 5.0])]
+    cases = [(k, m) for k in (0, 1) for m in (None, *kernels[k])]
+    matrices = [np.eye(20) if kernel is None else units.kernel(*kernel) for _, kernel in cases]
+    every = [forms._form(part, m) for (part, _), m in zip(cases, matrices, strict=True)]
+    values = forms._moments(every) @ np.concatenate(truth)
+    plain, left = forms._form, iter(values.tolist())
+    monkeypatch.setattr(
+        forms, '_form', lambda part, matrix: replace(plain(part, matrix), value=next(left))
+    )
+    found = forms.sizes(kernels)
+    for part in (0, 1):
+        np.testing.assert_allclose(found[part], truth[part], rtol=1e-6, atol=1e-9)
+    residual = np.concatenate([part[-1].ravel() for part in units.parts] + [[0.0, 0.0]])
+    rows = [part[:-1].reshape(4, -1).T for part in units.parts]
+    basis = np.linalg.qr(np.concatenate([*rows, extra]))[0]
+    residual -= basis @ (basis.T @ residual)
+    for (part, _), matrix, form in zip(cases, matrices, every, strict=True):
+        own = residual[60 * part : 60 * part + 60].reshape(3, 20)
+        assert form.value == pytest.approx(np.einsum('cn,nm,cm->', own, matrix, own))
+
+
+def test_too_few_stops_share_nothing():
+    """Fewer than tell how large a spread is."""
+    _, true, seen = measured_arm(0, 7)
+    system = System((samples_module.Samples(seen, *NOISE),))
+    names = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
+    found = shared_errors.shared_errors(minimise(true, names, system), names, system)
+    assert (found.successive, found.near, found.found, found.middles) == (0.0, 0.0, (), {})
+    weightless = system.weighted([np.zeros(7)])
+    assert not len(shared_errors._gather(true, names, weightless, 1, 20))
+
+
+@pytest.mark.parametrize('most', [400, 20])
+def test_the_middle_is_the_sum_of_all_that_a_test_finds(most, monkeypatch):
+    """White, near and successive errors by their sizes; a score decides, at 99 % of all tests."""
+    monkeypatch.setattr(shared_errors, 'MOST_STOPS', most)
+    rng = np.random.default_rng(5)
+    seen = measure(UR10E, UR10E.random_joints(24, rng), rng, *NOISE)
+    system, names = System((samples_module.Samples(seen, *NOISE),)), UR10E.parameter_names[:9]
+    fit = minimise(UR10E, names, system)
+    limit = norm.ppf(1.0 - 0.01 / 4)
+    scores = {('successive', 0): limit + 1e-6, ('near', 0): 9.0, ('near', 1): limit - 1e-6}
+    scores |= {('successive', 1): 9.0}
+    kinds = iter(['successive'] * 2 + ['near'] * 2)
+    sizes = {0: np.array([2.0, 0, 0, 0.3, 0, 0, 0, 0.0, 0.7]), 1: np.zeros(6)}
+
+    def test(_, part, __):
+        kind = next(kinds)
+        return 0.1 * (1 + part) * (1 if kind == 'near' else -1), scores[kind, part]
+
+    def sized(_, kernels):
+        successive = [('successive', length) for length in (1.0, 3.0, 10.0, 30.0, 100.0)]
+        assert kernels == {
+            0: [*successive, *(('near', x) for x in (0.3, 1.0, 3.0))],
+            1: successive,
+        }
+        return sizes
+
+    monkeypatch.setattr(shared_errors._Forms, 'test', test)
+    monkeypatch.setattr(shared_errors._Forms, 'sizes', sized)
+    found = shared_errors.shared_errors(fit, names, system)
+    assert (found.successive, found.near) == (0.0, 0.2)
+    assert found.found == ('successive', 'near')
+    rows = system.rows_of(fit.chain, names)[0][:-1, :3]
+    time = np.arange(24)
+    place = np.concatenate([np.cos(seen.joints), np.sin(seen.joints)], axis=1)
+    share = 1 if most > 24 else 2  # every second one of 24 stops, at most 20
+    kept = time % share == 0
+    near = 0.7 * share * np.exp(-cdist(place, place) / 3.0)
+    near = near * np.outer(kept, kept) * np.where(np.eye(24, dtype=bool), 1.0, share)
+    kernel = 2.0 * np.eye(24) + 0.3 * np.exp(-np.abs(np.subtract.outer(time, time)) / 10.0) + near
+    expected = np.einsum('pcn,nm,rcm->pr', rows, kernel, rows)
+    assert list(found.middles) == [0]
+    np.testing.assert_allclose(found.middles[0], expected, rtol=1e-9, atol=1e-6)

@@ -47,6 +47,10 @@ def test_noise_makes_no_gauge_freedom_look_determined():
     assert gauges(result) == gauges(found(0))
     std = [p.std for p in result.parameters if p.std and not result.chain.owns_frame(p.name)]
     assert max(std) < 30.0 * 5e-4
+    for side in (result.validation.before, result.validation.after):
+        for place in range(4):  # which is fitted to its own pairs, so that they err about nothing
+            away = side.position[side.configurations == place].mean(axis=0)
+            assert np.abs(away).max() < 1e-3 * 5e-4
 
 
 @pytest.mark.parametrize('offset', [0.0, 3e-4])

@@ -9,11 +9,12 @@ import pytest
 from fits import UR10E, worst_prediction
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.identification import trimmed
 from calib_ros.identification.identification import Problem, identify
-from calib_ros.identification.leastsquares import System
+from calib_ros.identification.leastsquares import Prior, System
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import _shortest, closed_forms
-from calib_ros.identification.trimmed import _Linear
+from calib_ros.identification.trimmed import _Halves, _Linear, trimmed_sum
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
@@ -44,6 +45,76 @@ def test_units_of_the_residuals_do_not_change_a_fit_to_a_half(rng):
         for size in (1e-4, 1e6)
     )
     np.testing.assert_allclose(1e20 * many, few, rtol=1e-5)
+
+
+def two_sets(rng, counts=(40, 23)):
+    """Return a system of poses and of positions at repeated joint values, with a prior."""
+    first, second = (
+        measure(UR10E, UR10E.random_joints(count, rng), rng, 1e-4, 3e-4, oriented=not k)
+        for k, count in enumerate(counts)
+    )
+    second = second.select(np.repeat(np.arange(counts[1]), 3))
+    sets = tuple(Samples(each, 1e-4, 3e-4) for each in (first, second))
+    return System(sets, Prior(UR10E, {'elbow_joint.a': 1e-5}, noise=2.0))
+
+
+def test_squares_after_fits_to_masks_are_those_of_least_squares(rng):
+    """The prior pulls a parameter back from an offset; each mask is one fit."""
+    system, names = two_sets(rng), [*UR10E.joints[2].parameters[:3], 'tool.x', 'tool.rx']
+    chain = UR10E.with_offsets({'elbow_joint.a': 1e-3})
+    masks = rng.random((4, 40 + 69)) < 0.5
+    found = _Linear(chain, names, system).squares(masks)
+    extra, offset = system.extra_rows(chain, names)
+    rows = [np.pad(r, ((0, 0), (0, 6 - r.shape[1]), (0, 0))) for r in system.rows_of(chain, names)]
+    every = np.concatenate(rows, axis=2)
+    for mask, squares in zip(masks, found, strict=True):
+        chosen = every[..., mask].reshape(len(every), -1).T
+        left, right = np.vstack([chosen[:, :-1], extra]), np.append(chosen[:, -1], offset)
+        step = np.linalg.lstsq(left, right, rcond=None)[0]
+        away = every[-1] - np.einsum('p,pcn->cn', step, every[:-1])
+        np.testing.assert_allclose(squares, (away**2).sum(axis=0), rtol=1e-4, atol=1e-4)
+
+
+def test_halves_are_of_every_set_and_slightly_more(rng):
+    """As many configurations are drawn as half of the parameters need, whole ones."""
+    system = two_sets(rng)
+    names = [*UR10E.joints[2].parameters[:3], 'tool.x', 'elbow_joint.a']
+    need = trimmed._need(names, system)  # the prior's parameter needs no equations
+    assert need == pytest.approx(3.0 / (6 * 40 + 3 * 23))
+    halves = _Halves(system, 0.25)
+    assert halves.parts == [slice(0, 40), slice(40, 109)]
+    drawn = halves.draw(0.25)
+    assert drawn.shape == (trimmed.STARTS, 109)
+    np.testing.assert_array_equal(drawn[:, :40].sum(axis=1), 5)  # an eighth
+    np.testing.assert_array_equal(drawn[:, 40:].sum(axis=1), 3 * 3)
+    together = drawn[:, 40:].reshape(-1, 23, 3)
+    np.testing.assert_array_equal(together.all(axis=2), together.any(axis=2))
+    assert len(np.unique(drawn[:, :40], axis=0)) > 490  # of 658,008
+    squares = rng.random((3, 109))
+    masks, sums = halves.concentrate(squares)
+    for part, size in ((slice(0, 40), 25), (slice(40, 109), 44)):
+        np.testing.assert_array_equal(masks[:, part].sum(axis=1), size)
+        limit = np.sort(squares[:, part], axis=1)[:, size - 1 : size]
+        np.testing.assert_array_equal(masks[:, part], squares[:, part] <= limit)
+    np.testing.assert_allclose(sums, (squares * masks).sum(axis=1))
+
+
+@pytest.mark.parametrize(('counts', 'left'), [((40, 23), (40, 69)), ((601, 20), (86, 60))])
+def test_of_many_samples_an_even_spread_of_each_set_is_searched(counts, left, rng):
+    """Two hundred in all: a hundred of each of two sets."""
+    system = two_sets(rng, counts)
+    few = trimmed._thinned(system)
+    assert tuple(samples.count for samples in few.sets) == left
+    share = -(-counts[0] // left[0])
+    np.testing.assert_array_equal(few.sets[0].joints, system.sets[0].joints[:, ::share])
+
+
+def test_the_trimmed_sum_is_that_of_the_shorter_half_of_each_set(rng):
+    system = two_sets(rng, (7, 2))  # six samples in the second set
+    wanted = 0.0
+    for rows, half in zip(system.rows_of(UR10E, ()), (4, 3), strict=True):
+        wanted += np.sort((rows[-1] ** 2).sum(axis=0))[:half].sum()
+    assert trimmed_sum(UR10E, system) == pytest.approx(wanted, rel=1e-9)
 
 
 @pytest.mark.parametrize('oriented', [True, False])

@@ -144,6 +144,15 @@ def truth(group, rng):
     return nominal, dict(zip(names, size * signs * rng.uniform(0.5, 1.5, len(names)), strict=True))
 
 
+def test_effects_may_be_a_third_of_an_arc_minute_or_one_of_what_bends():
+    minute = np.radians(1.0 / 60.0)
+    for group in effects.GROUPS:
+        sizes = {effects.expected(name) for name in effects.members(GEARED, group)}
+        bends = group in ('gravity', 'compliance', 'backlash')
+        assert len(sizes) == 1
+        assert sizes.pop() == pytest.approx(minute if bends else minute / 3.0, rel=0.05)
+
+
 def by_hand(true, values, q, approach):
     """Return poses (N, 4, 4) with effects that are written out here, torques excepted."""
     moved = q.copy()
