@@ -52,8 +52,8 @@ class Step:
     `image` of it and `stamp_ns` are those of the first sample after it. `size` is the RMS change
     of positions ('m') or, where it weighs more, of orientations ('rad'); of a joint that of its
     zero. `share` is what it explains of the squares of the residuals beyond as many useless
-    parameters. It is `outside` if all that was measured on one side are outliers: the fit is not
-    spoilt by it.
+    parameters. If all that was measured on one side are outliers, `unused` says which: the fit is
+    not spoilt by it.
     """
 
     what: str
@@ -64,13 +64,13 @@ class Step:
     size: float
     unit: str
     share: float
-    outside: bool
+    unused: str
     image: int | None = None
 
     @property
     def harmful(self) -> bool:
         """Tell whether the fit is that of no arm: of none before or after, or of one no more."""
-        return self.kind == 'joint' or not self.outside
+        return self.kind == 'joint' or not self.unused
 
     @property
     def reason(self) -> Reason:
@@ -82,17 +82,17 @@ class Step:
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         line, fraction = divmod(self.stamp_ns, 10**9)
         if line < 10**6 and not fraction:  # no clock, the numbers of rows
-            when = f'line {line}; rows count in their order'
+            when = f'line {line}, if rows are in the order of measurement'
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
-        text = f'something moved at {where}'
+        text = f'something moved before {where}'
         text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':
             return f'{text}the zero of {self.what} ({size})'
         thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
         text += f'{thing} ({self.what}, {size})'
-        if self.outside:
-            text += '; what was measured on one side of it carries no weight'
+        if self.unused:
+            text += f'; what was measured {self.unused} carries no weight'
         return text
 
 
@@ -310,11 +310,14 @@ class _Scan:
             size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'
-        outside = not all(np.concatenate(side).any() for side in weights)
+        sides = zip(('before that', 'from there on'), weights, strict=True)
+        unused = [where for where, side in sides if not np.concatenate(side).any()]
         seen = problem.sets[of_set]
         image = None if seen.pixels is None else int(seen.images[sample])
         where = (of_set, sample, stamp)
-        return Step(group.what, group.kind, *where, size, unit, found.share, outside, image)
+        return Step(
+            group.what, group.kind, *where, size, unit, found.share, ''.join(unused), image
+        )
 
 
 def _groups(problem: Problem) -> list[_Group]:

@@ -157,9 +157,9 @@ def test_a_step_beside_the_fit_is_told_and_harms_nothing():
     true, seen = session(2)
     result = identify(Problem(UR10E, moved(seen, true, 'base', 0.02, at=45), **SIGMAS))
     assert result.accepted
-    assert result.step.outside
+    assert result.step.unused
     assert result.remarks == (str(result.step),)
-    assert 'carries no weight' in result.remarks[0]
+    assert 'what was measured from there on carries no weight' in result.remarks[0]
     assert result.remarks[0] in remarks(result)
     assert as_document(result, {})['remarks'] == list(result.remarks)
 
@@ -175,7 +175,7 @@ def test_a_step_of_which_samples_are_fitted_is_not_beside_the_fit():
     robust = Robust(fit, system, (distances,), True, 0, problem.loss)
     step = find_step(problem, result.names, robust)
     assert step.kind == 'base'
-    assert not step.outside
+    assert not step.unused
     assert step.harmful
 
 
@@ -186,14 +186,15 @@ def test_the_order_is_that_of_the_stamps(rng):
     step = identify(Problem(UR10E, seen.select(mixed), **SIGMAS)).step
     assert mixed[step.sample] == AT
     assert step.stamp_ns == seen.stamps_ns[AT]
-    assert f'at pose {step.sample + 1} (stamp 270.000 s)' in str(step)
+    assert f'before pose {step.sample + 1} (stamp 270.000 s)' in str(step)
 
 
 def test_without_stamps_the_order_of_the_rows_is_said():
     true, seen = session(3)
     result = identify(Problem(UR10E, moved(seen, true, 'tool', 8e-4), **SIGMAS))
     assert result.refusals[0].startswith(
-        'something moved at pose 27 (line 27; rows count in their order): the target (tool, 0.8'
+        'something moved before pose 27 (line 27, if rows are in the order of measurement): the '
+        'target (tool, 0.8'
     )
 
 
