@@ -136,12 +136,9 @@ def read_lens(path: Path) -> Lens:
     content = parse_yaml(read_text(path, what='intrinsics '), str(path))
     if not isinstance(content, dict):
         raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
-    return lens_of(
-        content.get('distortion_model', DISTORTED[0]),
-        _numbers(content, ('camera_matrix', 'k', 'K'), path),
-        _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False),
-        str(path),
-    )
+    matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
+    distortion = _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False)
+    return lens_of(content.get('distortion_model', DISTORTED[0]), matrix, distortion, str(path))
 
 
 def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
@@ -221,18 +218,15 @@ def posed_arm() -> Chain:
     It takes the place of an arm of which only the flange's poses are known.
     """
     quarter = np.pi / 2
-    return Chain(
-        POSED,
-        'standard',
-        (
-            Joint('flange_z', 'prismatic', theta=quarter, alpha=quarter),
-            Joint('flange_x', 'prismatic', theta=quarter, alpha=quarter),
-            Joint('flange_y', 'prismatic', alpha=-quarter),
-            Joint('flange_rx', alpha=quarter),
-            Joint('flange_ry', theta=quarter, alpha=quarter),
-            Joint('flange_rz'),
-        ),
+    joints = (
+        Joint('flange_z', 'prismatic', theta=quarter, alpha=quarter),
+        Joint('flange_x', 'prismatic', theta=quarter, alpha=quarter),
+        Joint('flange_y', 'prismatic', alpha=-quarter),
+        Joint('flange_rx', alpha=quarter),
+        Joint('flange_ry', theta=quarter, alpha=quarter),
+        Joint('flange_rz'),
     )
+    return Chain(POSED, 'standard', joints)
 
 
 def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:

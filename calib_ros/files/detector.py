@@ -30,8 +30,6 @@ Markers = tuple[FloatArray, NDArray[np.intp]]
 
 FEWEST = len(parameters_of('base'))
 """Corners of an image that is used: half of their coordinates make its pose, half check it."""
-BLURRED = 8.0
-"""Width [px] of the sharpest edges from which on an image is blurred."""
 WINDOW = 0.6
 """Half the window that refines a corner, by the distance to the nearest marker; measured, as is
 WIDEST, by benchmarks/images.py."""
@@ -109,9 +107,8 @@ class Detector:
         self._new = hasattr(aruco, 'ArucoDetector')
         self._count = len(marker_cells(board))
         self._dictionary = _dictionary(board.dictionary)
-        self._parameters = (
-            aruco.DetectorParameters() if self._new else aruco.DetectorParameters_create()
-        )
+        made = 'DetectorParameters' if self._new else 'DetectorParameters_create'
+        self._parameters = getattr(aruco, made)()
         if board.type == 'markers':
             self._parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._corners = self._charuco() if board.type == 'charuco' else _of_markers
@@ -121,7 +118,7 @@ class Detector:
         if not image.size:
             return Refusal('that cannot be decoded', 'it is no image that OpenCV can read')
         width = _edge_width(self._cv2, image)
-        if width > BLURRED:
+        if width > 8.0:
             reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
             return Refusal('blurred', reason)
         corners, ids = self._sought(image)
@@ -135,11 +132,10 @@ class Detector:
             return Refusal('without the board', reason)
         own = ids < self._count
         if (~own).sum() > len(ids) // 2:
-            return Refusal(
-                'of another board',
+            reason = (
                 f'it shows another board: marker {int(ids[~own][0])}, and this board has 0 to '
-                f'{self._count - 1}',
             )
+            return Refusal('of another board', f'{reason}{self._count - 1}')
         return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:
@@ -165,9 +161,8 @@ class Detector:
 
     def _halved(self, image: Image, times: int) -> Image:
         size = tuple(max(side // 2**times, 1) for side in image.shape[1::-1])
-        return (
-            self._cv2.resize(image, size, interpolation=self._cv2.INTER_AREA) if times else image
-        )
+        area = self._cv2.INTER_AREA
+        return self._cv2.resize(image, size, interpolation=area) if times else image
 
     def _hidden(
         self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
@@ -197,22 +192,18 @@ class Detector:
         number, pixels = self._corners(image, corners, ids)
         whole = len(self._board.corners)
         if len(number) < self._fewest:
-            return Refusal(
-                'with too little of the board',
-                f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, and '
-                f'{len(ids)} markers: is it a part of the board only, or another board?',
-            )
+            reason = f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, '
+            reason += f'and {len(ids)} markers: is it a part of the board only, or another board?'
+            return Refusal('with too little of the board', reason)
         points = self._board.corners[number, :2]
         placed = self._placed(points, pixels, points)
         apart = np.inf if placed is None else np.linalg.norm(placed - pixels, axis=1).max()
         spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
         # Lens and board may bend a board by half of what a corner is refined in, or 10 %.
         if apart > max(0.5 * WIDEST, EXCEPTION * spacing):
-            return Refusal(
-                'whose corners do not fit the board',
-                f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, square'
-                ' and marker those of this board, and is it flat?',
-            )
+            reason = f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, '
+            reason += 'square and marker those of this board, and is it flat?'
+            return Refusal('whose corners do not fit the board', reason)
         return number, pixels
 
     def _placed(
@@ -282,9 +273,7 @@ class Detector:
         aruco, given = self._cv2.aruco, self._parameters
         given.minMarkerPerimeterRate = 0.03 / share
         given.adaptiveThreshWinSizeMin, given.adaptiveThreshWinSizeMax = windows[0], windows[-1]
-        given.adaptiveThreshWinSizeStep = max(
-            (windows[-1] - windows[0]) // (len(windows) - 1 or 1), 1
-        )
+        given.adaptiveThreshWinSizeStep = windows.step
         if self._new:
             corners, ids, _ = aruco.ArucoDetector(dictionary, given).detectMarkers(image)
         else:

@@ -254,13 +254,8 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
     """
     base, tool = chain.frame('base'), chain.frame('tool')
     start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
-    driven = {joint.driven for joint in start.joints}
-    names = [
-        name
-        for name in start.parameter_names
-        if start.owns_frame(name)
-        or Parameter(name).kind in kinds
-        or ('zero' in kinds and name in driven)
-    ]
+    chosen = {joint.driven for joint in start.joints} if 'zero' in kinds else set()
+    chosen |= {name for name in start.parameter_names if Parameter(name).kind in kinds}
+    names = [name for name in start.parameter_names if name in chosen or start.owns_frame(name)]
     joints = joints[:: max(1, len(joints) // 200)]  # to be fitted; it is judged on all
     return likened(start, names, chain, joints, 1e-3)[0]

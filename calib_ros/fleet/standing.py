@@ -22,7 +22,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, page_path, results
 from calib_ros.fleet.watch import Change, Watched, watch
 from calib_ros.fleet.work import PLOTLY
-from calib_ros.report.page import MARKS, MISSING, State, filled, plotly_script
+from calib_ros.report.page import MISSING, State, filled, plotly_script
 
 STATES: Mapping[str, tuple[State, str]] = {
     'changed': ('bad', 'the arm is another one than in the nights before'),
@@ -186,7 +186,6 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
     return filled(
         'fleet.html.jinja',
         mark=STATES[found[0].state][0] if found else 'info',
-        marks=MARKS,
         states=STATES,
         counts={state: number for state, number in counts(found).items() if number},
         total=len(found),

@@ -121,14 +121,9 @@ def _outcome(task: Task) -> Outcome:
         else:
             loaded = of_bag(*replayed(path, chain, settings), robot.largest_loss)
         problem, result = loaded.problem, loaded.identified(settings.model)
-        about = Filing(
-            robot.serial,
-            measured_at((*problem.sets, *problem.judging), source.modified),
-            content,
-            robot.settings_hash,
-            source.name,
-            source.fingerprint,
-        )
+        time_of = measured_at((*problem.sets, *problem.judging), source.modified)
+        known = (content, robot.settings_hash, source.name, source.fingerprint)
+        about = Filing(robot.serial, time_of, *known)
         row = identified(result, about, loaded.warnings)
         if not task.page:
             return Outcome(row)

@@ -136,18 +136,10 @@ def render(report: Report, script: str = '') -> str | None:
     plotly = '' if script else plotly_script()
     if plotly is None:
         return None
-    return filled(
-        'report.html.jinja',
-        report=report,
-        marks=MARKS,
-        drawings=None,
-        script=script,
-        plotly=plotly,
-        data={
-            'figures': {each.name: each.figure for each in report.shown if each.figure},
-            'explorer': report.explorer,
-        },
-    )
+    drawn = {each.name: each.figure for each in report.shown if each.figure}
+    data = {'figures': drawn, 'explorer': report.explorer}
+    shown = {'drawings': None, 'script': script, 'plotly': plotly, 'data': data}
+    return filled('report.html.jinja', report=report, **shown)
 
 
 def on_paper(report: Report) -> bytes | None:
@@ -163,15 +155,9 @@ def on_paper(report: Report) -> bytes | None:
 
     drawn = ((each.name, drawing(each.figure, each.height)) for each in report.shown)
     logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
-    page = filled(
-        'report.html.jinja',
-        report=report,
-        marks=MARKS,
-        drawings={name: each for name, each in drawn if each},
-    )
-    if page is None:
-        return None
-    found: bytes = weasyprint.HTML(string=page).write_pdf()
+    drawings = {name: each for name, each in drawn if each}
+    page = filled('report.html.jinja', report=report, drawings=drawings)
+    found: bytes | None = weasyprint.HTML(string=page).write_pdf() if page else None
     return found
 
 
@@ -181,16 +167,12 @@ def filled(template: str, **values: Any) -> str | None:
         import jinja2
     except ImportError:
         return None
+    loader, undefined = jinja2.FunctionLoader(_template), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_template),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_shown,
-        trim_blocks=True,
+        loader=loader, autoescape=True, undefined=undefined, finalize=_shown, trim_blocks=True
     )
-    page: str = environment.get_template(template).render(
-        css=_template('report.css'), js=_template('report.js'), **values
-    )
+    values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
+    page: str = environment.get_template(template).render(**values)
     return page
 
 

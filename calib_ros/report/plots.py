@@ -174,16 +174,9 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
     line = style[look.get('dash', 'solid')] if 'lines' in curve['mode'] else ''
     mark = {'diamond': 'D'}.get(curve.get('marker', {}).get('symbol', ''), 'o')
     error = curve.get('error_x', {}).get('array')
-    axes.errorbar(
-        curve['x'],
-        _plain(curve['y']),
-        xerr=error,
-        color=look['color'],
-        linestyle=line,
-        marker=mark if 'markers' in curve['mode'] else '',
-        markersize=4,
-        label=curve['name'],
-    )
+    marks = {'marker': mark if 'markers' in curve['mode'] else '', 'markersize': 4}
+    shown = {'color': look['color'], 'linestyle': line, 'label': curve['name'], **marks}
+    axes.errorbar(curve['x'], _plain(curve['y']), xerr=error, **shown)
 
 
 def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
@@ -219,7 +212,4 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
 
 def _plain(names: Sequence[Any]) -> list[Any]:
     """Return names without what plotly or matplotlib would read as marks."""
-    return [
-        html.unescape(each).replace('$', r'\$') if isinstance(each, str) else each
-        for each in names
-    ]
+    return [html.unescape(x).replace('$', r'\$') if isinstance(x, str) else x for x in names]

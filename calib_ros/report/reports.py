@@ -48,6 +48,7 @@ def identification_report(
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
     limits = sections.limits_of(judged, 1, CONFIDENT)
+    corrected = table_hash(result.chain) if result.accepted else 'none: not accepted'
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
@@ -66,11 +67,7 @@ def identification_report(
         steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
         identity=sections.identity_of(
-            result.chain,
-            origin,
-            poses,
-            ('Judged by', result.validated_by),
-            table_hash(result.chain) if result.accepted else 'none: not accepted',
+            result.chain, origin, poses, ('Judged by', result.validated_by), corrected
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
