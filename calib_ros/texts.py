@@ -44,10 +44,7 @@ def read_text(
     error: type[CalibrationError] = ConfigError,
     what: str = '',
 ) -> str:
-    """Return the text of a file, which `what` describes, without a byte order mark.
-
-    An `error` is raised when it cannot be read, is too large or is not UTF-8.
-    """
+    """Return the text of a UTF-8 file, which `what` describes; raise an `error` if that fails."""
     return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
 
 

@@ -33,10 +33,7 @@ CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
 
 
 class Journal:
-    """An open journal, which only grows and which no other process can open meanwhile.
-
-    The file is made if there is none, else rows are added.
-    """
+    """An open journal, new or not, which only grows and which no other process can open."""
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -169,10 +166,7 @@ class Archive:
         self.write()
 
     def write(self) -> None:
-        """Write what waits, as far as that is possible; `error` tells whether it was.
-
-        A journal that is no longer there goes on in another file, with all that was in it.
-        """
+        """Write what waits, if possible; a journal that is gone goes on in another file."""
         try:
             if self._journal is not None and self._journal.gone:
                 if self._path == self._journal.path:
@@ -200,10 +194,7 @@ class Archive:
         self._due = False
 
     def begin_anew(self) -> Path | None:
-        """Begin another journal, unless samples would be lost; return the path of the old one.
-
-        The new one is written at once: after a crash it must be the newest.
-        """
+        """Begin another journal, on disk at once; return the path of the old one."""
         self.write()
         if self._waiting:
             raise InputError(
@@ -232,10 +223,7 @@ class Archive:
         return next(reversed(self._files(CALIBRATION)), None)
 
     def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
-        """Write a calibration, into a new file unless a path is given; return its path.
-
-        The configuration by which it was made, where that is known, is written beside it.
-        """
+        """Write a calibration, and how it was made if that is known; return its path."""
         path = path or self._new_path(CALIBRATION)
         beside = {path.with_suffix(SETTINGS): configuration} if configuration else {}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -243,10 +231,7 @@ class Archive:
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:
-        """Write files into a new folder, which is there with all of them or not at all.
-
-        Returns its path.
-        """
+        """Write files into a new folder, all of them or none; return its path."""
         folder = self._new_path('')
         with whole_folder(folder) as partial:
             write_files(partial, files)

@@ -171,10 +171,7 @@ def _numbers(
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Corners found in images: `image` (N,) numbers the names, `corner` (N,), `pixels` (N, 2).
-
-    `lines` are those of a table at which the images begin.
-    """
+    """Corners (N,) by the numbers of their images, which begin at `lines`, and `pixels` (N, 2)."""
 
     names: tuple[str, ...]
     image: NDArray[np.intp]
@@ -265,10 +262,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
 def observed(
     found: Detections, board: Board, places: Mapping[str, FloatArray], on_flange: bool
 ) -> tuple[Observations, tuple[str, ...]]:
-    """Return the corners of all images at which the arm's place is known, and warnings.
-
-    Stamps are the lines at which the images begin.
-    """
+    """Return the corners of images at which the arm is known, stamped by line, and warnings."""
     known = np.array([name in places for name in found.names], dtype=bool)
     if not known.any():
         raise InputError(

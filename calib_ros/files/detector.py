@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The corners of a board in photographs.
+"""The corners of a board in photographs, by OpenCV (`pip install calib_ros[camera]`).
 
 An image is refused with the reason where its corners would harm: blurred, another board, or too
 little of this one.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,15 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
-from calib_ros.files.images import Image, opencv
+from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
 
+SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
+Image = NDArray[np.uint8]
+"""In grey."""
 Corners = tuple[NDArray[np.intp], FloatArray]
 """Numbers (K,) and pixels (K, 2) of a board's corners."""
 Markers = tuple[FloatArray, NDArray[np.intp]]
@@ -37,6 +41,43 @@ WIDEST = 10
 """Half of the widest such window [px]."""
 COARSE = 700
 """Longer side [px] of the smallest image in which markers are sought."""
+
+
+def opencv() -> Any:
+    """Return OpenCV with its ArUco module."""
+    try:
+        import cv2
+    except ImportError as err:
+        raise ConfigError(
+            'photographs need OpenCV: sudo apt install python3-opencv, or pip install '
+            '"calib_ros[camera]"'
+        ) from err
+    if not hasattr(cv2, 'aruco'):
+        raise ConfigError('this OpenCV has no ArUco module: before 4.7 it is in opencv-contrib')
+    return cv2
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Return the images of a folder by name, shorter ones first."""
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def read_image(path: Path) -> Image:
+    """Return an image in grey; without pixels where it cannot be read."""
+    if path.stat().st_size > LARGEST_IMAGE:
+        return np.zeros((0, 0), dtype=np.uint8)
+    return decoded(np.fromfile(path, dtype=np.uint8))
+
+
+def decoded(data: NDArray[np.uint8]) -> Image:
+    """Return a compressed image in grey; without pixels where it is none."""
+    cv2 = opencv()
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        image = None
+    return np.zeros((0, 0), dtype=np.uint8) if image is None else np.asarray(image)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,10 +208,7 @@ class Detector:
     def _hidden(
         self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp], ...]:
-        """Return which other markers must be in an image, and the box (2,), (2,) around them.
-
-        By the plane of those that were found.
-        """
+        """Return which other markers must be in an image, and the box (2,), (2,) around them."""
         points = self._board.around_markers
         others = np.setdiff1d(np.arange(self._count), ids)
         placed = None

@@ -69,7 +69,7 @@ class Vendor:
         )
 
     def has_layout(self, places: FloatArray) -> bool:
-        """Tell whether nominal export.origins (N, 4, 4) are those of this vendor, but for lengths.
+        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths.
 
         To 0.1 rad, since layouts differ by quarters of a turn, and to 0.01 m of the flange behind
         the last axis: elsewhere a tool is part of the table.

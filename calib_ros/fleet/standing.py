@@ -41,10 +41,7 @@ ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A robot, its newest result, what changed, and what could not be read by source.
-
-    `drift` is the chart of its verifications `verified`.
-    """
+    """A robot, its newest result, changes, unread sources, its verifications and their `drift`."""
 
     robot: Robot
     last: Row | None

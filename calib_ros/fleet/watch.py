@@ -85,10 +85,7 @@ class Watched:
 
 
 def watch(rows: Sequence[Row], years: float) -> Watched:
-    """Look for changes in identifications in the order of their times.
-
-    Those that are not accepted, or tell other parameters than the first, are left out.
-    """
+    """Look for changes in accepted identifications, in order, of the parameters of the first."""
     known = [row for row in rows if row.accepted]
     alike = [row for row in known if row.names == known[0].names]
     if not alike:

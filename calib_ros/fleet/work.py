@@ -40,10 +40,7 @@ PLOTLY = 'plotly.min.js'
 
 
 class Source(NamedTuple):
-    """A bag or table: its place, the session of a table, and what changes with its content.
-
-    The `fingerprint` is empty where the file system tells nothing by which a change would show.
-    """
+    """A bag or table, a session, and what changes with its content; empty where nothing tells."""
 
     url: str
     session: str = ''

@@ -138,10 +138,7 @@ def plan_report(
     found: Plan | None = None,
     wanted_mm: float | None = None,
 ) -> Report:
-    """Return the report of poses (K, n) to measure in this order; `words` say what they promise.
-
-    `found` is None for the test poses of ISO 9283.
-    """
+    """Return the report of poses (K, n) to measure; `found` is None for those of ISO 9283."""
     shown = [
         _visit(chain, joints),
         sections.coverage(chain, joints, 'How far each joint will move'),

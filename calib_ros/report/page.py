@@ -34,10 +34,7 @@ MISSING_PDF = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader sees first: 'good', 'bad', 'open' (undecided) or 'info', and words.
-
-    `gain` are the figures before and after.
-    """
+    """What a reader sees first: how it looks, words, and the `gain` from before to after."""
 
     state: State
     heading: str
@@ -47,10 +44,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Section:
-    """Words, a figure of plotly (`data` and `layout`), a table, or some of them.
-
-    `text` explains a figure, what is `said` holds without it.
-    """
+    """Words, a figure of plotly, a table, or some; what is `said` holds without the figure."""
 
     name: str
     title: str
@@ -78,10 +72,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Origin:
-    """Whence a result comes: what only the one who started it knows; empty where not told.
-
-    With the configuration in `settings` the same is done again.
-    """
+    """Whence a result comes, as far as told; with the `settings` the same is done again."""
 
     inputs: tuple[Input, ...] = ()
     operator: str = ''
@@ -129,10 +120,7 @@ def plotly_script() -> str | None:
 
 
 def render(report: Report, script: str = '') -> str | None:
-    """Return a report as HTML; None where jinja2 or plotly is not installed.
-
-    With the path of plotly's `script`, which many pages share, the page needs that file besides.
-    """
+    """Return a report as HTML, without the `script` at a path; None without jinja2 or plotly."""
     plotly = '' if script else plotly_script()
     if plotly is None:
         return None
@@ -143,10 +131,7 @@ def render(report: Report, script: str = '') -> str | None:
 
 
 def on_paper(report: Report) -> bytes | None:
-    """Return a report as PDF: a certificate first; None where jinja2 or weasyprint is missing.
-
-    Figures are drawn by matplotlib, those in space are left out: paper cannot be turned.
-    """
+    """Return a report as PDF, without figures in space; None without jinja2 or weasyprint."""
     try:
         import weasyprint
     except (ImportError, OSError):  # OSError: its libraries of the system
@@ -188,10 +173,7 @@ def _shown(value: object) -> object:
 
 
 def markdown(report: Report, samples: Mapping[str, Any]) -> str:
-    """Return the words and tables of a report, to be kept with a calibration.
-
-    `samples` is what became of the input.
-    """
+    """Return the words and tables of a report; `samples` are what became of the input."""
     verdict = report.verdict
     lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.robot)}', '']
     lines += [f'**{in_markdown(verdict.heading)}**', '']

@@ -107,10 +107,7 @@ def _in_metres(axes: Axes, first: str, second: str) -> None:
 
 
 def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> bytes:
-    """Return a page with black rectangles (K, 4) [m] in their true size: left, top, width, height.
-
-    The page is as large as what is on it, with a margin for the hands and the words.
-    """
+    """Return a page with black rectangles (K, 4) [m], true in size: left, top, width, height."""
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
