@@ -98,7 +98,11 @@ class Journal:
             os.ftruncate(self._file, 0)
             self._write(header)
             return
-        os.ftruncate(self._file, self.content.rfind(b'\n') + 1)  # the header ends a line
+        end, size = -1, os.fstat(self._file).st_size
+        while end < 0:  # the header ends a line
+            begin = max(size - 2**16, 0)
+            end, size = os.pread(self._file, size - begin, begin).rfind(b'\n'), begin
+        os.ftruncate(self._file, begin + end + 1)
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
