@@ -43,12 +43,10 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
     common.at_least(options, fewest=1)
     board = read_board(options.board)
     with screen.work('looking for corners') as work:
-        found = detect(_pictures(options, work), board, options.fewest, screen.say)
-    write_file(options.out, found.detections.as_csv(), overwrite=options.force)
-    used, corners = len(found.detections.names), len(found.detections.corner)
-    screen.say(
-        f'wrote {options.out}: {corners} corners of {used} images, {len(found.refused)} not used'
-    )
+        found, unused = detect(_pictures(options, work), board, options.fewest, screen.say)
+    write_file(options.out, found.as_csv(), overwrite=options.force)
+    corners = f'{len(found.corner)} corners of {len(found.names)} images'
+    screen.say(f'wrote {options.out}: {corners}, {unused} not used')
     return 0
 
 

@@ -9,7 +9,6 @@ little of this one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +77,6 @@ def decoded(data: NDArray[np.uint8]) -> Image:
     except cv2.error:
         image = None
     return np.zeros((0, 0), dtype=np.uint8) if image is None else np.asarray(image)
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What was found in images, and which others are not used and why."""
-
-    detections: Detections
-    refused: tuple[tuple[str, str], ...]
 
 
 def dictionaries() -> tuple[str, ...]:
@@ -342,26 +333,26 @@ def detect(
     board: Board,
     fewest: int = FEWEST,
     heard: Callable[[str], None] = lambda line: None,
-) -> Found:
-    """Return the corners of a board in named images."""
+) -> tuple[Detections, int]:
+    """Return the corners of a board in named images, and how many of these are not used."""
     detector = Detector(board, fewest)
     used: list[tuple[str, Corners]] = []
-    refused: list[tuple[str, str]] = []
+    refused: list[str] = []
     for name, picture in images:
         found = detector.of(picture)
         if isinstance(found, Refusal):
-            refused.append((name, found.reason))
+            refused.append(f'{name}: {found.reason}')
             heard(f'{name}: not used, {found.reason}')
             continue
         heard(f'{name}: {len(found[0])} corners')
         used.append((name, found))
     if not used:
-        name, reason = next(iter(refused), ('', 'there is none'))
-        raise InputError(f'no image can be used; {name}: {reason}')
+        first = next(iter(refused), ': there is none')
+        raise InputError(f'no image can be used; {first}')
     names, found_in = zip(*used, strict=True)
     image = np.repeat(np.arange(len(used)), [len(number) for number, _ in found_in])
     corner, pixels = map(np.concatenate, zip(*found_in, strict=True))
-    return Found(Detections(names, image, corner, pixels), tuple(refused))
+    return Detections(names, image, corner, pixels), len(refused)
 
 
 def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:

@@ -192,11 +192,9 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
             lines += [_row(each.head), head, *rest, '']
     told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
     told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
-    for title, points in (
-        ('What to do next', report.steps),
-        ('Please note', report.remarks),
-        ('Identity', [f'{name}: {value}' for name, value in told]),
-    ):
+    identity = [f'{name}: {value}' for name, value in told]
+    lists = {'What to do next': report.steps, 'Please note': report.remarks, 'Identity': identity}
+    for title, points in lists.items():
         lines += [*_section(title), *_listed(points)] if points else []
     return '\n'.join(lines)
 
