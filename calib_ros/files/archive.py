@@ -18,7 +18,7 @@ import io
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
@@ -39,12 +39,11 @@ class Journal:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
+        with ExitStack() as stack:
+            stack.callback(self.close)
             self._lock()
             self._begin(columns(joints))
-        except BaseException:
-            self.close()
-            raise
+            stack.pop_all()
 
     def add(self, sample: Sample, removed: bool = False) -> None:
         """Write a sample, or that it was taken back; what is there stays whole."""
@@ -76,7 +75,7 @@ class Journal:
                 'a data_dir of its own'
             ) from None
         except OSError:  # a file system without locks: a journal without one is better than none
-            return
+            pass
 
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""
