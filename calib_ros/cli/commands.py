@@ -4,7 +4,8 @@
 
 They are written as their help shows them: groups, and in these a line for each option. Behind its
 name are `!` if it must be given and, unless it is a flag, its placeholder, from which follows the
-type, or its choices `a|b`; `*3`, `+` or `?` for several values; and `=` with the default.
+type, or its choices `a|b`; `*3`, `+` or `?` for several values; and `=` with the default. A line
+that begins with `@` adds options that are not written here.
 """
 
 from __future__ import annotations
@@ -322,17 +323,21 @@ def add_options(parser: argparse.ArgumentParser, written: str) -> None:
 def _add_option(group: Group, option: str, text: str) -> None:
     name, _, form = option.partition(' ')
     placeholder, count, default = FORM.findall(form)[0]
-    kind = float if '.' in default and placeholder == 'N' else TYPES.get(placeholder, str)
-    several = tuple(placeholder.split(','))
+    kind = TYPES.get(placeholder, str)
+    if kind is int and '.' in default:
+        kind = float
     given: dict[str, Any] = {'required': True} if name.endswith('!') else {}
     if not form:
         given['action'] = 'store_true'
     elif '|' in placeholder:
         given['choices'] = tuple(placeholder.split('|'))
+    elif ',' in placeholder:  # one for each value
+        metavars = tuple(placeholder.split(','))
+        given |= {'type': kind, 'metavar': metavars, 'nargs': len(metavars)}
     else:
-        given |= {'type': kind, 'metavar': several if several[1:] else placeholder}
-    if count or several[1:]:
-        given['nargs'] = int(count.strip('*') or 0) if '*' in count else count or len(several)
+        given |= {'type': kind, 'metavar': placeholder}
+    if count:
+        given['nargs'] = int(count[1:]) if count.startswith('*') else count
     if '=' in form:
         values = [kind(each) for each in default.split(',')]
         given['default'] = values if 'nargs' in given else values[0]

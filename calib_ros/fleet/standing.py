@@ -33,8 +33,8 @@ STATES: Mapping[str, tuple[State, str]] = {
     'fine': ('good', 'nothing to do'),
 }
 """From the worst to the best, with their looks and meaning."""
-MOST_ROBOTS, MOST_NIGHTS = MOST_ENTRIES, MOST_ENTRIES // 10
-"""Robots, the worst ones, and nights of each, that the page shows; the history has all."""
+MOST_NIGHTS = MOST_ENTRIES // 10
+"""Nights of a robot that the page shows; the history has all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 """How Prometheus takes what would end a label."""
 
@@ -179,7 +179,7 @@ def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
 
 def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
     """Return the page; None where jinja2 is not installed."""
-    shown = found[:MOST_ROBOTS]
+    shown = found[:MOST_ENTRIES]  # the worst
     return filled(
         'fleet.html.jinja',
         mark=STATES[found[0].state][0] if found else 'info',

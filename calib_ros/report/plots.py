@@ -22,8 +22,8 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line
 
-INCH, MARGIN = 0.0254, 0.01
-"""In metres: an inch, and what is left free around a board."""
+MARGIN = 0.01
+"""What is left free around a board [m]."""
 
 
 def before_after_png(result: Identification) -> bytes:
@@ -113,7 +113,7 @@ def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> 
     from matplotlib.patches import Rectangle
 
     width, height = size[0] + 2.0 * MARGIN, size[1] + 2.0 * MARGIN
-    figure = Figure(figsize=(width / INCH, height / INCH))
+    figure = Figure(figsize=(width / 0.0254, height / 0.0254))  # inches
     FigureCanvasPdf(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-MARGIN, width - MARGIN), ylim=(height - MARGIN, -MARGIN))
