@@ -20,19 +20,10 @@ from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
 from calib_ros.sampling.sources import Source, parse_sources
 
-ENCODINGS = {
-    'mono8': (1, ''),
-    '8UC1': (1, ''),
-    'rgb8': (3, 'RGB'),
-    'bgr8': (3, 'BGR'),
-    '8UC3': (3, 'BGR'),
-    'rgba8': (4, 'RGBA'),
-    'bgra8': (4, 'BGRA'),
-    'bayer_rggb8': (1, 'BayerBG'),
-    'bayer_bggr8': (1, 'BayerRG'),
-    'bayer_gbrg8': (1, 'BayerGR'),
-    'bayer_grbg8': (1, 'BayerGB'),
-}
+ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}
+ENCODINGS |= {'8UC3': (3, 'BGR'), 'rgba8': (4, 'RGBA'), 'bgra8': (4, 'BGRA')}
+ENCODINGS |= {'bayer_rggb8': (1, 'BayerBG'), 'bayer_bggr8': (1, 'BayerRG')}
+ENCODINGS |= {'bayer_gbrg8': (1, 'BayerGR'), 'bayer_grbg8': (1, 'BayerGB')}
 """Channels, and what OpenCV calls them: a Bayer pattern by its second row."""
 
 

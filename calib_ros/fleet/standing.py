@@ -136,6 +136,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
     states = {f'{{state="{state}"}}': number for state, number in counts(found).items()}
     unread = sum(len(each.errors) for each in found)
     rms, measured = by_robot(lambda _, row: row.rms_mm), by_robot(lambda _, r: r.time.timestamp())
+    since, changes = by_robot(changed), 'First night after the last change of the arm.'
     tables: tuple[tuple[str, str, Mapping[str, float | None]], ...] = (
         ('fleet_robots', 'Robots by state.', states),
         ('fleet_unreadable_inputs', 'Inputs that could not be used.', {'': unread}),
@@ -144,11 +145,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
         ('fleet_last_run_timestamp_seconds', 'End of the last run.', {'': ended}),
         ('robot_rms_millimetres', 'RMS position error of the corrected arm.', rms),
         ('robot_measured_timestamp_seconds', 'When the newest result was measured.', measured),
-        (
-            'robot_changed_timestamp_seconds',
-            'First night after the last change of the arm.',
-            by_robot(changed),
-        ),
+        ('robot_changed_timestamp_seconds', changes, since),
     )
     lines: list[str] = []
     for name, text, values in tables:
