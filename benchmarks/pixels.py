@@ -120,7 +120,7 @@ def rendered_run(nominal, seed, images):
     size = (camera.width, camera.height)
     pictures = ((str(k), rendered(board, p, camera.lens, size)[0]) for k, p in enumerate(poses))
     places = {str(k): q for k, q in enumerate(joints)}
-    seen, _ = observed(detect(pictures, board).detections, board, places, True)
+    seen, _ = observed(detect(pictures, board)[0], board, places, True)
     known = replace(nominal, tool=Frame(lens=camera.lens))
     result = identify(Problem(known, seen, sigma_pixel=0.03))
     deviation = [result.chain.offset(name, true) for name in result.names]

@@ -24,10 +24,7 @@ from calib_ros.errors import LONGEST_NAME, InputError
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a file under a temporary name beside it, then put it in place.
-
-    One that is there already is refused unless `overwrite` is True.
-    """
+    """Write a file under a temporary name, then put it in place, if need be to `overwrite` one."""
     write_together({path: content}, overwrite=overwrite)
 
 
@@ -169,10 +166,7 @@ def _rename_new(partial: Path, path: Path) -> None:
 
 
 def _claim(work: Path, path: Path) -> int:
-    """Make a folder to work in, or take one over that a dead process has left.
-
-    Returns its handle; the claim ends when that is closed.
-    """
+    """Claim a folder to work in, new or left by a dead process, until its handle is closed."""
     while True:
         try:
             work.mkdir(mode=0o700)

@@ -16,10 +16,7 @@ MOST_ENTRIES = 1000
 
 
 def shortened(text: str, longest: int = LONGEST) -> str:
-    """Return a text without its middle where it is too long.
-
-    What is wrong stands first in a message, how to mend it last.
-    """
+    """Return a text without its middle where it is too long: the fault is first, the cure last."""
     if len(text) <= longest:
         return text
     gap = f' ... ({len(text)} characters) ... '

@@ -44,10 +44,7 @@ def read_text(
     error: type[CalibrationError] = ConfigError,
     what: str = '',
 ) -> str:
-    """Return the text of a file, which `what` describes, without a byte order mark.
-
-    An `error` is raised when it cannot be read, is too large or is not UTF-8.
-    """
+    """Return the text of a UTF-8 file, which `what` describes; raise an `error` if that fails."""
     return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
 
 
@@ -120,7 +117,7 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     if len(text) > LARGEST_TEXT:
         raise error(f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right one?')
     try:
-        _Weigher(yaml.parse(text, _loader()), where, error).run()
+        _weigh(yaml.parse(text, _loader()), where, error)
         documents = [each for each in yaml.load_all(text, _loader()) if each is not None]
     except CalibrationError:
         raise
@@ -162,59 +159,52 @@ def _loader() -> Any:
     return Loader
 
 
-class _Weigher:
-    """Refuses what would not fit into memory, or is not meant.
+def _weigh(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
+    """Refuse documents that would not fit into memory, or are not meant.
 
-    Of the events of a document scalars have a value, lists and mappings a tag, and aliases only
-    an anchor, which ends have not.
+    Of their events scalars have a value, lists and mappings a tag, and aliases only an anchor,
+    which ends have not.
     """
+    anchors: dict[str, tuple[int, int]] = {}
 
-    def __init__(self, events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
-        self._events, self._where, self._error = events, where, error
-        self._anchors: dict[str, tuple[int, int]] = {}
-
-    def run(self) -> None:
-        """Weigh all documents."""
-        for event in self._events:
-            if hasattr(event, 'anchor'):
-                self._node(event, 0)
-            else:
-                self._anchors.clear()
-
-    def _node(self, event: Any, above: int) -> tuple[int, int]:
+    def node(event: Any, above: int) -> tuple[int, int]:
         """Return how many values a node has with its aliases written out, and its levels."""
         if hasattr(event, 'value'):
             nodes, height = 1 + len(event.value) // 20, 0
         elif hasattr(event, 'tag'):
-            nodes, height = self._collection(event, above)
-        elif event.anchor in self._anchors:
-            nodes, height = self._anchors[event.anchor]
+            nodes, height = collection(event, above)
+        elif event.anchor in anchors:
+            nodes, height = anchors[event.anchor]
         else:
-            raise self._error(
-                f'{self._where}: alias "{event.anchor}" stands for nothing before it'
-            )
+            raise error(f'{where}: alias "{event.anchor}" stands for nothing before it')
         if above + height > DEEPEST:
-            raise self._error(f'{self._where} is nested deeper than {DEEPEST} levels')
+            raise error(f'{where} is nested deeper than {DEEPEST} levels')
         if event.anchor:
-            self._anchors[event.anchor] = nodes, height
+            anchors[event.anchor] = nodes, height
         return nodes, height
 
-    def _collection(self, event: Any, above: int) -> tuple[int, int]:
+    def collection(event: Any, above: int) -> tuple[int, int]:
         nodes, height, keys = 1, 1, set()
         keyed = type(event).__name__ == 'MappingStartEvent'
-        for k, inner in enumerate(self._events if above < DEEPEST else ()):
+        for k, inner in enumerate(events if above < DEEPEST else ()):
             if not hasattr(inner, 'anchor'):
                 break
             key = getattr(inner, 'value', '<<')
             if keyed and k % 2 == 0 and key != '<<':
                 if key in keys:
-                    raise self._error(f'{self._where}: key "{key}" comes twice')
+                    raise error(f'{where}: key "{key}" comes twice')
                 keys.add(key)
-            more, levels = self._node(inner, above + 1)
+            more, levels = node(inner, above + 1)
             nodes, height = nodes + more, max(height, levels + 1)
             if nodes > MOST_NODES:
-                raise self._error(f'{self._where} has more than {MOST_NODES} values')
+                raise error(f'{where} has more than {MOST_NODES} values')
         return nodes, height
+
+    for event in events:
+        if hasattr(event, 'anchor'):
+            node(event, 0)
+        else:
+            anchors.clear()
 
 
 def one_line(text: str) -> str:

@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros compare | compensate | export`: what is done with calibrations."""
+"""`calib_ros compare | compensate | export`: what is done with calibrations.
+
+Each imports what it alone needs.
+"""
 
 from __future__ import annotations
 
@@ -8,26 +11,21 @@ import argparse
 from dataclasses import fields
 from pathlib import Path
 
-from calib_ros.apply.compensation import Compensator, in_words
-from calib_ros.apply.program import compensate_program
 from calib_ros.atomic import write_file
 from calib_ros.cli import options as common
 from calib_ros.cli.given import calibration_of
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
-from calib_ros.files.programs import read_joints, read_program
-from calib_ros.files.vendors import VENDOR_FILES, vendor_files
-from calib_ros.identification.difference import difference
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
-from calib_ros.kinematics.urdf import corrected_urdf
 from calib_ros.settings import Limits
 from calib_ros.shown import NAMED
 from calib_ros.texts import dump_json
 
 
 def _compare(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.identification.difference import difference
+
     pair = [calibration_of(path, 'compare') for path in (options.first, options.second)]
     with screen.work('comparing'):
         found = difference(*pair)
@@ -41,6 +39,10 @@ def _compare(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _compensate(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.apply.compensation import Compensator, in_words
+    from calib_ros.apply.program import compensate_program
+    from calib_ros.files.programs import read_program
+
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
     common.refuse_existing(options, options.out)
     if options.out.exists() and options.out.samefile(options.program):
@@ -72,6 +74,11 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _export(options: argparse.Namespace, screen: Screen) -> int:
+    from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
+    from calib_ros.files.programs import read_joints
+    from calib_ros.files.vendors import VENDOR_FILES, vendor_files
+    from calib_ros.kinematics.urdf import corrected_urdf
+
     nominal = load_chain(options.chain)
     calibration = calibration_of(options.calibration, 'export', nominal)
     chain, origin = calibration.chain, calibration.record

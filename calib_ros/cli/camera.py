@@ -13,8 +13,8 @@ from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.detector import black_of, detect
-from calib_ros.files.images import SUFFIXES, Image, files_of, image_of, read_image
+from calib_ros.files.cameras import image_of
+from calib_ros.files.detector import SUFFIXES, Image, black_of, detect, files_of, read_image
 from calib_ros.texts import dump_yaml
 
 
@@ -43,12 +43,10 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
     common.at_least(options, fewest=1)
     board = read_board(options.board)
     with screen.work('looking for corners') as work:
-        found = detect(_pictures(options, work), board, options.fewest, screen.say)
-    write_file(options.out, found.detections.as_csv(), overwrite=options.force)
-    used, corners = len(found.detections.names), len(found.detections.corner)
-    screen.say(
-        f'wrote {options.out}: {corners} corners of {used} images, {len(found.refused)} not used'
-    )
+        found, unused = detect(_pictures(options, work), board, options.fewest, screen.say)
+    write_file(options.out, found.as_csv(), overwrite=options.force)
+    corners = f'{len(found.corner)} corners of {len(found.names)} images'
+    screen.say(f'wrote {options.out}: {corners}, {unused} not used')
     return 0
 
 

@@ -1,281 +1,269 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of all commands; nothing here needs what the commands work with."""
+"""The options of all commands; nothing here needs what the commands work with.
+
+They are written as their help shows them: groups, and in these a line for each option. Behind its
+name are `!` if it must be given and, unless it is a flag, its placeholder, from which follows the
+type, or its choices `a|b`; `*3`, `+` or `?` for several values; and `=` with the default. A line
+that begins with `@` adds options that are not written here.
+"""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+import re
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
-from calib_ros.cli import options as common
-from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, Limits
+from calib_ros.cli.options import OF_BAGS, Group, add_fields, add_settings, complete_robots
+from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, STORAGES, Limits
 
-
-def _add_chain(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('which arm')
-    add = group.add_argument
-    add('robot', metavar='ROBOT', help='URDF, chain file, or a robot by its name (ur10e, ...)')
-    add('--base-link', metavar='LINK', help='of a URDF: where the arm starts, else its root')
-    add('--tip-link', metavar='LINK', help='of a URDF: where the arm ends, such as tool0')
-    add('--convention', metavar='NAME', help='of the table from a URDF: standard or modified')
-    add('--out', type=Path, metavar='FILE', help='file to write instead')
-
-
-def _add_simulate(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to simulate')
-    group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
-    common.add_chain(group)
-    _add_simulation(group)
-
-
-def _add_demo(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to simulate')
-    common.add_chain(group, 'ur10e')
-    common.add_out(group, 'what it writes', default=Path('demo'))
-    _add_simulation(group)
-
-
-def _add_simulation(parser: argparse._ArgumentGroup) -> None:
-    add = parser.add_argument
-    add('--poses', type=int, default=60, metavar='N', help='poses to measure')
-    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    common.add_storage(parser)
-
-
-def _add_board(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('the board')
-    add = group.add_argument
-    add('type', choices=('charuco', 'markers'), help='markers: a grid of them')
-    for name, text in (('columns', 'across'), ('rows', 'down')):
-        add(f'--{name}', type=int, required=True, metavar='N', help=f'squares or markers {text}')
-    add('--square', type=float, required=True, metavar='M', help='from one to the next')
-    add('--marker', type=float, required=True, metavar='M', help='side of a marker')
-    add('--dictionary', default='DICT_5X5_250', metavar='NAME', help='DICT_APRILTAG_36h11, ...')
-    common.add_out(group, 'PDF; its YAML is put beside it', 'FILE', needed=True)
-
-
-def _add_images(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to look at')
-    add = group.add_argument
-    add('images', type=Path, metavar='IMAGES', help='folder of images, or a bag')
-    add('--board', type=Path, required=True, metavar='FILE', help='YAML of the board')
-    add('--topic', default='', metavar='NAME', help='of the images in a bag, if there are several')
-    add('--fewest', type=int, default=6, metavar='N', help='corners that an image must show')
-    common.add_out(group, 'table: image, corner, u, v', 'FILE', needed=True)
-
-
-def _add_plan(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what is wanted')
-    common.add_chain(group)
-    add = group.add_argument
-    add('--poses', type=int, metavar='N', help='how many; 25, or what --accuracy needs')
-    add('--accuracy', type=float, metavar='MM', help='wanted RMS position error at the task poses')
-    add('--iso9283', action='store_true', help='the five test poses of ISO 9283 instead')
-    add('--task', type=Path, metavar='FILE', help='CSV q1..qn; random poses if not given')
-    add('--taken', type=Path, metavar='FILE', help='CSV q1..qn of poses measured already')
-    common.add_out(group, 'CSV q1..qn to write, and its report beside it', 'FILE')
-    add = parser.add_argument_group('poses to choose from').add_argument
-    add('--candidates', type=Path, metavar='FILE', help='CSV q1..qn of poses to choose from')
-    add('--draw', type=int, default=2000, metavar='N', help='random candidates without a file')
-    add('--criterion', choices=CRITERIA, default='d', help='determinant, index, or task error')
-    text = 'least move of a joint between poses [rad, m]'
-    add('--apart', type=float, default=1e-3, metavar='X', help=text)
-    text = 'of the joints [rad/s, m/s]'
-    add('--velocity', type=float, nargs='+', default=[1.0], metavar='V', help=text)
-    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    add = parser.add_argument_group('what the device sees').add_argument
-    add('--measured', choices=('pose', 'position'), default='pose', help='at each pose')
-    add('--box', type=float, nargs=6, metavar='M', help='measurable region: lower, upper corner')
-    add('--tracker', type=float, nargs=3, metavar='M', help='where the device stands')
-    forward, text = [0.0, 0.0, 1.0], 'of the target, to face it'
-    add('--axis', type=float, nargs=3, default=forward, metavar='X', help=text)
-    add('--cone', type=float, default=45.0, metavar='DEG', help='between axis and line of sight')
-    add('--world', action='store_true', help='box and tracker are in the world, not in the base')
-    common.add_settings(
-        parser, ('sigma_position', 'sigma_orientation', 'priors', 'model', 'fixed')
-    )
-    common.add_identity(parser)
-
-
-def _add_fleet(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add('plant', type=Path, metavar='PLANT', help='plant.yaml: the robots (docs/fleet.md)')
-    add('--history', required=True, metavar='DIR', help='where results are filed; also a URL')
-    add('--out', type=Path, metavar='FOLDER', help='the report: index.html, a page of each robot')
-    add('--metrics', type=Path, metavar='FILE', help="for Prometheus' text collector")
-    group = parser.add_argument_group('who does the work')
-    add = group.add_argument
-    add('--scheduler', default='', metavar='ADDRESS', help='of a dask cluster: tcp://host:8786')
-    add('--workers', type=int, default=0, metavar='N', help='processes here; default: one a core')
-    add('--memory', default='2GiB', metavar='SIZE', help='of each of these, at most')
-    group = parser.add_argument_group('alarms')
-    text = 'between two false alarms of a robot that is measured every night'
-    group.add_argument('--years', type=float, default=100.0, metavar='N', help=text)
-
-
-def _add_history(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add('history', metavar='DIR', help='folder or URL of a history')
-    add('--robot', metavar='SERIAL', help='this robot only')
-
-
-def _add_identify(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to read')
-    add = group.add_argument
-    text = 'a table of measured poses, or a bag: folder, .mcap or .db3'
-    add('measured', nargs='?', type=Path, metavar='MEASURED', help=text)
-    add('--csv', type=Path, metavar='FILE', help='the same for a table of any name')
-    common.add_chain(group)
-    add('--session', metavar='NAME', help='session of the table; several joined by commas')
-    text = 'the poses are those of a fixed target in a camera on the flange'
-    add('--eye-in-hand', action='store_true', help=text)
-    loss = 'of the messages of a bag, beyond which the result is not accepted; 1: any'
-    common.add_each(
-        group,
-        float,
-        ('--largest-loss', 'SHARE', EXCEPTION, loss),
-        ('--sigma-touch', 'M', None, 'of heights over touched planes, 1e-4 if not given'),
-    )
-    group = parser.add_argument_group('what to write')
-    common.add_out(group, 'calibration, result and report')
-    common.add_history(group)
-    group.add_argument('--json', action='store_true', help='print the result as JSON')
-    group.add_argument('--tolerance', type=float, metavar='MM', help='wanted RMS position error')
-    group = parser.add_argument_group('what a camera saw (docs/images.md)')
-    places = 'table of the arm at each image: image and q1 ... qn; with --chain flange_pose x y z '
-    common.add_each(
-        group,
-        Path,
-        ('--detections', 'FILE', None, 'corners of a board, by calib_ros images'),
-        ('--board', 'FILE', None, 'YAML of that board'),
-        ('--places', 'FILE', None, f'{places}qx qy qz qw of the flange'),
-        ('--intrinsics', 'FILE', None, 'camera_info, by camera_calibration'),
-    )
-    text = 'fit the intrinsics as well; else given'
-    group.add_argument('--lens', choices=('given', 'fitted'), help=text)
-    common.add_settings(parser)
-    common.add_layout(parser)
-    common.add_identity(parser, pdf=True)
-    group = parser.add_argument_group('an earlier calibration (docs/history.md)')
-    text = 'bring this one up to date by a few poses, and say what has changed since'
-    group.add_argument('--previous', type=Path, metavar='CALIBRATION', help=text)
-    text, growth = 'by which lengths wander in a year; angles by twice as many mrad', 1e3 * GROWTH
-    group.add_argument('--growth', type=float, default=growth, metavar='MM', help=text)
-    common.add_moved(group)
-
-
-def _add_verify(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to judge')
-    add = group.add_argument
-    text = 'new measurements: a bag, or a table with q1..qn as reported, x y z ...'
-    add('measured', type=Path, metavar='MEASURED', help=text)
-    common.add_chain(group)
-    common.add_calibration(group)
-    text = 'the program before its correction, q1..qn: judge against the poses that it means'
-    add('--commanded', type=Path, metavar='FILE', help=text)
-    add('--session', metavar='NAME', help='session of the table')
-    common.add_moved(group)
-    group = parser.add_argument_group('how to judge')
-    wanted = 'wanted RMS position error; if not given: does the calibration still hold?'
-    common.add_each(
-        group,
-        float,
-        ('--tolerance', 'MM', None, wanted),
-        ('--confidence', 'SHARE', 0.95, 'of the verdict'),
-    )
-    common.add_out(group, 'the report and the residuals')
-    common.add_history(group)
-    common.add_settings(parser, common.OF_BAGS)
-    common.add_layout(parser)
-    common.add_identity(parser, pdf=True)
-
-
-def _add_compare(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to compare')
-    for name, text in (('first', 'the earlier one'), ('second', 'the later one')):
-        text += ': calibration.yaml, or the folder of identify --out'
-        group.add_argument(name, type=Path, metavar=name.upper(), help=text)
-    group.add_argument('--json', action='store_true', help='print the difference as JSON')
-
-
-def _add_compensate(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to correct')
-    text = '.csv with q1 ... qn, or .yaml with a JointTrajectory'
-    group.add_argument('program', type=Path, metavar='PROGRAM', help=text)
-    common.add_chain(group)
-    common.add_calibration(group)
-    common.add_out(group, 'the corrected program', 'FILE', needed=True)
-    limits = parser.add_argument_group('limits')
-    text, axes = 'point in the flange frame whose position counts [m]', ('X', 'Y', 'Z')
-    none = [0.0, 0.0, 0.0]
-    limits.add_argument('--tool', nargs=3, type=float, default=none, metavar=axes, help=text)
-    common.add_fields(limits, fields(Limits))
-
-
-def _add_export(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to export')
-    add = group.add_argument
-    add('calibration', type=Path, metavar='CALIBRATION', help='calibration.yaml of identify --out')
-    common.add_chain(group)
-    common.add_out(group, 'all forms', needed=True)
-    text = 'table with q1 ... qn where tables that cannot be exact are to be best; if not given, '
-    add('--measured', type=Path, metavar='FILE', help=f'{text}the whole joint range')
-    add = parser.add_argument_group('for URDF and drivers').add_argument
-    add('--urdf', type=Path, metavar='FILE', help='nominal URDF of the robot, to correct as well')
-    add('--base-link', metavar='LINK', help='of the URDF: where the arm starts')
-    add('--tip-link', metavar='LINK', help='of the URDF: where the arm ends')
-    text = 'checksum that the driver of Universal Robots prints at its start, for '
-    add('--ur-hash', default='', metavar='calib_...', help=f'{text}ur_kinematics.yaml')
-
-
-def _add_workspace(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to map')
-    add = group.add_argument
-    text = 'folder of identify --out, or a calibrated chain file alone'
-    add('result', type=Path, metavar='RESULT', help=text)
-    common.add_chain(group)
-    common.add_out(group, 'tables, words and figures', needed=True)
-    add('--poses', type=int, default=20_000, metavar='N', help='random poses of the survey')
-    add('--model', choices=MODELS, default='corrected', help='by which the arm is commanded')
-    add('--seed', type=int, default=0, metavar='N', help='of the random numbers')
-    add = parser.add_argument_group('a task to place').add_argument
-    add('--task', type=Path, metavar='FILE', help='CSV x y z qx qy qz qw in the frame of a task')
-    add('--joint-box', type=float, nargs='+', metavar='Q', help='task: lower, then upper values')
-    add('--aim', choices=AIMS, default='mean', help='error over the poses of the task')
-    add('--region', type=float, nargs=6, metavar='M', help='for the task, lower, upper corner')
-    add('--cells', type=int, default=9, metavar='N', help='placements along each axis')
-    add('--turns', type=int, default=1, metavar='N', help='turns about the vertical to try')
-    common.add_identity(parser)
-
-
-def _add_import(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to convert')
-    group.add_argument('table', type=Path, metavar='TABLE', help='CSV, text in columns, or .xlsx')
-    common.add_chain(group, needed=False)
-    common.add_out(group, 'CSV to write', 'FILE', needed=True)
-    common.add_layout(parser)
-
-
-def _add_csv2bag(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to convert')
-    group.add_argument('csv', type=Path, metavar='TABLE', help='the table')
-    group.add_argument('bag', type=Path, metavar='BAG', help='folder of the bag to write')
-    common.add_chain(group)
-    group.add_argument('--session', metavar='NAME', help='session of the table to use')
-    common.add_storage(group)
-
-
-def _add_bag2csv(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group('what to convert')
-    group.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file')
-    group.add_argument('csv', type=Path, metavar='TABLE', help='CSV to write')
-    group.add_argument('--force', action='store_true', help='replace what is there already')
-    common.add_chain(group)
-    common.add_settings(parser, common.OF_BAGS)
-
-
+TYPES = {
+    **dict.fromkeys(('N', 'ROWS'), int),
+    **dict.fromkeys(('DEG', 'M', 'MM', 'Q', 'SHARE', 'V', 'X', 'X,Y,Z'), float),
+    **dict.fromkeys(('BAG', 'FILE', 'FIRST', 'FOLDER', 'IMAGES', 'MEASURED', 'PLANT'), Path),
+    **dict.fromkeys(('CALIBRATION', 'PROGRAM', 'RESULT', 'SECOND', 'TABLE'), Path),
+}
+"""By placeholder; of any other a text."""
+FORM = re.compile(r'([^=]*?)([*]\d+|[+?]|)(?:=(.*)|)$')
+"""Placeholder or choices, how many values, and the default."""
+CHAIN = 'its name (calib_ros robots), a chain file, or a URDF'
+EARLIER = 'calibration.yaml, or the folder of identify --out'
+FORCE = 'replace what is there already'
+SEED = 'of the random numbers'
+HISTORY = 'file the result there as well, by --serial'
+CALIBRATION = 'folder of identify --out, or calibration.yaml alone'
+SIMULATION = f"""\
+  --poses N=60  poses to measure
+  --seed N=0  {SEED}
+  --storage {'|'.join(STORAGES)}=mcap  of the bag"""
+MOVED = """\
+  --new-base  the measuring device stands elsewhere now
+  --new-tool  the target is another one, or mounted anew"""
+LAYOUT = """\
+tables of others (docs/tables.md); what is not given is guessed
+  --preset NAME=  a layout by name, or your own .yaml
+  --length UNIT=  of lengths: m, cm, mm, um, in
+  --angle UNIT=  unit of angles, joint values included: rad, deg
+  --joint-angle UNIT=  unit of joint values where it is another one
+  --euler ZYX=  rx ry rz are Euler angles; zyx: fixed axes
+  --quaternion wxyz=  order of qx qy qz qw, else xyzw
+  --separator NAME=  comma, semicolon, tab or space; guessed if not given
+  --decimal NAME=  point or comma
+  --sheet NAME=  of a workbook (.xlsx), else its first
+  --joints-preset NAME=  layout of the log --joints
+  @columns
+  --rotation-vector  rx ry rz are a rotation vector
+  --inverse  the poses are those of the device in the target
+  --shift ROWS=0  joint values stand so much below
+  --joints FILE  log of the joint values, row by row"""
+COLUMNS = 'q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints'
+REPORT = """\
+for the report
+  --operator NAME=  who measured
+  --serial NAME=  serial number of the robot
+  --device NAME=  measuring device and its serial number"""
+PDF = '  --pdf  report.pdf as well, with a certificate first'
+OPTIONS = f"""
+# robots robots._robots
+# chain robots._chain
+which arm
+  robot ROBOT  URDF, chain file, or a robot by its name (ur10e, ...)
+  --base-link LINK  of a URDF: where the arm starts, else its root
+  --tip-link LINK  of a URDF: where the arm ends, such as tool0
+  --convention NAME  of the table from a URDF: standard or modified
+  --out FILE  file to write instead
+# demo simulate._demo
+what to simulate
+  --chain ROBOT=ur10e  {CHAIN}
+  --out FOLDER=demo  what it writes
+  --force  {FORCE}
+{SIMULATION}
+# simulate simulate._run
+what to simulate
+  bag BAG  folder of the bag to write
+  --chain! ROBOT  {CHAIN}
+{SIMULATION}
+# board camera._board
+the board
+  type charuco|markers  markers: a grid of them
+  --columns! N  squares or markers across
+  --rows! N  squares or markers down
+  --square! M  from one to the next
+  --marker! M  side of a marker
+  --dictionary NAME=DICT_5X5_250  DICT_APRILTAG_36h11, ...
+  --out! FILE  PDF; its YAML is put beside it
+  --force  {FORCE}
+# images camera._images
+what to look at
+  images IMAGES  folder of images, or a bag
+  --board! FILE  YAML of the board
+  --topic NAME=  of the images in a bag, if there are several
+  --fewest N=6  corners that an image must show
+  --out! FILE  table: image, corner, u, v
+  --force  {FORCE}
+# plan plan._run
+what is wanted
+  --chain! ROBOT  {CHAIN}
+  --poses N  how many; 25, or what --accuracy needs
+  --accuracy MM  wanted RMS position error at the task poses
+  --iso9283  the five test poses of ISO 9283 instead
+  --task FILE  CSV q1..qn; random poses if not given
+  --taken FILE  CSV q1..qn of poses measured already
+  --out FILE  CSV q1..qn to write, and its report beside it
+  --force  {FORCE}
+poses to choose from
+  --candidates FILE  CSV q1..qn of poses to choose from
+  --draw N=2000  random candidates without a file
+  --criterion {'|'.join(CRITERIA)}=d  determinant, index, or task error
+  --apart X=0.001  least move of a joint between poses [rad, m]
+  --velocity V+=1  of the joints [rad/s, m/s]
+  --seed N=0  {SEED}
+what the device sees
+  --measured pose|position=pose  at each pose
+  --box M*6  measurable region: lower, upper corner
+  --tracker M*3  where the device stands
+  --axis X*3=0,0,1  of the target, to face it
+  --cone DEG=45  between axis and line of sight
+  --world  box and tracker are in the world, not in the base
+@settings sigma_position sigma_orientation priors model fixed
+{REPORT}
+# fleet fleet._run_fleet
+  plant PLANT  plant.yaml: the robots (docs/fleet.md)
+  --history! DIR  where results are filed; also a URL
+  --out FOLDER  the report: index.html, a page of each robot
+  --metrics FILE  for Prometheus' text collector
+who does the work
+  --scheduler ADDRESS=  of a dask cluster: tcp://host:8786
+  --workers N=0  processes here; default: one a core
+  --memory SIZE=2GiB  of each of these, at most
+alarms
+  --years N=100.0  between two false alarms of a robot that is measured every night
+# history fleet._run_history
+  history DIR  folder or URL of a history
+  --robot SERIAL  this robot only
+# identify identify._run
+what to read
+  measured MEASURED?  a table of measured poses, or a bag: folder, .mcap or .db3
+  --csv FILE  the same for a table of any name
+  --chain! ROBOT  {CHAIN}
+  --session NAME  session of the table; several joined by commas
+  --eye-in-hand  the poses are those of a fixed target in a camera on the flange
+  --largest-loss SHARE={EXCEPTION}  of the messages of a bag, beyond which the result is not \
+accepted; 1: any
+  --sigma-touch M  of heights over touched planes, 1e-4 if not given
+what to write
+  --out FOLDER  calibration, result and report
+  --force  {FORCE}
+  --history DIR  {HISTORY}
+  --json  print the result as JSON
+  --tolerance MM  wanted RMS position error
+what a camera saw (docs/images.md)
+  --detections FILE  corners of a board, by calib_ros images
+  --board FILE  YAML of that board
+  --places FILE  table of the arm at each image: image and q1 ... qn; with --chain flange_pose \
+x y z qx qy qz qw of the flange
+  --intrinsics FILE  camera_info, by camera_calibration
+  --lens given|fitted  fit the intrinsics as well; else given
+@settings
+{LAYOUT}
+{REPORT}
+{PDF}
+an earlier calibration (docs/history.md)
+  --previous CALIBRATION  bring this one up to date by a few poses, and say what has changed since
+  --growth MM={1e3 * GROWTH}  by which lengths wander in a year; angles by twice as many mrad
+{MOVED}
+# verify verify._run
+what to judge
+  measured MEASURED  new measurements: a bag, or a table with q1..qn as reported, x y z ...
+  --chain! ROBOT  {CHAIN}
+  --calibration! RESULT  {CALIBRATION}
+  --commanded FILE  the program before its correction, q1..qn: judge against the poses that it \
+means
+  --session NAME  session of the table
+{MOVED}
+how to judge
+  --tolerance MM  wanted RMS position error; if not given: does the calibration still hold?
+  --confidence SHARE=0.95  of the verdict
+  --out FOLDER  the report and the residuals
+  --force  {FORCE}
+  --history DIR  {HISTORY}
+@settings {' '.join(OF_BAGS)}
+{LAYOUT}
+{REPORT}
+{PDF}
+# compare calibrated._compare
+what to compare
+  first FIRST  the earlier one: {EARLIER}
+  second SECOND  the later one: {EARLIER}
+  --json  print the difference as JSON
+# compensate calibrated._compensate
+what to correct
+  program PROGRAM  .csv with q1 ... qn, or .yaml with a JointTrajectory
+  --chain! ROBOT  {CHAIN}
+  --calibration! RESULT  {CALIBRATION}
+  --out! FILE  the corrected program
+  --force  {FORCE}
+limits
+  --tool X,Y,Z=0,0,0  point in the flange frame whose position counts [m]
+  @limits
+# export calibrated._export
+what to export
+  calibration CALIBRATION  calibration.yaml of identify --out
+  --chain! ROBOT  {CHAIN}
+  --out! FOLDER  all forms
+  --force  {FORCE}
+  --measured FILE  table with q1 ... qn where tables that cannot be exact are to be best; if not \
+given, the whole joint range
+for URDF and drivers
+  --urdf FILE  nominal URDF of the robot, to correct as well
+  --base-link LINK  of the URDF: where the arm starts
+  --tip-link LINK  of the URDF: where the arm ends
+  --ur-hash calib_...=  checksum that the driver of Universal Robots prints at its start, for \
+ur_kinematics.yaml
+# workspace workspace._run
+what to map
+  result RESULT  folder of identify --out, or a calibrated chain file alone
+  --chain! ROBOT  {CHAIN}
+  --out! FOLDER  tables, words and figures
+  --force  {FORCE}
+  --poses N=20000  random poses of the survey
+  --model {'|'.join(MODELS)}=corrected  by which the arm is commanded
+  --seed N=0  {SEED}
+a task to place
+  --task FILE  CSV x y z qx qy qz qw in the frame of a task
+  --joint-box Q+  task: lower, then upper values
+  --aim {'|'.join(AIMS)}=mean  error over the poses of the task
+  --region M*6  for the task, lower, upper corner
+  --cells N=9  placements along each axis
+  --turns N=1  turns about the vertical to try
+{REPORT}
+# bag2csv convert._bag2csv
+what to convert
+  bag BAG  rosbag2 folder, .mcap or .db3 file
+  csv TABLE  CSV to write
+  --force  {FORCE}
+  --chain! ROBOT  {CHAIN}
+@settings {' '.join(OF_BAGS)}
+# csv2bag convert._csv2bag
+what to convert
+  csv TABLE  the table
+  bag BAG  folder of the bag to write
+  --chain! ROBOT  {CHAIN}
+  --session NAME  session of the table to use
+  --storage {'|'.join(STORAGES)}=mcap  of the bag
+# import convert._convert
+what to convert
+  table TABLE  CSV, text in columns, or .xlsx
+  --chain ROBOT  {CHAIN}
+  --out! FILE  CSV to write
+  --force  {FORCE}
+{LAYOUT}
+"""
+"""Of each command by its name, behind MODULE.FUNCTION, which is imported when it runs."""
+COMMANDS = dict(part.split(' ', 1) for part in OPTIONS.split('\n# ')[1:])
+"""By name: MODULE.FUNCTION and, in the lines below, the options."""
 EXAMPLES = """
 robots
 chain ur10e
@@ -313,27 +301,49 @@ import export.csv --preset optitrack --joints log.csv --joints-preset kuka --out
 """
 """For the foot of each help, without "calib_ros"."""
 
-COMMANDS: Mapping[str, tuple[str, Callable[[argparse.ArgumentParser], None]]] = {
-    'robots': ('robots._robots', lambda parser: None),
-    'chain': ('robots._chain', _add_chain),
-    'demo': ('simulate._demo', _add_demo),
-    'simulate': ('simulate._run', _add_simulate),
-    'board': ('camera._board', _add_board),
-    'images': ('camera._images', _add_images),
-    'plan': ('plan._run', _add_plan),
-    'fleet': ('fleet._run_fleet', _add_fleet),
-    'history': ('fleet._run_history', _add_history),
-    'identify': ('identify._run', _add_identify),
-    'verify': ('verify._run', _add_verify),
-    'compare': ('calibrated._compare', _add_compare),
-    'compensate': ('calibrated._compensate', _add_compensate),
-    'export': ('calibrated._export', _add_export),
-    'workspace': ('workspace._run', _add_workspace),
-    'bag2csv': ('convert._bag2csv', _add_bag2csv),
-    'csv2bag': ('convert._csv2bag', _add_csv2bag),
-    'import': ('convert._convert', _add_import),
-}
-"""By name: MODULE.FUNCTION, which is imported when it runs, and what adds its options."""
+
+def add_options(parser: argparse.ArgumentParser, written: str) -> None:
+    """Add options to a parser, as they are written in OPTIONS."""
+    group: Group = parser
+    for line in filter(None, written.splitlines()):
+        first, *names = line.split()
+        if first == '@settings':
+            add_settings(parser, names)
+        elif first == '@limits':
+            add_fields(group, fields(Limits))
+        elif first == '@columns':
+            theirs: dict[str, Any] = {'metavar': 'OURS=THEIRS,...', 'help': COLUMNS}
+            group.add_argument('--columns', action='append', default=[], **theirs)
+        elif line.startswith('  '):
+            _add_option(group, *line[2:].split('  ', 1))
+        else:
+            group = parser.add_argument_group(line)
+
+
+def _add_option(group: Group, option: str, text: str) -> None:
+    name, _, form = option.partition(' ')
+    placeholder, count, default = FORM.findall(form)[0]
+    kind = TYPES.get(placeholder, str)
+    if kind is int and '.' in default:
+        kind = float
+    given: dict[str, Any] = {'required': True} if name.endswith('!') else {}
+    if not form:
+        given['action'] = 'store_true'
+    elif '|' in placeholder:
+        given['choices'] = tuple(placeholder.split('|'))
+    elif ',' in placeholder:  # one for each value
+        metavars = tuple(placeholder.split(','))
+        given |= {'type': kind, 'metavar': metavars, 'nargs': len(metavars)}
+    else:
+        given |= {'type': kind, 'metavar': placeholder}
+    if count:
+        given['nargs'] = int(count[1:]) if count.startswith('*') else count
+    if '=' in form:
+        values = [kind(each) for each in default.split(',')]
+        given['default'] = values if 'nargs' in given else values[0]
+    action = group.add_argument(name.rstrip('!'), help=text, **given)
+    if name.startswith('--chain'):
+        action.completer = complete_robots  # type: ignore[attr-defined]
 
 
 def examples_of(name: str) -> list[str]:

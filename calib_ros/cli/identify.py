@@ -113,7 +113,9 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     configuration = words.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
     origin = given.origin_of(options, read, configuration)
-    return identified(loaded, settings, screen, origin, options.tolerance)
+    with screen.work('identifying') as work:
+        result = loaded.identified(settings.model, work)
+    return Identified(loaded, result, origin, options.tolerance)
 
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
@@ -206,18 +208,6 @@ class Identified:
     def wanted(self) -> float | None:
         """Return the wanted error [m]."""
         return None if self.tolerance is None else 1e-3 * self.tolerance
-
-
-def identified(
-    loaded: Loaded,
-    settings: Settings,
-    screen: Screen,
-    origin: Origin,
-    tolerance: float | None = None,
-) -> Identified:
-    """Identify with a sign of life."""
-    with screen.work('identifying') as work:
-        return Identified(loaded, loaded.identified(settings.model, work), origin, tolerance)
 
 
 def show(found: Identified, screen: Screen) -> None:

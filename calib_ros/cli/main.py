@@ -128,7 +128,11 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; only the one given knows its options."""
-    from calib_ros.cli.commands import COMMANDS, examples_of  # the overview does not need them
+    from calib_ros.cli.commands import (  # the overview does not need them
+        COMMANDS,
+        add_options,
+        examples_of,
+    )
 
     parser = argparse.ArgumentParser(prog='calib_ros', add_help=False)
     names = parser.add_subparsers(required=True, metavar='COMMAND')
@@ -136,7 +140,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
         if name not in given:
             names.add_parser(name, add_help=False)
             continue
-        home, add = COMMANDS[name]
+        home, _, options = COMMANDS[name].partition('\n')
         added = names.add_parser(
             name,
             add_help=False,
@@ -145,7 +149,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
             formatter_class=_Help,
         )
         added.set_defaults(home=home)
-        add(added)
+        add_options(added, options)
         add_more = added.add_argument_group('on the screen').add_argument
         text = 'only warnings, errors and what is asked for'
         add_more('--quiet', action='store_true', help=text)

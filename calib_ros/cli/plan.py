@@ -38,13 +38,10 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     nowhere = np.zeros((1, len(chain.joints)))
     imagined = measure(chain, nowhere, rng, oriented=options.measured == 'pose')
     design = Design.of(Problem(chain, imagined, **common.settings_of(options).for_problem()))
-    visibility = Visibility(
-        None if options.box is None else np.reshape(options.box, (2, 3)),
-        None if options.tracker is None else np.array(options.tracker),
-        tuple(options.axis),
-        np.radians(options.cone),
-        options.world,
-    )
+    box = None if options.box is None else np.reshape(options.box, (2, 3))
+    tracker = None if options.tracker is None else np.array(options.tracker)
+    axis, cone = tuple(options.axis), np.radians(options.cone)
+    visibility = Visibility(box, tracker, axis, cone, options.world)
     with screen.work('choosing poses') as work:
         if options.iso9283:
             tests = iso_9283_poses(design, rng, visibility)

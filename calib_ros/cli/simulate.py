@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import given, options as common
-from calib_ros.cli.identify import RESULT_FILES, identified, result_files, show
+from calib_ros.cli.identify import RESULT_FILES, Identified, result_files, show
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import of_bag
 from calib_ros.files.recording import Recording, write_bag
@@ -41,7 +41,8 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say('3. identifying the errors from it')
         configuration = words.configuration_yaml(options.chain, settings)
         origin = given.origin_of(options, [bag], configuration)
-        found = identified(loaded, settings, screen, origin)
+        with screen.work('identifying') as work:
+            found = Identified(loaded, loaded.identified(settings.model, work), origin)
         screen.say('4. writing the report')
         contents = result_files(found, screen, options.out)
         write_files(folder, contents)

@@ -77,16 +77,15 @@ def show(found: Verification, screen: Screen) -> None:
     interval = f'RMS {1e3 * found.lower:.4f} to {1e3 * found.upper:.4f} mm over poses like these'
     state, steps = STANDINGS[found.verdict]
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
-    screen.table(
-        (
-            ('measured', f'{after.count} times at {found.configurations} poses'),
-            ('position error', f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm'),
-            ('largest', f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm'),
-            ('orientation error', orientation),
-            (f'{100.0 * found.confidence:g} % sure', interval),
-            ('tolerance', tolerance),
-        )
-    )
+    rows = {
+        'measured': f'{after.count} times at {found.configurations} poses',
+        'position error': f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm',
+        'largest': f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm',
+        'orientation error': orientation,
+        f'{100.0 * found.confidence:g} % sure': interval,
+        'tolerance': tolerance,
+    }
+    screen.table(tuple(rows.items()))
     if found.each:
         screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
     for remark in remarks(found):

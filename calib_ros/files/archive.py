@@ -18,7 +18,7 @@ import io
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
@@ -33,21 +33,17 @@ CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
 
 
 class Journal:
-    """An open journal, which only grows and which no other process can open meanwhile.
-
-    The file is made if there is none, else rows are added.
-    """
+    """An open journal, new or not, which only grows and which no other process can open."""
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         self.path = path
         self._file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
+        with ExitStack() as stack:
+            stack.callback(self.close)
             self._lock()
             self._begin(columns(joints))
-        except BaseException:
-            self.close()
-            raise
+            stack.pop_all()
 
     def add(self, sample: Sample, removed: bool = False) -> None:
         """Write a sample, or that it was taken back; what is there stays whole."""
@@ -79,7 +75,7 @@ class Journal:
                 'a data_dir of its own'
             ) from None
         except OSError:  # a file system without locks: a journal without one is better than none
-            return
+            pass
 
     def _begin(self, header: Sequence[str]) -> None:
         """Write the header into a new file; leave out what a crash cut off."""
@@ -101,7 +97,11 @@ class Journal:
             os.ftruncate(self._file, 0)
             self._write(header)
             return
-        os.ftruncate(self._file, self.content.rfind(b'\n') + 1)  # the header ends a line
+        end, size = -1, os.fstat(self._file).st_size
+        while end < 0:  # the header ends a line
+            begin = max(size - 2**16, 0)
+            end, size = os.pread(self._file, size - begin, begin).rfind(b'\n'), begin
+        os.ftruncate(self._file, begin + end + 1)
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
@@ -169,10 +169,7 @@ class Archive:
         self.write()
 
     def write(self) -> None:
-        """Write what waits, as far as that is possible; `error` tells whether it was.
-
-        A journal that is no longer there goes on in another file, with all that was in it.
-        """
+        """Write what waits, if possible; a journal that is gone goes on in another file."""
         try:
             if self._journal is not None and self._journal.gone:
                 if self._path == self._journal.path:
@@ -200,10 +197,7 @@ class Archive:
         self._due = False
 
     def begin_anew(self) -> Path | None:
-        """Begin another journal, unless samples would be lost; return the path of the old one.
-
-        The new one is written at once: after a crash it must be the newest.
-        """
+        """Begin another journal, on disk at once; return the path of the old one."""
         self.write()
         if self._waiting:
             raise InputError(
@@ -232,10 +226,7 @@ class Archive:
         return next(reversed(self._files(CALIBRATION)), None)
 
     def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
-        """Write a calibration, into a new file unless a path is given; return its path.
-
-        The configuration by which it was made, where that is known, is written beside it.
-        """
+        """Write a calibration, and how it was made if that is known; return its path."""
         path = path or self._new_path(CALIBRATION)
         beside = {path.with_suffix(SETTINGS): configuration} if configuration else {}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -243,10 +234,7 @@ class Archive:
         return path
 
     def export(self, files: Mapping[str, str]) -> Path:
-        """Write files into a new folder, which is there with all of them or not at all.
-
-        Returns its path.
-        """
+        """Write files into a new folder, all of them or none; return its path."""
         folder = self._new_path('')
         with whole_folder(folder) as partial:
             write_files(partial, files)

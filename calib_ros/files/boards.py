@@ -136,12 +136,9 @@ def read_lens(path: Path) -> Lens:
     content = parse_yaml(read_text(path, what='intrinsics '), str(path))
     if not isinstance(content, dict):
         raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
-    return lens_of(
-        content.get('distortion_model', DISTORTED[0]),
-        _numbers(content, ('camera_matrix', 'k', 'K'), path),
-        _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False),
-        str(path),
-    )
+    matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
+    distortion = _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False)
+    return lens_of(content.get('distortion_model', DISTORTED[0]), matrix, distortion, str(path))
 
 
 def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
@@ -174,10 +171,7 @@ def _numbers(
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Corners found in images: `image` (N,) numbers the names, `corner` (N,), `pixels` (N, 2).
-
-    `lines` are those of a table at which the images begin.
-    """
+    """Corners (N,) by the numbers of their images, which begin at `lines`, and `pixels` (N, 2)."""
 
     names: tuple[str, ...]
     image: NDArray[np.intp]
@@ -221,18 +215,15 @@ def posed_arm() -> Chain:
     It takes the place of an arm of which only the flange's poses are known.
     """
     quarter = np.pi / 2
-    return Chain(
-        POSED,
-        'standard',
-        (
-            Joint('flange_z', 'prismatic', theta=quarter, alpha=quarter),
-            Joint('flange_x', 'prismatic', theta=quarter, alpha=quarter),
-            Joint('flange_y', 'prismatic', alpha=-quarter),
-            Joint('flange_rx', alpha=quarter),
-            Joint('flange_ry', theta=quarter, alpha=quarter),
-            Joint('flange_rz'),
-        ),
+    joints = (
+        Joint('flange_z', 'prismatic', theta=quarter, alpha=quarter),
+        Joint('flange_x', 'prismatic', theta=quarter, alpha=quarter),
+        Joint('flange_y', 'prismatic', alpha=-quarter),
+        Joint('flange_rx', alpha=quarter),
+        Joint('flange_ry', theta=quarter, alpha=quarter),
+        Joint('flange_rz'),
     )
+    return Chain(POSED, 'standard', joints)
 
 
 def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
@@ -271,10 +262,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
 def observed(
     found: Detections, board: Board, places: Mapping[str, FloatArray], on_flange: bool
 ) -> tuple[Observations, tuple[str, ...]]:
-    """Return the corners of all images at which the arm's place is known, and warnings.
-
-    Stamps are the lines at which the images begin.
-    """
+    """Return the corners of images at which the arm is known, stamped by line, and warnings."""
     known = np.array([name in places for name in found.names], dtype=bool)
     if not known.any():
         raise InputError(

@@ -10,15 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib_ros.errors import CalibrationError, ConfigError
+from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import lens_of, read_board
-from calib_ros.files.detector import Detector
-from calib_ros.files.images import image_of
+from calib_ros.files.detector import Detector, Image, decoded, opencv
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.messages import Source, parse_sources
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
+
+ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}
+ENCODINGS |= {'8UC3': (3, 'BGR'), 'rgba8': (4, 'RGBA'), 'bgra8': (4, 'BGRA')}
+ENCODINGS |= {'bayer_rggb8': (1, 'BayerBG'), 'bayer_bggr8': (1, 'BayerRG')}
+ENCODINGS |= {'bayer_gbrg8': (1, 'BayerGR'), 'bayer_grbg8': (1, 'BayerGB')}
+"""Channels, and what OpenCV calls them: a Bayer pattern by its second row."""
 
 
 class BoardCamera:
@@ -81,3 +87,26 @@ def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
                 'rectified, give that (image_raw)'
             )
     return {source.topic: BoardCamera(source) for source in sources}
+
+
+def image_of(message: Any) -> Image:
+    """Return a sensor_msgs/Image or CompressedImage in grey."""
+    data = np.frombuffer(message.data, dtype=np.uint8)
+    if hasattr(message, 'format'):
+        return decoded(data)
+    return grey(data, message.height, message.width, message.step, message.encoding)
+
+
+def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
+    """Return the content of a sensor_msgs/Image in grey; refuse unknown encodings and sizes."""
+    if encoding not in ENCODINGS:
+        raise UnknownNameError('encoding of images', encoding, ENCODINGS)
+    channels, kind = ENCODINGS[encoding]
+    if step < width * channels or len(data) < height * step or height < 1 or width < 1:
+        raise InputError(f'an image of {width} x {height} px holds {len(data)} bytes only')
+    rows = data[: height * step].reshape(height, step)[:, : width * channels]
+    if not kind:
+        return np.ascontiguousarray(rows)
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    code = getattr(opencv(), f'COLOR_{kind}2GRAY')
+    return np.asarray(opencv().cvtColor(np.ascontiguousarray(rows).reshape(shape), code))

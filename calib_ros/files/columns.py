@@ -47,10 +47,7 @@ class Columns:
         )
 
     def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:
-        """Return the numbers (N, len(names)), NaN for empty cells.
-
-        Many columns at once take hardly longer than one. Errors name them as they are `called`.
-        """
+        """Return numbers (N, len(names)), NaN for empty cells; errors name them as `called`."""
         found = self._numbers(names)
         for row, k in np.argwhere(np.isinf(found))[:1].tolist():
             raise self._no_number(row, (called or names)[k], self.texts(names[k])[row])

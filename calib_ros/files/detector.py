@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The corners of a board in photographs.
+"""The corners of a board in photographs, by OpenCV (`pip install calib_ros[camera]`).
 
 An image is refused with the reason where its corners would harm: blurred, another board, or too
 little of this one.
@@ -9,7 +9,7 @@ little of this one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
-from calib_ros.files.images import Image, opencv
+from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
 
+SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
+Image = NDArray[np.uint8]
+"""In grey."""
 Corners = tuple[NDArray[np.intp], FloatArray]
 """Numbers (K,) and pixels (K, 2) of a board's corners."""
 Markers = tuple[FloatArray, NDArray[np.intp]]
@@ -30,8 +33,6 @@ Markers = tuple[FloatArray, NDArray[np.intp]]
 
 FEWEST = len(parameters_of('base'))
 """Corners of an image that is used: half of their coordinates make its pose, half check it."""
-BLURRED = 8.0
-"""Width [px] of the sharpest edges from which on an image is blurred."""
 WINDOW = 0.6
 """Half the window that refines a corner, by the distance to the nearest marker; measured, as is
 WIDEST, by benchmarks/images.py."""
@@ -41,12 +42,41 @@ COARSE = 700
 """Longer side [px] of the smallest image in which markers are sought."""
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What was found in images, and which others are not used and why."""
+def opencv() -> Any:
+    """Return OpenCV with its ArUco module."""
+    try:
+        import cv2
+    except ImportError as err:
+        raise ConfigError(
+            'photographs need OpenCV: sudo apt install python3-opencv, or pip install '
+            '"calib_ros[camera]"'
+        ) from err
+    if not hasattr(cv2, 'aruco'):
+        raise ConfigError('this OpenCV has no ArUco module: before 4.7 it is in opencv-contrib')
+    return cv2
 
-    detections: Detections
-    refused: tuple[tuple[str, str], ...]
+
+def files_of(folder: Path) -> list[Path]:
+    """Return the images of a folder by name, shorter ones first."""
+    paths = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def read_image(path: Path) -> Image:
+    """Return an image in grey; without pixels where it cannot be read."""
+    if path.stat().st_size > LARGEST_IMAGE:
+        return np.zeros((0, 0), dtype=np.uint8)
+    return decoded(np.fromfile(path, dtype=np.uint8))
+
+
+def decoded(data: NDArray[np.uint8]) -> Image:
+    """Return a compressed image in grey; without pixels where it is none."""
+    cv2 = opencv()
+    try:
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        image = None
+    return np.zeros((0, 0), dtype=np.uint8) if image is None else np.asarray(image)
 
 
 def dictionaries() -> tuple[str, ...]:
@@ -109,9 +139,8 @@ class Detector:
         self._new = hasattr(aruco, 'ArucoDetector')
         self._count = len(marker_cells(board))
         self._dictionary = _dictionary(board.dictionary)
-        self._parameters = (
-            aruco.DetectorParameters() if self._new else aruco.DetectorParameters_create()
-        )
+        made = 'DetectorParameters' if self._new else 'DetectorParameters_create'
+        self._parameters = getattr(aruco, made)()
         if board.type == 'markers':
             self._parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._corners = self._charuco() if board.type == 'charuco' else _of_markers
@@ -121,7 +150,7 @@ class Detector:
         if not image.size:
             return Refusal('that cannot be decoded', 'it is no image that OpenCV can read')
         width = _edge_width(self._cv2, image)
-        if width > BLURRED:
+        if width > 8.0:
             reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
             return Refusal('blurred', reason)
         corners, ids = self._sought(image)
@@ -135,11 +164,10 @@ class Detector:
             return Refusal('without the board', reason)
         own = ids < self._count
         if (~own).sum() > len(ids) // 2:
-            return Refusal(
-                'of another board',
+            reason = (
                 f'it shows another board: marker {int(ids[~own][0])}, and this board has 0 to '
-                f'{self._count - 1}',
             )
+            return Refusal('of another board', f'{reason}{self._count - 1}')
         return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:
@@ -165,17 +193,13 @@ class Detector:
 
     def _halved(self, image: Image, times: int) -> Image:
         size = tuple(max(side // 2**times, 1) for side in image.shape[1::-1])
-        return (
-            self._cv2.resize(image, size, interpolation=self._cv2.INTER_AREA) if times else image
-        )
+        area = self._cv2.INTER_AREA
+        return self._cv2.resize(image, size, interpolation=area) if times else image
 
     def _hidden(
         self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp], ...]:
-        """Return which other markers must be in an image, and the box (2,), (2,) around them.
-
-        By the plane of those that were found.
-        """
+        """Return which other markers must be in an image, and the box (2,), (2,) around them."""
         points = self._board.around_markers
         others = np.setdiff1d(np.arange(self._count), ids)
         placed = None
@@ -197,22 +221,18 @@ class Detector:
         number, pixels = self._corners(image, corners, ids)
         whole = len(self._board.corners)
         if len(number) < self._fewest:
-            return Refusal(
-                'with too little of the board',
-                f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, and '
-                f'{len(ids)} markers: is it a part of the board only, or another board?',
-            )
+            reason = f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, '
+            reason += f'and {len(ids)} markers: is it a part of the board only, or another board?'
+            return Refusal('with too little of the board', reason)
         points = self._board.corners[number, :2]
         placed = self._placed(points, pixels, points)
         apart = np.inf if placed is None else np.linalg.norm(placed - pixels, axis=1).max()
         spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
         # Lens and board may bend a board by half of what a corner is refined in, or 10 %.
         if apart > max(0.5 * WIDEST, EXCEPTION * spacing):
-            return Refusal(
-                'whose corners do not fit the board',
-                f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, square'
-                ' and marker those of this board, and is it flat?',
-            )
+            reason = f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, '
+            reason += 'square and marker those of this board, and is it flat?'
+            return Refusal('whose corners do not fit the board', reason)
         return number, pixels
 
     def _placed(
@@ -282,9 +302,7 @@ class Detector:
         aruco, given = self._cv2.aruco, self._parameters
         given.minMarkerPerimeterRate = 0.03 / share
         given.adaptiveThreshWinSizeMin, given.adaptiveThreshWinSizeMax = windows[0], windows[-1]
-        given.adaptiveThreshWinSizeStep = max(
-            (windows[-1] - windows[0]) // (len(windows) - 1 or 1), 1
-        )
+        given.adaptiveThreshWinSizeStep = windows.step
         if self._new:
             corners, ids, _ = aruco.ArucoDetector(dictionary, given).detectMarkers(image)
         else:
@@ -315,26 +333,26 @@ def detect(
     board: Board,
     fewest: int = FEWEST,
     heard: Callable[[str], None] = lambda line: None,
-) -> Found:
-    """Return the corners of a board in named images."""
+) -> tuple[Detections, int]:
+    """Return the corners of a board in named images, and how many of these are not used."""
     detector = Detector(board, fewest)
     used: list[tuple[str, Corners]] = []
-    refused: list[tuple[str, str]] = []
+    refused: list[str] = []
     for name, picture in images:
         found = detector.of(picture)
         if isinstance(found, Refusal):
-            refused.append((name, found.reason))
+            refused.append(f'{name}: {found.reason}')
             heard(f'{name}: not used, {found.reason}')
             continue
         heard(f'{name}: {len(found[0])} corners')
         used.append((name, found))
     if not used:
-        name, reason = next(iter(refused), ('', 'there is none'))
-        raise InputError(f'no image can be used; {name}: {reason}')
+        first = next(iter(refused), ': there is none')
+        raise InputError(f'no image can be used; {first}')
     names, found_in = zip(*used, strict=True)
     image = np.repeat(np.arange(len(used)), [len(number) for number, _ in found_in])
     corner, pixels = map(np.concatenate, zip(*found_in, strict=True))
-    return Found(Detections(names, image, corner, pixels), tuple(refused))
+    return Detections(names, image, corner, pixels), len(refused)
 
 
 def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:

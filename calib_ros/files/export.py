@@ -155,8 +155,7 @@ def _tail(a: float, alpha: float, beta: float) -> FloatArray:
 def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
     """Return the pose of each joint in the frame of the one before, as vendors write it.
 
-    The first is given in the arm's base, the last frame is the flange. A joint turns about, or
-    slides along, the z axis of its frame.
+    The first is in the base, the last is the flange. Joints turn about, or slide along, their z.
     """
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
     names = (*chain.joint_names, 'flange')
@@ -171,10 +170,7 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
 
 
 def origins(form: Chain) -> FloatArray:
-    """Return the frames of the joints of a modified chain, each in the one before, and the flange.
-
-    Shape (n + 1, 4, 4), at zero. The flange is the tool of the chain.
-    """
+    """Return the frames (n + 1, 4, 4) of the joints of a modified chain, and the tool, at zero."""
     rows = [replace(joint, sign=1) for joint in form.joints]
     chains = [Chain(form.name, 'modified', (row,), parallel=()) for row in rows]
     places = [chain.forward(np.zeros((1, 1)))[0] for chain in chains]
@@ -223,10 +219,7 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
 
 
 def head(chain: Chain, what: str, error: float, digest: str) -> str:
-    """Return the line that says what a file is, and how far [m] from the calibrated arm.
-
-    `digest` is that of the calibrated table, by which the file is known.
-    """
+    """Return the line that says what a file is, how far [m] off the arm, and of which table."""
     name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
     return f'# {name}: {what}; metres and radians; {exact}; calibrated table {digest}\n'
@@ -277,13 +270,8 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
     """
     base, tool = chain.frame('base'), chain.frame('tool')
     start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
-    driven = {joint.driven for joint in start.joints}
-    names = [
-        name
-        for name in start.parameter_names
-        if start.owns_frame(name)
-        or Parameter(name).kind in kinds
-        or ('zero' in kinds and name in driven)
-    ]
+    chosen = {joint.driven for joint in start.joints} if 'zero' in kinds else set()
+    chosen |= {name for name in start.parameter_names if Parameter(name).kind in kinds}
+    names = [name for name in start.parameter_names if name in chosen or start.owns_frame(name)]
     joints = joints[:: max(1, len(joints) // 200)]  # to be fitted; it is judged on all
     return likened(start, names, chain, joints, 1e-3)[0]

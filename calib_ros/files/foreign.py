@@ -36,14 +36,8 @@ from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
 MEASURED = (*POSITION, 'distance')
-UNITS = {
-    'millimeters': 'mm',
-    'centimeters': 'cm',
-    'meters': 'm',
-    'micrometers': 'um',
-    'inches': 'in',
-    **{unit: unit for unit in LENGTHS},
-}
+UNITS = {'millimeters': 'mm', 'centimeters': 'cm', 'meters': 'm', 'micrometers': 'um'}
+UNITS |= {'inches': 'in'} | {unit: unit for unit in LENGTHS}
 
 
 @dataclass(frozen=True, eq=False)

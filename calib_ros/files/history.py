@@ -348,14 +348,10 @@ def is_local(files: Any) -> bool:
 def _schema() -> Any:
     import pyarrow as pa
 
-    kinds = {
-        'str': pa.string(),
-        'int': pa.int64(),
-        'float | None': pa.float64(),
-        'datetime': pa.timestamp('us', tz='UTC'),
-        'tuple[str, ...]': pa.list_(pa.string()),
-        'FloatArray': pa.list_(pa.float64()),
-    }
+    text, number = pa.string(), pa.float64()
+    kinds = {'str': text, 'int': pa.int64(), 'float | None': number}
+    kinds |= {'datetime': pa.timestamp('us', tz='UTC')}
+    kinds |= {'tuple[str, ...]': pa.list_(text), 'FloatArray': pa.list_(number)}
     columns = [(each.name, kinds[str(each.type)]) for each in fields(Row)]
     return pa.schema([('key', pa.string()), *columns])
 
@@ -366,13 +362,10 @@ def _conformed(table: Any, key: str) -> Any:
 
     if table.column('key').to_pylist() != [key]:
         raise ValueError('its name is not its key')
-    columns = [
-        table.column(each.name).cast(each.type)
-        if each.name in table.column_names
-        else pa.nulls(len(table), each.type)
-        for each in _schema()
-    ]
-    return pa.Table.from_arrays(columns, schema=_schema())
+    for each in _schema():
+        if each.name not in table.column_names:
+            table = table.append_column(each, pa.nulls(len(table), each.type))
+    return table.select(_schema().names).cast(_schema())
 
 
 def _rows_of(table: Any) -> list[Row]:

@@ -49,14 +49,9 @@ TOKEN = re.compile(
     r'|([^\W\d]\w*(?:\.\w+)*)|([-+*/()]))\s*'
 )
 """{any name}, #7 (a column by its number), a number, a plain name, or a sign."""
-SIGNS: Mapping[type[ast.AST], Callable[..., Any]] = {
-    ast.Add: np.add,
-    ast.Sub: np.subtract,
-    ast.Mult: np.multiply,
-    ast.Div: np.true_divide,
-    ast.UAdd: np.positive,
-    ast.USub: np.negative,
-}
+SIGNS: dict[type[ast.AST], Callable[..., Any]]
+SIGNS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.true_divide}
+SIGNS |= {ast.UAdd: np.positive, ast.USub: np.negative}
 JOINT = re.compile('[qsva][0-9]+')
 """Columns of ours with a number of each joint: values, signs of last moves, and rates."""
 
@@ -151,19 +146,14 @@ class Layout:
                 raise ConfigError(
                     f'"{item.name}" of a layout must be a {item.type}, not {value!r}'
                 )
-        for name, all_of_them in (
-            ('separator', (*SEPARATORS, *SEPARATORS.values())),
-            ('decimal', ('.', ',')),
-            ('length', LENGTHS),
-            ('angle', ANGLES),
-            ('joint_angle', ANGLES),
-            ('quaternion', ('xyzw', 'wxyz')),
-        ):
+        known = {'separator': (*SEPARATORS, *SEPARATORS.values()), 'decimal': ('.', ',')}
+        known |= {'length': (*LENGTHS,), 'angle': (*ANGLES,), 'joint_angle': (*ANGLES,)}
+        for name, values in {**known, 'quaternion': ('xyzw', 'wxyz')}.items():
             value = getattr(self, name)
-            if value and value not in all_of_them:
-                raise UnknownNameError(name.replace('_', ' '), value, tuple(all_of_them))
-        known = r'(?!.?(.)\1)([XYZ]{3}|[xyz]{3})'  # no axis twice in a row
-        if self.euler and not re.fullmatch(known, self.euler):
+            if value and value not in values:
+                raise UnknownNameError(name.replace('_', ' '), value, values)
+        axes = r'(?!.?(.)\1)([XYZ]{3}|[xyz]{3})'  # none twice in a row
+        if self.euler and not re.fullmatch(axes, self.euler):
             raise ConfigError(
                 f'Euler angles must be three axes, ZYX (each about the axis as turned before) or '
                 f'zyx (about fixed axes), not "{self.euler}"'

@@ -104,9 +104,6 @@ def table(
 def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return what is to be fitted of a table; what is `given` goes to the problem."""
     problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
-    samples = {
-        'samples': sum(map(len, found.fitted)),
-        'held_out': sum(map(len, found.held_out)),
-        'sets': len(found.fitted),
-    }
+    fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))
+    samples = {'samples': fitted, 'held_out': held_out, 'sets': len(found.fitted)}
     return Loaded(problem, samples, found.warnings, lines=found.by_line)

@@ -115,10 +115,7 @@ class Measurements:
         return np.column_stack([*words, self.eye_in_hand, self.kind, self.test])
 
     def kept(self) -> Measurements:
-        """Return the rows that were not taken back: of those alike it is the last one.
-
-        Two that are left and alike are refused.
-        """
+        """Return the rows that were not taken back; refuse two that are alike."""
         found = self
         if self.removed.any():
             open_rows: dict[tuple[int, ...], list[int]] = {}
@@ -144,10 +141,7 @@ class Measurements:
         return found
 
     def check_frames(self) -> None:
-        """Refuse too many frames, and what one device measured in different ones.
-
-        A row that names no frame may be of any.
-        """
+        """Refuse too many frames, and several of a device; a row that names none may be of any."""
         kinds, number = distinct(self.codes[:, :3])
         most = 100
         for line in self.lines[number == most][:1].tolist():

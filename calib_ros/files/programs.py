@@ -36,10 +36,7 @@ RATES = ('positions', 'velocities', 'accelerations')
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
-    """Read joint values (N, n) [rad or m] of a chain from a CSV.
-
-    A value over 1e-3 beyond the limits of its joint is refused.
-    """
+    """Read joint values (N, n) [rad or m] from a CSV; refuse any over 1e-3 beyond its limits."""
     found = read_columns(path, ())
     names = _header_of(found, chain.joint_names)
     values = found.block(names)
@@ -159,10 +156,7 @@ def _read_yaml(text: str, where: str) -> ProgramFile:
 def trajectory_program(
     names: Sequence[object], points: Sequence[Mapping[str, Any]], where: str
 ) -> Program:
-    """Return the program of a JointTrajectory: joint names, and points with lists of numbers.
-
-    Velocities and accelerations are those of all points or of none.
-    """
+    """Return the program of a JointTrajectory: names and points, rates at all or none."""
 
     def values(key: str) -> FloatArray | None:
         given = [point.get(key) or [] for point in points]

@@ -32,10 +32,7 @@ DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """The rows of a table, their columns named `#1`, `#2` and so on.
-
-    `header` are the names that the table gives them, `above` the cells of the lines before.
-    """
+    """The rows of a table in columns `#1`, `#2` ..., their names, and the cells `above`."""
 
     header: tuple[str, ...]
     above: tuple[tuple[str, ...], ...]

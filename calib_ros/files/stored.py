@@ -65,10 +65,7 @@ def recorded(path: Path) -> int | None:
 
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
-    """Give a bag whose files are whole: it itself, or one that goes away again.
-
-    Neither are they compressed, nor is a part of them in a write-ahead log beside.
-    """
+    """Give a bag whose files are whole, neither compressed nor partly in a write-ahead log."""
     files = _files(path, '.mcap', '.db3', '.zstd')
     if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
         yield path
@@ -151,10 +148,7 @@ def check(path: Path) -> None:
 
 @dataclass
 class Salvage:
-    """Topics with their types, how many messages there are, and what is wrong; empty if nothing.
-
-    `whole` tells whether each file could be read to its end.
-    """
+    """Topics with their types, how many messages, what is wrong, and if files are `whole`."""
 
     files: tuple[Path, ...]
     topics: dict[str, str] = field(default_factory=dict)
@@ -344,10 +338,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
 
 
 def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
-    """Yield chunks that hold messages on some channels, those that overlap in time together.
-
-    As far as they fit into memory; messages may come in any order.
-    """
+    """Yield chunks with messages on some channels, together what overlaps and fits into memory."""
     together: list[Any] = []
     end = size = 0
     for chunk in sorted(chunks, key=attrgetter('message_start_time', 'chunk_start_offset')):

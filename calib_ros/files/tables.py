@@ -46,8 +46,6 @@ from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, set
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
 
-Sets = tuple[Observations, ...]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table(Measured):
@@ -149,13 +147,20 @@ def _table(
         raise InputError(f'{made.path} has no rows to fit, only such that are marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
-    frames, cameras = Frames(), dict[str, Lens]()
-    if made.view[1] == ['']:
-        fitted, held_out, pairs = _sets(made, sigmas, frames)
-    else:
+    frames = Frames()
+    if made.view[1] != ['']:
         samples = [*_samples(made)]
         fitted, held_out = collect(samples, sigmas, frames)
-        pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
+    else:  # arrays, of which one of each kind is an example
+        _, number = distinct(made.codes)
+        samples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
+
+        def observed(members: Sequence[int]) -> Observations:
+            rows = np.isin(number, members)
+            return (made if rows.all() else made.select(rows)).observations()
+
+        fitted, held_out = sets_of(samples, observed, sigmas, frames)
+    pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
     place, names = made.frame_id
     world_frame = next((names[k] for k in place.tolist() if names[k]), '')
     return Table(fitted, held_out, pairs, world_frame, cameras, warnings, by_line)
@@ -170,34 +175,6 @@ def check_table(made: MadeColumns) -> None:
             'chain whose joints they are called like (--chain), or their own table (--joints)'
         )
     table_of(made, joints, tuple(dict.fromkeys(made.words.get('session', ()))))
-
-
-def _sets(
-    made: Measurements, sigmas: tuple[float, float], frames: Frames
-) -> tuple[Sets, Sets, tuple[tuple[str, str], ...]]:
-    """Return the sets to fit and held out, and the frames of the sockets of each location."""
-    kinds, number = distinct(made.codes)
-    examples = [
-        Sample(
-            0,
-            np.zeros(0),
-            session=made.session[1][session],
-            device=made.device[1][device],
-            target=made.target[1][target],
-            distance=0.0 if kind == DISTANCE else None,
-            eye_in_hand=bool(eye),
-            socket=kind == SOCKET,
-            plane=kind == PLANE,
-            validation=bool(test),
-        )
-        for session, device, target, eye, kind, test in kinds.tolist()
-    ]
-
-    def observed(members: Sequence[int]) -> Observations:
-        rows = np.isin(number, members)
-        return (made if rows.all() else made.select(rows)).observations()
-
-    return *sets_of(examples, observed, sigmas, frames), tuple(socket_pairs(examples, frames))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:

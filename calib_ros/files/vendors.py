@@ -69,7 +69,7 @@ class Vendor:
         )
 
     def has_layout(self, places: FloatArray) -> bool:
-        """Tell whether nominal export.origins (N, 4, 4) are those of this vendor, but for lengths.
+        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths.
 
         To 0.1 rad, since layouts differ by quarters of a turn, and to 0.01 m of the flange behind
         the last axis: elsewhere a tool is part of the table.
@@ -83,13 +83,11 @@ class Vendor:
         return bool(turned < 0.1 and shifted < 0.01)
 
 
+WRISTS = ('wrist_1', 'wrist_2', 'wrist_3')
 UR = Vendor(
     'ur_kinematics.yaml',
-    (
-        *('shoulder_pan_joint', 'shoulder_lift_joint', 'elbow_joint'),
-        *('wrist_1_joint', 'wrist_2_joint', 'wrist_3_joint'),
-    ),
-    ('shoulder', 'upper_arm', 'forearm', 'wrist_1', 'wrist_2', 'wrist_3'),
+    tuple(f'{each}_joint' for each in ('shoulder_pan', 'shoulder_lift', 'elbow', *WRISTS)),
+    ('shoulder', 'upper_arm', 'forearm', *WRISTS),
     (0, 1, 0, 0, 1, -1),
 )
 FRANKA = Vendor(

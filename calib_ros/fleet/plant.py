@@ -65,10 +65,7 @@ class Robot:
 
 
 def read_plant(path: Path) -> tuple[Robot, ...]:
-    """Read a plant file.
-
-    Relative names in it are meant from its folder.
-    """
+    """Read a plant file; names in it are relative to its folder."""
     return parse_plant(read_text(path, what='plant file '), path.parent, str(path))
 
 

@@ -22,7 +22,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, page_path, results
 from calib_ros.fleet.watch import Change, Watched, watch
 from calib_ros.fleet.work import PLOTLY
-from calib_ros.report.page import MARKS, MISSING, State, filled, plotly_script
+from calib_ros.report.page import MISSING, State, filled, plotly_script
 
 STATES: Mapping[str, tuple[State, str]] = {
     'changed': ('bad', 'the arm is another one than in the nights before'),
@@ -33,18 +33,15 @@ STATES: Mapping[str, tuple[State, str]] = {
     'fine': ('good', 'nothing to do'),
 }
 """From the worst to the best, with their looks and meaning."""
-MOST_ROBOTS, MOST_NIGHTS = MOST_ENTRIES, MOST_ENTRIES // 10
-"""Robots, the worst ones, and nights of each, that the page shows; the history has all."""
+MOST_NIGHTS = MOST_ENTRIES // 10
+"""Nights of a robot that the page shows; the history has all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 """How Prometheus takes what would end a label."""
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A robot, its newest result, what changed, and what could not be read by source.
-
-    `drift` is the chart of its verifications `verified`.
-    """
+    """A robot, its newest result, changes, unread sources, its verifications and their `drift`."""
 
     robot: Robot
     last: Row | None
@@ -139,6 +136,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
     states = {f'{{state="{state}"}}': number for state, number in counts(found).items()}
     unread = sum(len(each.errors) for each in found)
     rms, measured = by_robot(lambda _, row: row.rms_mm), by_robot(lambda _, r: r.time.timestamp())
+    since, changes = by_robot(changed), 'First night after the last change of the arm.'
     tables: tuple[tuple[str, str, Mapping[str, float | None]], ...] = (
         ('fleet_robots', 'Robots by state.', states),
         ('fleet_unreadable_inputs', 'Inputs that could not be used.', {'': unread}),
@@ -147,11 +145,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
         ('fleet_last_run_timestamp_seconds', 'End of the last run.', {'': ended}),
         ('robot_rms_millimetres', 'RMS position error of the corrected arm.', rms),
         ('robot_measured_timestamp_seconds', 'When the newest result was measured.', measured),
-        (
-            'robot_changed_timestamp_seconds',
-            'First night after the last change of the arm.',
-            by_robot(changed),
-        ),
+        ('robot_changed_timestamp_seconds', changes, since),
     )
     lines: list[str] = []
     for name, text, values in tables:
@@ -182,11 +176,10 @@ def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
 
 def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
     """Return the page; None where jinja2 is not installed."""
-    shown = found[:MOST_ROBOTS]
+    shown = found[:MOST_ENTRIES]  # the worst
     return filled(
         'fleet.html.jinja',
         mark=STATES[found[0].state][0] if found else 'info',
-        marks=MARKS,
         states=STATES,
         counts={state: number for state, number in counts(found).items() if number},
         total=len(found),

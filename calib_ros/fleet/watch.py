@@ -85,10 +85,7 @@ class Watched:
 
 
 def watch(rows: Sequence[Row], years: float) -> Watched:
-    """Look for changes in identifications in the order of their times.
-
-    Those that are not accepted, or tell other parameters than the first, are left out.
-    """
+    """Look for changes in accepted identifications, in order, of the parameters of the first."""
     known = [row for row in rows if row.accepted]
     alike = [row for row in known if row.names == known[0].names]
     if not alike:
@@ -141,32 +138,26 @@ class _Tests(NamedTuple):
     weight: FloatArray
 
 
-class _Data:
+class _Data(NamedTuple):
     """The parameters (K, P) of K nights with their information (K, P, P)."""
 
-    def __init__(
-        self,
-        names: tuple[Parameter, ...],
-        values: FloatArray,
-        information: FloatArray,
-        freedom: FloatArray,
-    ) -> None:
-        self.names, self.freedom = names, freedom
-        self._values, self._information = values, information
-        owners = [name.owner for name in names]
-        self.joints = tuple(dict.fromkeys(owners))
-        self._groups = [
-            np.array([k for k, owner in enumerate(owners) if owner == joint])
-            for joint in self.joints
-        ]
+    names: tuple[Parameter, ...]
+    values: FloatArray
+    information: FloatArray
+    freedom: FloatArray
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(name.owner for name in self.names))
 
     def tests(self, first: int) -> _Tests:
         """Return the tests of all nights against those before, from the `first` on."""
-        count, size = self._values.shape
-        whole = np.cumsum(self._information[first:], axis=0)
-        pulled = np.cumsum(
-            np.einsum('kpr,kr->kp', self._information[first:], self._values[first:]), axis=0
-        )
+        count, size = self.values.shape
+        owners = np.array([name.owner for name in self.names])
+        groups = [np.flatnonzero(owners == joint) for joint in self.joints]
+        information, values = self.information[first:], self.values[first:]
+        whole = np.cumsum(information, axis=0)
+        pulled = np.cumsum(np.einsum('kpr,kr->kp', information, values), axis=0)
         chances = np.ones((len(LAGS), count, len(self.joints)))
         pull = np.zeros((len(LAGS), count, size))
         weight = np.zeros((len(LAGS), count, size, size))
@@ -188,7 +179,7 @@ class _Data:
             usual = np.array([self._usual(scatter[first + 1 : k + 1 - lag]) for k in nights])
             weight[number, nights] = inverse / usual[:, np.newaxis, np.newaxis]
             pull[number, nights] = force / usual[:, np.newaxis]
-            for j, group in enumerate(self._groups):
+            for j, group in enumerate(groups):
                 part = inverse[:, group[:, np.newaxis], group]
                 found = np.linalg.solve(part, force[:, group, np.newaxis])[..., 0]
                 gain = np.einsum('kp,kp->k', found, force[:, group])

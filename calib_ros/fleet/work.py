@@ -40,10 +40,7 @@ PLOTLY = 'plotly.min.js'
 
 
 class Source(NamedTuple):
-    """A bag or table: its place, the session of a table, and what changes with its content.
-
-    The `fingerprint` is empty where the file system tells nothing by which a change would show.
-    """
+    """A bag or table, a session, and what changes with its content; empty where nothing tells."""
 
     url: str
     session: str = ''
@@ -121,14 +118,9 @@ def _outcome(task: Task) -> Outcome:
         else:
             loaded = of_bag(*replayed(path, chain, settings), robot.largest_loss)
         problem, result = loaded.problem, loaded.identified(settings.model)
-        about = Filing(
-            robot.serial,
-            measured_at((*problem.sets, *problem.judging), source.modified),
-            content,
-            robot.settings_hash,
-            source.name,
-            source.fingerprint,
-        )
+        time_of = measured_at((*problem.sets, *problem.judging), source.modified)
+        known = (content, robot.settings_hash, source.name, source.fingerprint)
+        about = Filing(robot.serial, time_of, *known)
         row = identified(result, about, loaded.warnings)
         if not task.page:
             return Outcome(row)

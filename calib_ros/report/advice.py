@@ -70,15 +70,8 @@ GOOD_ARM = Advice(
 
 WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 """Where the description does not fit the arm."""
-WRONG = {
-    *WRONG_ARM,
-    Rule.CONVERGENCE,
-    Rule.DRIFT,
-    Rule.GAIN,
-    Rule.REGION,
-    Rule.ORIENTATION,
-    Rule.SCALE,
-}
+WRONG = {*WRONG_ARM, Rule.CONVERGENCE, Rule.DRIFT, Rule.GAIN}
+WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
 """What a description that does not fit brings by itself."""
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
     rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)

@@ -137,10 +137,7 @@ def plan_report(
     found: Plan | None = None,
     wanted_mm: float | None = None,
 ) -> Report:
-    """Return the report of poses (K, n) to measure in this order; `words` say what they promise.
-
-    `found` is None for the test poses of ISO 9283.
-    """
+    """Return the report of poses (K, n) to measure; `found` is None for those of ISO 9283."""
     shown = [
         _visit(chain, joints),
         sections.coverage(chain, joints, 'How far each joint will move'),
@@ -220,18 +217,14 @@ def verification_report(
     if found.tolerance is not None:
         text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
     state, steps = STANDINGS[found.verdict]
+    gain = sections.gain(found.comparison, intervals=False)
+    title = 'Accuracy before and after the correction'
+    accuracy = sections.accuracy_section(title, found.comparison, poses.things, intervals=False)
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
-        verdict=replace(
-            state, text=tuple(text), gain=sections.gain(found.comparison, intervals=False)
-        ),
-        accuracy=sections.accuracy_section(
-            'Accuracy before and after the correction',
-            found.comparison,
-            poses.things,
-            intervals=False,
-        ),
+        verdict=replace(state, text=tuple(text), gain=gain),
+        accuracy=accuracy,
         picture=sections.distribution(poses),
         steps=steps,
         remarks=(*warnings, *remarks(found)),

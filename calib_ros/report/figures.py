@@ -97,10 +97,7 @@ def against_noise(poses: Poses) -> Figure:
 
 
 def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> Figure | None:
-    """Return offsets with their 95 % intervals, of lengths [mm] or of angles [mrad].
-
-    `limit` [m or rad] is that of common sense: drawn where it comes near.
-    """
+    """Return offsets with 95 % intervals [mm or mrad], and a `limit` [m or rad] if it is near."""
     found = [p for p in parameters if p.std is not None and p.name.is_length == lengths]
     if not found:
         return None

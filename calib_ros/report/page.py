@@ -35,10 +35,7 @@ MISSING_PDF = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader sees first: 'good', 'bad', 'open' (undecided) or 'info', and words.
-
-    `gain` are the figures before and after.
-    """
+    """What a reader sees first: how it looks, words, and the `gain` from before to after."""
 
     state: State
     heading: str
@@ -48,10 +45,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Section:
-    """Words, a figure of plotly (`data` and `layout`), a table, or some of them.
-
-    `text` explains a figure, what is `said` holds without it.
-    """
+    """Words, a figure of plotly, a table, or some; what is `said` holds without the figure."""
 
     name: str
     title: str
@@ -136,32 +130,18 @@ def plotly_script() -> str | None:
 
 
 def render(report: Report, script: str = '') -> str | None:
-    """Return a report as HTML; None where jinja2 or plotly is not installed.
-
-    With the path of plotly's `script`, which many pages share, the page needs that file besides.
-    """
+    """Return a report as HTML, without the `script` at a path; None without jinja2 or plotly."""
     plotly = '' if script else plotly_script()
     if plotly is None:
         return None
-    return filled(
-        'report.html.jinja',
-        report=report,
-        marks=MARKS,
-        drawings=None,
-        script=script,
-        plotly=plotly,
-        data={
-            'figures': {each.name: each.figure for each in report.shown if each.figure},
-            'explorer': report.explorer,
-        },
-    )
+    drawn = {each.name: each.figure for each in report.shown if each.figure}
+    data = {'figures': drawn, 'explorer': report.explorer}
+    shown = {'drawings': None, 'script': script, 'plotly': plotly, 'data': data}
+    return filled('report.html.jinja', report=report, **shown)
 
 
 def on_paper(report: Report) -> bytes | None:
-    """Return a report as PDF: a certificate first; None where jinja2 or weasyprint is missing.
-
-    Figures are drawn by matplotlib, those in space are left out: paper cannot be turned.
-    """
+    """Return a report as PDF, without figures in space; None without jinja2 or weasyprint."""
     try:
         import weasyprint
     except (ImportError, OSError):  # OSError: its libraries of the system
@@ -170,15 +150,9 @@ def on_paper(report: Report) -> bytes | None:
 
     drawn = ((each.name, drawing(each.figure, each.height)) for each in report.shown)
     logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
-    page = filled(
-        'report.html.jinja',
-        report=report,
-        marks=MARKS,
-        drawings={name: each for name, each in drawn if each},
-    )
-    if page is None:
-        return None
-    found: bytes = weasyprint.HTML(string=page).write_pdf()
+    drawings = {name: each for name, each in drawn if each}
+    page = filled('report.html.jinja', report=report, drawings=drawings)
+    found: bytes | None = weasyprint.HTML(string=page).write_pdf() if page else None
     return found
 
 
@@ -188,16 +162,12 @@ def filled(template: str, **values: Any) -> str | None:
         import jinja2
     except ImportError:
         return None
+    loader, undefined = jinja2.FunctionLoader(_template), jinja2.StrictUndefined
     environment = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_template),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_shown,
-        trim_blocks=True,
+        loader=loader, autoescape=True, undefined=undefined, finalize=_shown, trim_blocks=True
     )
-    page: str = environment.get_template(template).render(
-        css=_template('report.css'), js=_template('report.js'), **values
-    )
+    values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
+    page: str = environment.get_template(template).render(**values)
     return page
 
 
@@ -213,10 +183,7 @@ def _shown(value: object) -> object:
 
 
 def markdown(report: Report, samples: Mapping[str, Any]) -> str:
-    """Return the words and tables of a report, to be kept with a calibration.
-
-    `samples` is what became of the input.
-    """
+    """Return the words and tables of a report; `samples` are what became of the input."""
     verdict = report.verdict
     lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.robot)}', '']
     lines += [f'**{in_markdown(verdict.heading)}**', '']
@@ -235,11 +202,9 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
             lines += [_row(each.head), head, *rest, '']
     told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
     told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
-    for title, points in (
-        ('What to do next', report.steps),
-        ('Please note', report.remarks),
-        ('Identity', [f'{name}: {value}' for name, value in told]),
-    ):
+    identity = [f'{name}: {value}' for name, value in told]
+    lists = {'What to do next': report.steps, 'Please note': report.remarks, 'Identity': identity}
+    for title, points in lists.items():
         lines += [*_section(title), *_listed(points)] if points else []
     return '\n'.join(lines)
 

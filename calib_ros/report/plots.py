@@ -21,8 +21,8 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line
 
-INCH, MARGIN = 0.0254, 0.01
-"""In metres: an inch, and what is left free around a board."""
+MARGIN = 0.01
+"""What is left free around a board [m]."""
 
 
 def before_after_png(result: Identification) -> bytes:
@@ -106,16 +106,13 @@ def _in_metres(axes: Axes, first: str, second: str) -> None:
 
 
 def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> bytes:
-    """Return a page with black rectangles (K, 4) [m] in their true size: left, top, width, height.
-
-    The page is as large as what is on it, with a margin for the hands and the words.
-    """
+    """Return a page with black rectangles (K, 4) [m], true in size: left, top, width, height."""
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
 
     width, height = size[0] + 2.0 * MARGIN, size[1] + 2.0 * MARGIN
-    figure = Figure(figsize=(width / INCH, height / INCH))
+    figure = Figure(figsize=(width / 0.0254, height / 0.0254))  # inches
     FigureCanvasPdf(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     axes.set(xlim=(-MARGIN, width - MARGIN), ylim=(height - MARGIN, -MARGIN))
@@ -173,16 +170,9 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
     line = style[look.get('dash', 'solid')] if 'lines' in curve['mode'] else ''
     mark = {'diamond': 'D'}.get(curve.get('marker', {}).get('symbol', ''), 'o')
     error = curve.get('error_x', {}).get('array')
-    axes.errorbar(
-        curve['x'],
-        _plain(curve['y']),
-        xerr=error,
-        color=look['color'],
-        linestyle=line,
-        marker=mark if 'markers' in curve['mode'] else '',
-        markersize=4,
-        label=curve['name'],
-    )
+    marks = {'marker': mark if 'markers' in curve['mode'] else '', 'markersize': 4}
+    shown = {'color': look['color'], 'linestyle': line, 'label': curve['name'], **marks}
+    axes.errorbar(curve['x'], _plain(curve['y']), xerr=error, **shown)
 
 
 def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
@@ -218,7 +208,4 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
 
 def _plain(names: Sequence[Any]) -> list[Any]:
     """Return names without what plotly or matplotlib would read as marks."""
-    return [
-        html.unescape(each).replace('$', r'\$') if isinstance(each, str) else each
-        for each in names
-    ]
+    return [html.unescape(x).replace('$', r'\$') if isinstance(x, str) else x for x in names]

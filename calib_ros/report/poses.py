@@ -78,10 +78,7 @@ class Poses:
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Return (N,) which poses the figures are about, without the outliers.
-
-        They are those left out to judge, or all where none was.
-        """
+        """Return (N,) which poses judge, all where none was left out for that, but no outliers."""
         chosen = self.role != FITTED
         return np.asarray((chosen | ~chosen.any()) & ~self.outlier)
 

@@ -50,6 +50,7 @@ def identification_report(
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
     limits = sections.limits_of(judged, 1, CONFIDENT)
+    corrected = table_hash(result.chain) if result.accepted else 'none: not accepted'
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
@@ -68,11 +69,7 @@ def identification_report(
         steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
         identity=sections.identity_of(
-            result.chain,
-            origin,
-            poses,
-            ('Judged by', result.validated_by),
-            table_hash(result.chain) if result.accepted else 'none: not accepted',
+            result.chain, origin, poses, ('Judged by', result.validated_by), corrected
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
@@ -158,30 +155,21 @@ def _steps(
     if not result.accepted:
         first = 'Follow the steps above, those of the first reason first.'
         return (*((first,) if len(reasons) > 1 else ()), reasons[0].again)
-    found = []
-    if tolerance is not None and limits[0] > tolerance:
-        if not result.chain.effects:
-            found.append(
-                'To come nearer to the tolerance, identify with --model auto: it corrects what '
-                'gears, gravity and play add, where that helps.'
-            )
-        found.append(
-            'Compare what is left with the accuracy of the measuring device: no calibration gets '
-            'below that.'
-        )
-    elif tolerance is not None and limits[1] > tolerance:
-        found.append(f'Measure more poses to decide about the tolerance, {SPREAD}.')
-    found += [
-        f'{NOT_YET}.',
+    beyond = tolerance is not None and limits[0] > tolerance
+    undecided = tolerance is not None and limits[0] <= tolerance < limits[1]
+    found = {
+        'To come nearer to the tolerance, identify with --model auto: it corrects what gears, '
+        'gravity and play add, where that helps.': beyond and not result.chain.effects,
+        'Compare what is left with the accuracy of the measuring device: no calibration gets '
+        'below that.': beyond,
+        f'Measure more poses to decide about the tolerance, {SPREAD}.': undecided,
+        f'{NOT_YET}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
-        'arm: calib_ros verify.',
-    ]
-    if result.region is not None and not result.region.whole:
-        found.append(
-            'calib_ros compensate refuses poses where the calibration is not valid. To use it '
-            'there, measure poses there as well.'
-        )
-    return tuple(found)
+        'arm: calib_ros verify.': True,
+        'calib_ros compensate refuses poses where the calibration is not valid. To use it there, '
+        'measure poses there as well.': result.region is not None and not result.region.whole,
+    }
+    return tuple(step for step, needed in found.items() if needed)
 
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterator[Section]:

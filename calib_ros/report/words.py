@@ -115,10 +115,7 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
 
 
 def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
-    """Return the configuration as a parameter file, with which a node does the same again.
-
-    `more` are parameters of the node besides the settings.
-    """
+    """Return settings and `more` as a parameter file, by which a node does the same again."""
     parameters: dict[str, Any] = {'chain': chain, **more}
     for name, value in asdict(settings).items():
         parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
@@ -126,10 +123,7 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
 
 
 def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
-    """Return whether the last stops agree with the calibration in use, and why in words.
-
-    It must hold as for `verdict`, and nothing may have changed.
-    """
+    """Return whether a calibration holds at the last stops, nothing changed, and why in words."""
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
     if found.changed:
         reasons = '; '.join(reason_in_words(each) for each in found.changed)
@@ -150,10 +144,7 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
 def verdict(
     calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures, reused: float = 0.0
 ) -> tuple[bool, str]:
-    """Return whether a calibration still holds on new samples, and why in words.
-
-    A share of them may be `reused`: fitted before, as of a bag that is played again.
-    """
+    """Return whether a calibration holds on samples, a share `reused`, and why in words."""
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
     if warning := reused_in_words(reused):
