@@ -13,7 +13,7 @@ from calib_ros.identification import trimmed
 from calib_ros.identification.identification import Problem, identify
 from calib_ros.identification.leastsquares import Prior, System
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.start import _shortest, closed_forms
+from calib_ros.identification.start import _shortest, closed_forms, start_frames
 from calib_ros.identification.trimmed import _Halves, _Linear, trimmed_sum
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Frame
@@ -181,3 +181,19 @@ def test_a_tool_that_is_given_stays_where_orientations_do_not_tell():
     np.testing.assert_allclose(_shortest(turned, wanted, True), [0.1, 0.2, 0.0], atol=1e-12)
     still = _shortest(turned, wanted - [1.0, 2.0, 3.0], False)
     np.testing.assert_allclose(still, [0.1, 0.2, 0.3], atol=1e-12)
+
+
+def test_distances_start_right_among_gross_errors_that_agree():
+    """A third of them is 0.3 m too long; the rest fits to the arm's own errors."""
+    rng = np.random.default_rng(0)
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(120, rng)
+    seen = measure(true, q, rng, 5e-5, 2e-4, oriented=False)
+    distances = np.linalg.norm(seen.positions, axis=1)
+    distances[::3] += 0.3
+    wires = replace(seen, distances=distances)
+    problem = Problem(UR10E, wires)
+    found = start_frames(problem.model, problem.sets, 1e-4, 1e-4, problem.loss)
+    left = np.linalg.norm(found.forward(q)[:, :3, 3], axis=1) - distances
+    assert np.median(np.abs(left)) < 2e-3
+    np.testing.assert_allclose(found.base.matrix[:3, :3], np.eye(3))  # no distance tells a turn
