@@ -48,10 +48,11 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
-from calib_ros.settings import EXCEPTION
+from calib_ros.settings import EXCEPTION, Settings
 
-WIDE = (0.01, 0.02)
-"""Standard deviations [m, rad] of arm parameters before anything is measured."""
+WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)
+"""Standard deviations [m, rad] of arm parameters before anything is measured: five times as much
+is another robot."""
 START = len(parameters_of('base'))
 """Configurations with which two frames are found: of three coordinates each, for two unknowns."""
 MOST_THOROUGH = 60

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -116,6 +117,11 @@ class CalibrationSession:
         self._kept.leave_out_strange()
 
     @property
+    def received(self) -> Counter[str]:
+        """Return how many messages came so far, by kind."""
+        return self._entry.received
+
+    @property
     def latest(self) -> tuple[int, Sequence[float]] | None:
         """Return stamp [ns] and values of the last joint state that named all joints."""
         return self._entry.latest
@@ -198,8 +204,8 @@ class CalibrationSession:
         gate = self._road.gate
         dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + gate.dropped
         return Account(
-            self._entry.received[JOINTS],
-            self._entry.received[POSES],
+            self.received[JOINTS],
+            self.received[POSES],
             collector.waiting.count + gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
@@ -223,7 +229,7 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        return found + self._road.hints(self._entry.received[POSES])
+        return found + self._road.hints(self.received[POSES])
 
     @property
     def delay(self) -> Delay | None:
