@@ -10,7 +10,8 @@ are marginalised first:
     A' = A - A R M R^T A        b' = b - A R M R^T b        M = (1 + R^T A R)^-1,  K = R R^T
 
 An explanation states x = G z: one parameter has changed, or all parameters of a joint (a bent
-link), or a frame (the device or the target was moved). Its gain in chi-squared,
+link), or a frame (the device or the target was moved), or the device
+measures in another scale. Its gain in chi-squared,
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
@@ -30,7 +31,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
-from calib_ros.identification.levels import CONFIDENT, chance_of
+from calib_ros.identification.levels import CONFIDENT, SCALE, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
@@ -46,6 +47,8 @@ FALSE = 0.005
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
 way costs half a unit of the evidence's logarithm."""
+SCALE_OF_DEVICE = Parameter('device', 'ratio')
+"""Growth of all that a device measures: of the lengths of the arm, and of the way to it."""
 MOST_CHANGES = 3
 """Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
@@ -166,7 +169,7 @@ def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple
         return ()
     logs = []
     for _, names in sets:
-        sizes = np.array([SIZES.get(name.unit, 1.0) for name in names])
+        sizes = np.array([_size(name) for name in names])
         logs.append(told.evidence(columns.of(names), sizes))
     shares = np.exp(logs - special.logsumexp(logs))
     found = []
@@ -206,11 +209,17 @@ class Columns:
         these, show in them; those that are none do not show at all.
     frames : sequence of str
         Frames that may have moved; others are free, and take up whatever they can.
+    scaled : bool
+        The device may measure in another scale than before.
 
     """
 
     def __init__(
-        self, chain: Chain, names: Sequence[Parameter], frames: Sequence[str] = ()
+        self,
+        chain: Chain,
+        names: Sequence[Parameter],
+        frames: Sequence[str] = (),
+        scaled: bool = False,
     ) -> None:
         arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
         mapped, left = gauged(chain, names, arm, free=not frames)
@@ -231,6 +240,11 @@ class Columns:
         for frame in frames:
             own = [name for name in parameters_of(frame) if name in self._columns]
             sets += [(frame, tuple(own))] if own else []
+        lengths = [n for n in self._columns if n.kind in ('a', 'd', 'x', 'y', 'z')]
+        if scaled and lengths:
+            grown = [chain.value(name) * self._columns[name] for name in lengths]
+            self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
+            sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
         self.sets = tuple(sets)
 
     def of(self, names: Sequence[Parameter]) -> FloatArray:
@@ -241,10 +255,15 @@ class Columns:
         """Return the covariance (P, P) of changes whose sizes are left to the data."""
         parts = []
         for reason in reasons:
-            sizes = [SPREAD * SIZES.get(name.unit, 1.0) for name in reason.names]
+            sizes = [SPREAD * _size(name) for name in reason.names]
             parts.append(self.of(reason.names) * np.array(sizes))
         square = np.hstack(parts)
         return np.asarray(square @ square.T)
+
+
+def _size(name: Parameter) -> float:
+    """Return the size of a change."""
+    return SCALE if name == SCALE_OF_DEVICE else SIZES.get(name.unit, 1.0)
 
 
 def _alike(first: FloatArray, second: FloatArray) -> bool:

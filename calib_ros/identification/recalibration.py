@@ -12,8 +12,8 @@ converges. If two causes cannot be distinguished, both are free.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
 
@@ -23,102 +23,40 @@ import calib_ros
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import (
-    FALSE,
     MOST_CHANGES,
     SIZES,
     Columns,
     Explanation,
     Told,
     reason_in_words,
-    reasons_document,
     reasons_of,
 )
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.fingerprint import Fingerprint, reused_in_words
+from calib_ros.identification.fingerprint import Fingerprint
 from calib_ros.identification.leastsquares import (
     System,
     minimise,
     normal_equations,
     products_of,
 )
-from calib_ros.identification.levels import ALIKE, chance_of
+from calib_ros.identification.levels import chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.recalibrated import Recalibration as Recalibration
 from calib_ros.identification.records import nominal_document
-from calib_ros.identification.validation import ErrorFigures, left_out
+from calib_ros.identification.validation import ErrorFigures, left_out, residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import frames_document, table_hash
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
-from calib_ros.shown import Shown
 
+FEWEST, SUSPECTS = 6, 4
+"""Poses of which one may contradict the others, and those tried, with the largest errors."""
 PER_METRE = SIZES['rad'] / SIZES['m']
 """Angles [rad] grow by so much more than lengths [m]."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Recalibration(Shown):
-    """An earlier calibration, brought up to date by some new poses.
-
-    `changed` is what has changed, one after the other: the best explanation of each change, and
-    those that cannot be told apart from it; `unexplained` is the probability of residuals as large
-    as those that are left. `before` and `after` are errors of the new poses by the earlier
-    calibration, and by what the other poses tell; `anew` tells whether there are new frames, which
-    are fitted to all of the new poses for `before`. `reused` is the share of the poses that the
-    earlier calibration was fitted to: they would count twice.
-    """
-
-    calibration: Calibration
-    changed: tuple[tuple[Explanation, ...], ...]
-    unexplained: float
-    before: ErrorFigures
-    after: ErrorFigures
-    reused: float = 0.0
-    anew: bool = False
-
-    @property
-    def accepted(self) -> bool:
-        """Tell whether the result may be used."""
-        better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
-        agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
-        return self.unexplained > FALSE and bool(agrees) and not self.reused
-
-    def document(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {
-            'accepted': self.accepted,
-            'reused': self.reused,
-            'changed': [reasons_document(each) for each in self.changed],
-            'unexplained': self.unexplained,
-            'before': asdict(self.before),
-            'after': asdict(self.after),
-        }
-
-    def in_words(self) -> str:
-        """Return what has changed."""
-        text = (
-            f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
-            'new poses (each left out in turn)'
-        )
-        if self.reused:
-            return f'NOT accepted: {reused_in_words(self.reused)}, and give only those. {text}'
-        if self.unexplained <= FALSE:
-            return (
-                f'NOT accepted: no few parameters explain what has changed; identify anew. {text}'
-            )
-        if not self.accepted and self.anew:
-            return (
-                'NOT accepted: the earlier calibration, in new frames, fits the new poses better; '
-                f'keep it, or identify anew from more poses. {text}'
-            )
-        if not self.accepted:
-            return f'NOT accepted: the new poses contradict each other; measure more. {text}'
-        if not self.changed:
-            return f'accepted: unchanged within what is known, brought up to date; {text}'
-        return f'accepted: {"; ".join(reason_in_words(each) for each in self.changed)}; {text}'
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -158,6 +96,43 @@ def recalibrate(
         When the calibration holds no covariance, or does not know a frame.
 
     """
+    found, arm = _recalibrated(previous, problem, years, growth, new)
+    if found.accepted or found.reused or found.scale is not None:
+        return found
+    for number, pose, rest in _without_one(problem, arm):
+        try:
+            others, _ = _recalibrated(previous, rest, years, growth, new)
+        except np.linalg.LinAlgError:
+            continue
+        if others.accepted:
+            return replace(found, odd=(number, pose))
+    return found
+
+
+def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
+    """Yield set and pose of those with the largest errors by a chain, and all without it."""
+    sets = (*problem.sets, *problem.judging)
+    sizes = [np.linalg.norm(residuals(chain, each).position, axis=1) for each in sets]
+    order = np.argsort(-np.concatenate(sizes))
+    if not len(order) >= FEWEST or any(each.pixels is not None for each in sets):
+        return
+    owner = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
+    first = np.cumsum([0, *(len(each) for each in sets)])
+    for k in order[:SUSPECTS].tolist():
+        number = int(owner[k])
+        pose = k - int(first[number])
+        rest = [
+            each.select(np.arange(len(each)) != pose) if at == number else each
+            for at, each in enumerate(sets)
+        ]
+        one, *more = (each for each in rest if len(each))
+        yield number, pose, replace(problem, observations=one, more=tuple(more), held_out=None)
+
+
+def _recalibrated(
+    previous: Calibration, problem: Problem, years: float, growth: float, new: Sequence[str]
+) -> tuple[Recalibration, Chain]:
+    """Return what comes of the poses of a problem, and the earlier arm in new frames."""
     sets = (*problem.sets, *problem.judging)
     _require_known(previous, sets)
     arm = _Arm.of(previous, years, growth)
@@ -171,8 +146,9 @@ def recalibrate(
         arm = replace(arm, chain=minimise(arm.chain, names, system).chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
-    columns = Columns(arm.chain, arm.names, movable)
+    columns = Columns(arm.chain, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
+    earlier = _applied(previous, arm.chain, {})
     found = arm.solved(system)
     while len(changed) < MOST_CHANGES:
         reasons = reasons_of(found.told.beside(arm.square), columns, previous.freedom)
@@ -181,13 +157,24 @@ def recalibrate(
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
-    return Recalibration(
+    result = Recalibration(
         _updated(previous, arm, found, problem, tuple(changed)),
         tuple(changed),
         found.unexplained(arm.square, system.rows, previous.freedom),
         *_judged(previous, arm, found, system, sets),
         previous.reused(sets),
         bool(names),
+    )
+    return result, earlier
+
+
+def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
+    """Tell whether all was measured by one device whose scale would show in positions."""
+    bases = {each.base for each in sets}
+    free = len(bases) == 1 and not any(chain.frame(base).fixed for base in bases)
+    return free and all(
+        each.distances is None and each.pixels is None and not (each.socket or each.inverse)
+        for each in sets
     )
 
 
