@@ -24,6 +24,7 @@ from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import (
     MOST_CHANGES,
+    SCALE_OF_DEVICE,
     SIZES,
     Columns,
     Explanation,
@@ -39,7 +40,7 @@ from calib_ros.identification.leastsquares import (
     normal_equations,
     products_of,
 )
-from calib_ros.identification.levels import chance_of
+from calib_ros.identification.levels import SCALE, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.problem import Problem
@@ -53,6 +54,8 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
 
+FAR = 6.0
+"""Error of a pose, in units of those of the others, from which on it is a gross one."""
 FEWEST, SUSPECTS = 6, 4
 """Poses of which one may contradict the others, and those tried, with the largest errors."""
 PER_METRE = SIZES['rad'] / SIZES['m']
@@ -104,7 +107,9 @@ def recalibrate(
             others, _ = _recalibrated(previous, rest, years, growth, new)
         except np.linalg.LinAlgError:
             continue
-        if others.accepted:
+        chain = others.calibration.chain
+        away = residuals(chain, (*problem.sets, *problem.judging)[number]).position[pose]
+        if others.accepted and 1e3 * np.linalg.norm(away) > FAR * others.after.rms_mm:
             return replace(found, odd=(number, pose))
     return found
 
@@ -154,6 +159,9 @@ def _recalibrated(
         reasons = reasons_of(found.told.beside(arm.square), columns, previous.freedom)
         if not reasons:
             break
+        if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
+            columns = Columns(arm.chain, arm.names, movable)  # as much is usual
+            continue
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
