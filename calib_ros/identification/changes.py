@@ -10,8 +10,8 @@ are marginalised first:
     A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
 An explanation states x = G z: one parameter has changed, or all of a joint (a bent link) or of a
-frame (the device or the target was moved). It gains of chi-squared, with as many degrees of
-freedom as z,
+frame (the device or the target was moved), or the device measures in another scale. It gains of
+chi-squared, with as many degrees of freedom as z,
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
@@ -31,7 +31,7 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.identification.identifiability import followed
-from calib_ros.identification.levels import CONFIDENT, chance_of
+from calib_ros.identification.levels import CONFIDENT, SCALE, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
@@ -47,6 +47,8 @@ FALSE = 0.005
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
 way costs half a unit of the evidence's logarithm."""
+SCALE_OF_DEVICE = Parameter('device', 'ratio')
+"""Growth of all that a device measures: of the lengths of the arm, and of the way to it."""
 MOST_CHANGES = 3
 """Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
@@ -183,7 +185,7 @@ def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
 
 def _sizes(names: Sequence[Parameter]) -> FloatArray:
     """Return the typical sizes (k,) [m, rad] of changes."""
-    return np.array([SIZES.get(name.unit, 1.0) for name in names])
+    return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES.get(n.unit, 1.0) for n in names])
 
 
 class Columns:
@@ -197,11 +199,17 @@ class Columns:
         these, show in them; those that are none do not show at all.
     frames : sequence of str
         Frames that may have moved; others are free, and take up whatever they can.
+    scaled : bool
+        The device may measure in another scale than before.
 
     """
 
     def __init__(
-        self, chain: Chain, names: Sequence[Parameter], frames: Sequence[str] = ()
+        self,
+        chain: Chain,
+        names: Sequence[Parameter],
+        frames: Sequence[str] = (),
+        scaled: bool = False,
     ) -> None:
         arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
         mapped, left = gauged(chain, names, arm, free=not frames)
@@ -217,6 +225,11 @@ class Columns:
         for frame in frames:
             own = tuple(name for name in parameters_of(frame) if name in self._columns)
             sets += [(frame, own)] if own else []
+        lengths = [name for name in self._columns if name.is_length]
+        if scaled and lengths:
+            grown = [chain.value(name) * self._columns[name] for name in lengths]
+            self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
+            sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
         self.sets = tuple(sets)
 
     def _unlike(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:

@@ -12,8 +12,8 @@ b, relinearised until it converges.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
 
@@ -22,84 +22,26 @@ import numpy as np
 from calib_ros.errors import InputError
 from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration, about, made
-from calib_ros.identification.changes import Columns, Explanation, Told
+from calib_ros.identification.changes import SCALE_OF_DEVICE, Columns, Explanation, Told
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.leastsquares import System, minimise, normal_equations, products_of
-from calib_ros.identification.levels import ALIKE, chance_of
+from calib_ros.identification.levels import SCALE, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.records import Fingerprint, reused_in_words
-from calib_ros.identification.validation import ErrorFigures, left_out
+from calib_ros.identification.recalibrated import Recalibration as Recalibration
+from calib_ros.identification.records import Fingerprint
+from calib_ros.identification.validation import ErrorFigures, left_out, residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
-from calib_ros.shown import Shown
 
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Recalibration(Shown):
-    """An earlier calibration, brought up to date by some new poses.
-
-    `changed` is what has changed, one after the other: the best explanation of each change, and
-    those that cannot be told apart from it; `unexplained` is the probability of residuals as large
-    as those that are left. `before` and `after` are errors of the new poses by the earlier
-    calibration, and by what the other poses tell; `anew` tells whether there are new frames, which
-    are fitted to all of the new poses for `before`. `reused` is the share of the poses that the
-    earlier calibration was fitted to: they would count twice.
-    """
-
-    calibration: Calibration
-    changed: tuple[tuple[Explanation, ...], ...]
-    unexplained: float
-    before: ErrorFigures
-    after: ErrorFigures
-    reused: float = 0.0
-    anew: bool = False
-
-    @property
-    def accepted(self) -> bool:
-        """Tell whether the result may be used."""
-        better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
-        agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
-        return self.unexplained > changes.FALSE and bool(agrees) and not self.reused
-
-    def document(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        return {
-            'accepted': self.accepted,
-            'reused': self.reused,
-            'changed': [changes.reasons_document(each) for each in self.changed],
-            'unexplained': self.unexplained,
-            'before': asdict(self.before),
-            'after': asdict(self.after),
-        }
-
-    def in_words(self) -> str:
-        """Return what has changed."""
-        text = (
-            f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
-            'new poses (each left out in turn)'
-        )
-        if self.accepted:
-            said = 'unchanged within what is known, brought up to date'
-            if self.changed:
-                said = '; '.join(changes.reason_in_words(each) for each in self.changed)
-            return f'accepted: {said}; {text}'
-        if self.reused:
-            why = f'{reused_in_words(self.reused)}, and give only those'
-        elif self.unexplained <= changes.FALSE:
-            why = 'no few parameters explain what has changed; identify anew'
-        elif self.anew:
-            why = (
-                'the earlier calibration, in new frames, fits the new poses better; keep it, or '
-                'identify anew from more poses'
-            )
-        else:
-            why = 'the new poses contradict each other; measure more'
-        return f'NOT accepted: {why}. {text}'
+FAR = 6.0
+"""Error of a pose, in units of those of the others, from which on it is a gross one."""
+FEWEST, SUSPECTS = 6, 4
+"""Poses of which one may contradict the others, and those tried, with the largest errors."""
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -139,6 +81,45 @@ def recalibrate(
         When the calibration holds no covariance, or does not know a frame.
 
     """
+    found, arm = _recalibrated(previous, problem, years, growth, new)
+    if found.accepted or found.reused or found.scale is not None:
+        return found
+    for number, pose, rest in _without_one(problem, arm):
+        try:
+            others, _ = _recalibrated(previous, rest, years, growth, new)
+        except np.linalg.LinAlgError:
+            continue
+        chain = others.calibration.chain
+        away = residuals(chain, (*problem.sets, *problem.judging)[number]).position[pose]
+        if others.accepted and 1e3 * np.linalg.norm(away) > FAR * others.after.rms_mm:
+            return replace(found, odd=(number, pose))
+    return found
+
+
+def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
+    """Yield set and pose of those with the largest errors by a chain, and all without it."""
+    sets = (*problem.sets, *problem.judging)
+    sizes = [np.linalg.norm(residuals(chain, each).position, axis=1) for each in sets]
+    order = np.argsort(-np.concatenate(sizes))
+    if not len(order) >= FEWEST or any(each.pixels is not None for each in sets):
+        return
+    owner = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
+    first = np.cumsum([0, *(len(each) for each in sets)])
+    for k in order[:SUSPECTS].tolist():
+        number = int(owner[k])
+        pose = k - int(first[number])
+        rest = [
+            each.select(np.arange(len(each)) != pose) if at == number else each
+            for at, each in enumerate(sets)
+        ]
+        one, *more = (each for each in rest if len(each))
+        yield number, pose, replace(problem, observations=one, more=tuple(more), held_out=None)
+
+
+def _recalibrated(
+    previous: Calibration, problem: Problem, years: float, growth: float, new: Sequence[str]
+) -> tuple[Recalibration, Chain]:
+    """Return what comes of the poses of a problem, and the earlier arm in new frames."""
     sets = (*problem.sets, *problem.judging)
     arm = _Arm.of(previous, sets, years, growth)
     system = _system(problem, sets, previous)
@@ -151,23 +132,38 @@ def recalibrate(
         arm = replace(arm, chain=minimise(arm.chain, names, system).chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
-    columns = Columns(arm.chain, arm.names, movable)
+    columns = Columns(arm.chain, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
+    earlier = arm.changed(np.zeros(len(arm.names)))
     found = arm.solved(system)
     while len(changed) < changes.MOST_CHANGES and (
         reasons := changes.reasons_of(found.told.beside(arm.square), columns, previous.freedom)
     ):
+        if reasons[0].owner == SCALE_OF_DEVICE.owner and abs(reasons[0].change[0]) < SCALE:
+            columns = Columns(arm.chain, arm.names, movable)  # as much is usual
+            continue
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
     left = found.squares - float(found.told.vector @ found.change)
-    return Recalibration(
+    result = Recalibration(
         _updated(arm, found, problem, changed),
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
         *_judged(arm, found, system, sets),
         previous.reused(sets),
         bool(names),
+    )
+    return result, earlier
+
+
+def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
+    """Tell whether all was measured by one device whose scale would show in positions."""
+    bases = {each.base for each in sets}
+    free = len(bases) == 1 and not any(chain.frame(base).fixed for base in bases)
+    return free and all(
+        each.distances is None and each.pixels is None and not (each.socket or each.inverse)
+        for each in sets
     )
 
 

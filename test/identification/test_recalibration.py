@@ -132,6 +132,40 @@ def test_a_device_that_stands_elsewhere_and_a_new_target_are_no_change_of_the_ar
     assert {each.owner for reasons in found.changed for each in reasons} == {'base'}
 
 
+@pytest.mark.parametrize('ppm', [300.0, -500.0])
+@pytest.mark.parametrize('told', [False, True])
+def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told):
+    """Lengths of the arm that grow with the way to it are those of the device."""
+    true, previous = earlier
+    there = true
+    if told:
+        there = replace(true, base=random_frame(np.random.default_rng(3), 3.0))
+    seen = problem(there, 10, 1)
+    grown = replace(seen.observations, positions=seen.observations.positions * (1.0 + 1e-6 * ppm))
+    new = ('base',) * told
+    found = recalibrate(previous, replace(seen, observations=grown), 0.1, new=new)
+    assert not found.accepted
+    assert 1e6 * found.scale.change[0] == pytest.approx(ppm, abs=60.0)
+    assert f'another scale than before, by {ppm:+.0f}'[:-3] in found.in_words()
+    assert found.odd is None
+    assert recalibrate(previous, seen, 0.1, new=new).accepted
+
+
+@pytest.mark.parametrize('slip', [0.0, 2e-3])
+def test_one_gross_error_among_few_poses_is_named(earlier, slip):
+    true, previous = earlier
+    now = true.with_offsets({'elbow_joint.theta': slip})
+    seen = problem(now, 9, 2)
+    positions = seen.observations.positions.copy()
+    positions[3] += [0.02, -0.01, 0.03]
+    wrong = replace(seen, observations=replace(seen.observations, positions=positions))
+    found = recalibrate(previous, wrong, 0.1)
+    assert not found.accepted
+    assert found.odd == (0, 3)
+    assert 'pose 4 contradicts all others' in found.in_words()
+    assert recalibrate(previous, seen, 0.1).odd is None
+
+
 def test_another_arm_is_not_mended_by_8_poses(earlier):
     true, previous = earlier
     rng = np.random.default_rng(12)

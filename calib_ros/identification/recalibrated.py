@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What comes of bringing a calibration up to date: accepted or not, and in words."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from calib_ros.identification import changes
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import Explanation
+from calib_ros.identification.levels import ALIKE
+from calib_ros.identification.records import reused_in_words
+from calib_ros.identification.validation import ErrorFigures
+from calib_ros.shown import Shown
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Recalibration(Shown):
+    """An earlier calibration, brought up to date by some new poses.
+
+    `changed` is what has changed, one after the other: the best explanation of each change, and
+    those that cannot be told apart from it; `unexplained` is the probability of residuals as large
+    as those that are left. `before` and `after` are errors of the new poses by the earlier
+    calibration, and by what the other poses tell; `anew` tells whether there are new frames, which
+    are fitted to all of the new poses for `before`. `reused` is the share of the poses that the
+    earlier calibration was fitted to: they would count twice. `odd` is the set and the pose
+    without which the others would be accepted, if there is one.
+    """
+
+    calibration: Calibration
+    changed: tuple[tuple[Explanation, ...], ...]
+    unexplained: float
+    before: ErrorFigures
+    after: ErrorFigures
+    reused: float = 0.0
+    anew: bool = False
+    odd: tuple[int, int] | None = None
+
+    @property
+    def accepted(self) -> bool:
+        """Tell whether the result may be used."""
+        better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
+        agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
+        fits = self.unexplained > changes.FALSE and bool(agrees)
+        return fits and not (self.reused or self.scale)
+
+    @property
+    def scale(self) -> Explanation | None:
+        """Return by how much the device's scale has changed, if that explains most."""
+        first = (reasons[0] for reasons in self.changed)
+        return next((e for e in first if e.owner == changes.SCALE_OF_DEVICE.owner), None)
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            'accepted': self.accepted,
+            'reused': self.reused,
+            'changed': [changes.reasons_document(each) for each in self.changed],
+            'unexplained': self.unexplained,
+            'before': asdict(self.before),
+            'after': asdict(self.after),
+        }
+
+    def in_words(self) -> str:
+        """Return what has changed."""
+        text = (
+            f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
+            'new poses (each left out in turn)'
+        )
+        if self.accepted:
+            said = 'unchanged within what is known, brought up to date'
+            if self.changed:
+                said = '; '.join(changes.reason_in_words(each) for each in self.changed)
+            return f'accepted: {said}; {text}'
+        if self.reused:
+            why = f'{reused_in_words(self.reused)}, and give only those'
+        elif self.scale is not None:
+            size, sigma = 1e6 * self.scale.change[0], 1e6 * self.scale.sigma[0]
+            why = (
+                f'the measuring device has another scale than before, by {size:+.0f} ± '
+                f'{sigma:.0f} ppm; check it with a known length, and the temperature and pressure '
+                'set in it'
+            )
+        elif self.odd is not None:
+            where = f'pose {self.odd[1] + 1}' + f' of set {self.odd[0] + 1}' * bool(self.odd[0])
+            why = (
+                f'{where} contradicts all others, which would be accepted without it; measure it '
+                'again, or leave it out'
+            )
+        elif self.unexplained <= changes.FALSE:
+            why = 'no few parameters explain what has changed; identify anew'
+        elif self.anew:
+            why = (
+                'the earlier calibration, in new frames, fits the new poses better; keep it, or '
+                'identify anew from more poses'
+            )
+        else:
+            why = 'the new poses contradict each other; measure more'
+        return f'NOT accepted: {why}. {text}'
