@@ -198,16 +198,12 @@ def verify(
     numbers = np.unique(np.geomspace(len(moments), most, 200).astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    holds, needed, common = arm.holds(rms), None, 1.0
-    verdict = HOLDS[holds]
-    if tolerance is not None:
-        deciding = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
-        needed = int(numbers[deciding[0]]) if deciding.size else None
-        verdict = 'PASS' if upper[0] <= tolerance else 'FAIL'
-        verdict = 'UNDECIDED' if lower[0] <= tolerance < upper[0] else verdict
+    holds = arm.holds(rms)
+    decided = None if tolerance is None else _decided(tolerance, lower, upper, numbers)
+    verdict, common = decided or (HOLDS[holds], None), 1.0
     if not new_base and all(each.pixels is None for each in sets):  # which have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
-    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), verdict, needed, common)
+    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, holds, arm.reused(sets))
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
@@ -242,6 +238,17 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
             'usual (calib_ros plan --iso9283)'
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
+
+
+def _decided(
+    tolerance: float, lower: FloatArray, upper: FloatArray, numbers: Index
+) -> tuple[Verdict, int | None]:
+    """Return the verdict by the first limits, and which of the numbers of poses would decide."""
+    decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
+    needed = int(numbers[decided[0]]) if decided.size else None
+    if lower[0] <= tolerance < upper[0]:
+        return 'UNDECIDED', needed
+    return ('PASS' if upper[0] <= tolerance else 'FAIL'), needed
 
 
 def _check(

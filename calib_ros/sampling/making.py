@@ -46,36 +46,31 @@ class Maker:
         found: Piece,
         motion: Motion,
         begins: Index,
-        approach: FloatArray,
+        came: FloatArray,
         delay: float,
         sigma: float,
     ) -> Iterator[Numbered]:
         """Yield a sample of the measurements of each stop, unless these spread too much.
 
-        Stops, or the measurements themselves while the arm moves, begin at `begins` (S,), where
-        the joints came by the signs `approach` (S, n). The places are their numbers. Measurements
-        are stamped late by a `delay` [s] and scatter by `sigma` [m].
+        Stops, or the measurements themselves while the arm moves, begin at `begins` (S,), to which
+        the joints `came` (S, n) in these senses. The places are their numbers. Measurements are
+        stamped late by a `delay` [s] and scatter by `sigma` [m].
         """
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
         counts = np.diff(begins, append=len(values))
-        joints = motion.joints[begins]
-        steps = unwrapped(motion.joints - np.repeat(joints, counts, axis=0), self._revolute)
         if key.images:
-            joints = joints + mean_of_each(steps, begins, np.ones(len(steps), dtype=bool))
-            yield from self._of_images(found, begins, joints, approach, delay)
+            yield from self._of_images(found, motion, begins, came, delay)
             return
         turned = ~np.isnan(values[:, QUAT]).any(axis=1)
-        own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
-        variances = np.add.reduceat(own, begins) / counts  # of NaN where any has none
-        sigmas = np.where(np.isnan(variances), sigma, np.sqrt(variances))
-        means = averages(values[:, DISTANCE if key.distance else POSITION], begins, sigmas)
+        positions = values[:, DISTANCE if key.distance else POSITION]
+        means = averages(positions, begins, _sigmas(values, begins, sigma))
         rotations = np.tile(np.eye(3), (len(values), 1, 1))
         rotations[turned] = se3.from_quat(values[turned, QUAT])
         oriented = np.logical_and.reduceat(turned, begins).tolist()
         if motion.velocity is None:  # the chordal mean (Moakher 2002)
             rotations = se3.nearest_rotation(mean_of_each(rotations, begins, means.used))
-        joints = joints + mean_of_each(steps, begins, means.used)
+        joints = self._mean(motion.joints, begins, means.used)
         since = (stamps - np.repeat(stamps[begins], counts)).astype(np.float64)
         times = stamps[begins] + np.rint(mean_of_each(since, begins, means.used)).astype(np.int64)
         spikes = np.add.reduceat(~means.used, begins, dtype=np.intp)
@@ -99,7 +94,7 @@ class Maker:
                 position=means.values[k],
                 rotation=rotations[k] if oriented[k] else None,
                 joints=joints[k],
-                approach=approach[k],
+                approach=came[k],
                 velocity=None if motion.velocity is None else motion.velocity[k],
                 acceleration=None if motion.acceleration is None else motion.acceleration[k],
                 delay=delay,
@@ -107,12 +102,13 @@ class Maker:
             )
 
     def _of_images(
-        self, found: Piece, begins: Index, joints: FloatArray, approach: FloatArray, delay: float
+        self, found: Piece, motion: Motion, begins: Index, came: FloatArray, delay: float
     ) -> Iterator[Numbered]:
         """Yield a sample of the images of each stop, of which one will be looked at."""
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
         ends = np.append(begins[1:], len(values))
+        joints = self._mean(motion.joints, begins, np.ones(len(values), dtype=bool))
         for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):
             middle = (begin + end) // 2
             yield from self._made(
@@ -122,10 +118,17 @@ class Maker:
                 values[middle : middle + 1],
                 position=np.full(3, np.nan),
                 joints=joints[k],
-                approach=approach[k],
+                approach=came[k],
                 delay=delay,
                 images=tuple(values[begin:end, 0].astype(int).tolist()),
             )
+
+    def _mean(self, joints: FloatArray, begins: Index, used: Flags) -> FloatArray:
+        """Return the mean joint values (S, n) of those in use (N, n) at each stop."""
+        first = joints[begins]
+        counts = np.diff(begins, append=len(joints))
+        steps = unwrapped(joints - np.repeat(first, counts, axis=0), self._revolute)
+        return np.asarray(first + mean_of_each(steps, begins, used))
 
     def in_socket(self, place: str, stamp_ns: int, joints: FloatArray, came: FloatArray) -> None:
         """Make a sample of a ball in a socket, at joint values (N, n) while the arm stands.
@@ -210,6 +213,13 @@ class Maker:
     def forget(self, sample: Sample) -> None:
         """Allow a sample of the same stamp again."""
         self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
+
+
+def _sigmas(values: FloatArray, begins: Index, sigma: float) -> FloatArray:
+    """Return those (S,) [m] of stops by the covariances; `sigma` where any has none."""
+    own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
+    variances = np.add.reduceat(own, begins) / np.diff(begins, append=len(values))
+    return np.where(np.isnan(variances), sigma, np.sqrt(variances))
 
 
 def _key(sample: Sample) -> StreamKey:
