@@ -24,10 +24,8 @@ from calib_ros.identification.identification import (
 from calib_ros.identification.model_choice import identify_model as identify_model
 from calib_ros.identification.observations import Observations as Observations
 from calib_ros.identification.problem import Problem as Problem
-from calib_ros.identification.recalibration import (
-    Recalibration as Recalibration,
-    recalibrate as recalibrate,
-)
+from calib_ros.identification.recalibrated import Recalibration as Recalibration
+from calib_ros.identification.recalibration import recalibrate as recalibrate
 from calib_ros.kinematics.chain import Chain as Chain
 from calib_ros.kinematics.chain_file import dump_chain as dump_chain, load_chain as load_chain
 from calib_ros.kinematics.urdf import (

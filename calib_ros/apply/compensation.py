@@ -25,7 +25,7 @@ import numpy as np
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.inverse import Follower, Solution
+from calib_ros.kinematics.inverse import LEVER, Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import Limits
@@ -36,7 +36,7 @@ EXACT = Limits.largest_position_error
 orientation be wrong of arms that can reach every one."""
 
 
-BESIDE = 0.1
+BESIDE = LEVER / 3.0
 """Distance [m] from the tool at which what a turn does is told: the length of small tools."""
 
 

@@ -29,8 +29,9 @@ from calib_ros.identification.levels import SCALE, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.recalibrated import Recalibration as Recalibration
+from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import Fingerprint
+from calib_ros.identification.robust import OUTLIER
 from calib_ros.identification.validation import ErrorFigures, left_out, residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -38,8 +39,6 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
 
-FAR = 6.0
-"""Error of a pose, in units of those of the others, from which on it is a gross one."""
 FEWEST, SUSPECTS = 6, 4
 """Poses of which one may contradict the others, and those tried, with the largest errors."""
 
@@ -91,7 +90,7 @@ def recalibrate(
             continue
         chain = others.calibration.chain
         away = residuals(chain, (*problem.sets, *problem.judging)[number]).position[pose]
-        if others.accepted and 1e3 * np.linalg.norm(away) > FAR * others.after.rms_mm:
+        if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
             return replace(found, odd=(number, pose))
     return found
 

@@ -15,7 +15,7 @@ import calib_ros
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import FALSE, reason_in_words
 from calib_ros.identification.identification import Identification, Noise, Outlier
-from calib_ros.identification.recalibration import Recalibration
+from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
 from calib_ros.identification.region import Region
 from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow

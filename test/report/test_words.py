@@ -9,7 +9,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import in_words, verify
 from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.recalibration import Recalibration
+from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import checked, verdict
