@@ -23,9 +23,14 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
+
+
+TOOL = 1.0
+"""Length [m] that no target on a flange exceeds."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +142,8 @@ class Problem(Shown):
                     f'observations have {observations.joints.shape[1:]} joint values, chain '
                     f'"{self.chain.name}" has {joints} joints'
                 )
+            if observations.distances is not None:
+                self._check_distances(observations.distances)
             if observations.pixels is not None:
                 require_lens(self.model.frame(observations.camera).lens, observations.camera)
         sockets = {each.base for each in self.sets if each.socket}
@@ -146,6 +153,24 @@ class Problem(Shown):
                     raise UnknownNameError('socket that is a known distance away', base, sockets)
             if not distance > 0.0:
                 raise ConfigError(f'the distance of sockets must be positive, not {distance}')
+
+    def _check_distances(self, distances: FloatArray) -> None:
+        """Refuse distances that vary by more than any point on the flange can move.
+
+        Half of them tell: some may be gross errors.
+        """
+        reach = TOOL
+        for joint in self.chain.joints:
+            reach += abs(joint.a) + abs(joint.d)
+            if joint.type == 'prismatic':
+                ends = joint.lower, joint.upper
+                reach += max(np.inf if end is None else abs(end) for end in ends)
+        spread = float(np.ptp(np.percentile(distances, (25.0, 75.0)))) if len(distances) else 0.0
+        if spread > 2.0 * reach:
+            raise InputError(
+                f'the distances vary by {spread:.3g} m, more than an arm of {reach - TOOL:.3g} m '
+                'can move anything: are they in metres (--length)?'
+            )
 
     def _check_patterns(self) -> None:
         names = self.model.parameter_names

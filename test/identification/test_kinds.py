@@ -292,3 +292,16 @@ def test_frames_of_a_chain_are_told_apart_by_name(rng):
         chain.frame('base_B').matrix @ chain.forward(q),
         atol=1e-12,
     )
+
+
+@pytest.mark.parametrize('unit', [1e3, 1e2, 1.0 / 0.0254])
+def test_distances_that_no_arm_moves_by_are_no_metres(rng, unit):
+    """Told before a fit that would not end: it took minutes, and named a moved device."""
+    true = faulty(UR10E, Cell(), rng)
+    seen = wire(true, 60, rng, noise=NOISE[0])
+    wrong = replace(seen, distances=unit * seen.distances)
+    with pytest.raises(InputError, match=r'distances vary by .* are they in metres \(--length\)'):
+        Problem(UR10E, wrong, **SIGMAS)
+    typo = seen.distances.copy()
+    typo[::6] *= unit
+    Problem(UR10E, replace(seen, distances=typo), **SIGMAS)  # gross errors are for the fit
