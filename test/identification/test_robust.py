@@ -427,7 +427,7 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
 def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(loss, monkeypatch):
     """One more reweighting by 1 / distance hardly moves the start of the last phase."""
     rng, true, clean, _ = cell(0)
-    seen, _ = spoiled(clean, rng, 0.3, shift=(5e-3, 50e-3))
+    seen, _ = spoiled(clean, rng, 0.45, shift=(0.1, 1.5), turn=(0.1, 2.0))
     system = problem(seen).system([seen])
     names = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
     steps, starts, reweighted = [], [], robust.reweighted
@@ -443,9 +443,12 @@ def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(lo
 
     monkeypatch.setattr(robust, 'minimise', counted)
     monkeypatch.setattr(robust, 'reweighted', kept)
-    found = robust.robust_fit(true, names, system, loss)
+    far = true.with_offsets({'base.x': 0.5, 'base.rz': 0.5, 'tool.y': 0.3})
+    found = robust.robust_fit(far, names, system, loss)
     assert found.iterations == sum(steps)
     assert found.settled
+    size = max(1.0, found.fit.normal.rms(found.system))
+    assert found.fit.left < robust.STEP_TOLERANCE * size
     (last,) = distances_of(starts[0], names, system)
     bounded = system.weighted([1.0 / np.maximum(last, 1.0)])
     (again,) = distances_of(minimise(starts[0], names, bounded).chain, names, system)

@@ -90,7 +90,7 @@ def test_halves_are_of_every_set_and_slightly_more(rng):
     together = drawn[:, 40:].reshape(-1, 23, 3)
     np.testing.assert_array_equal(together.all(axis=2), together.any(axis=2))
     assert len(np.unique(drawn[:, :40], axis=0)) > 490  # of 658,008
-    squares = rng.random((3, 109))
+    squares = rng.random((300, 109))
     masks, sums = halves.concentrate(squares)
     for part, size in ((slice(0, 40), 25), (slice(40, 109), 44)):
         np.testing.assert_array_equal(masks[:, part].sum(axis=1), size)
@@ -107,6 +107,13 @@ def test_of_many_samples_an_even_spread_of_each_set_is_searched(counts, left, rn
     assert tuple(samples.count for samples in few.sets) == left
     share = -(-counts[0] // left[0])
     np.testing.assert_array_equal(few.sets[0].joints, system.sets[0].joints[:, ::share])
+
+
+def test_of_many_sets_each_keeps_a_tenth_of_the_poses(rng):
+    seen = measure(UR10E, UR10E.random_joints(60, rng), rng)
+    system = System((Samples(seen, 1e-4, 3e-4),) * 12)
+    few = trimmed._thinned(system)
+    assert [samples.count for samples in few.sets] == [20] * 12
 
 
 def test_the_trimmed_sum_is_that_of_the_shorter_half_of_each_set(rng):
