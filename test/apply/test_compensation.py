@@ -239,6 +239,8 @@ def test_a_command_beyond_a_limit_is_refused(side):
     assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
         refusal.reason
     )
+    tolerant = replace(compensator, largest_position_error=1.0, largest_orientation_error=1.0)
+    assert 'the command' in only_refusal(compensate(tolerant, q)).reason
     for beyond, said in ((0.5, False), (2.0, True)):  # of what a command may lie beyond a limit
         q[1, 2] = side * (np.pi + beyond * EXACT)
         reasons = ' '.join(each.reason for each in compensate(compensator, q).refusals)
@@ -382,6 +384,7 @@ def test_chains_of_other_joints_are_refused():
         (np.zeros((2, 5)), r'shape \(N, 6\), not \(2, 5\)'),
         (np.zeros((0, 6)), r'shape \(N, 6\)'),
         (np.full((2, 6), np.nan), 'joint values of point 0'),
+        (np.diag([0.0, np.nan, 0.0, 0.0, 0.0, 0.0]), 'joint values of point 1 '),
     ],
 )
 def test_wrong_joint_values_are_refused(joints, complaint):

@@ -268,6 +268,7 @@ def test_without_signs_of_the_approach_backlash_is_refused(rng):
         ('ratios', 'ratio'),
         ('excentricity', 'eccentricity'),
         ('elbow_joint.ratios', 'ratio'),
+        ('elbow_joint.ratio_2', 'ratio'),
         ('elbow_jont.ratio', 'elbow_joint'),
         ('elbow_joint.coupling_wrist', 'wrist_1_joint'),
         ('elbow_joint.gravity_hand', 'wrist_3_joint'),
