@@ -365,6 +365,7 @@ def test_approaches_are_the_last_moves():
         ({'largest_shift': np.inf}, 'largest_shift must be a positive number, not inf'),
         ({'largest_change': np.nan}, 'largest_change must be a positive number, not nan'),
         ({'orientation_weight': -1.0}, 'orientation_weight must be a positive number'),
+        ({'tool': (0.0, 0.0)}, 'tool must be three finite numbers'),
         ({'tool': (0.0, np.inf, 0.0)}, 'tool must be three finite numbers'),
     ],
 )
@@ -384,7 +385,7 @@ def test_chains_of_other_joints_are_refused():
         (np.zeros((2, 5)), r'shape \(N, 6\), not \(2, 5\)'),
         (np.zeros((0, 6)), r'shape \(N, 6\)'),
         (np.full((2, 6), np.nan), 'joint values of point 0'),
-        (np.diag([0.0, np.nan, 0.0, 0.0, 0.0, 0.0]), 'joint values of point 1 '),
+        (np.repeat([[0.0], [0.0], [np.inf]], 6, axis=1), 'joint values of point 2 '),
     ],
 )
 def test_wrong_joint_values_are_refused(joints, complaint):
