@@ -140,8 +140,8 @@ class ErrorModel:
     def _frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return frames (n + 3, 4, 3, B) along the chain and the target's (4, 3, B).
 
-        They are those before the joints, of the flange, of the world at the base, and of the
-        flange's axes at the target; q (n, B) holds effective joint values.
+        They are those before the joints, of the flange, of the world at the base, and the
+        flange's axes without an origin; q (n, B) holds effective joint values.
         """
         count, samples = q.shape
         base, walk = self.chain.frame(self._ends[0]).matrix, self.chain.walk
@@ -150,7 +150,7 @@ class ErrorModel:
         target = self.chain.at_the_tool(frames[count], self._ends[1])
         frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
         frames[count + 1, 3] += base[:3, 3, np.newaxis]
-        frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]
+        frames[count + 2, :3] = frames[count, :3]
         if self._layout.bent and walk.beta.any():  # a and alpha come before beta
             behind = frames[self._layout.behind]
             behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]

@@ -239,6 +239,8 @@ def test_a_command_beyond_a_limit_is_refused(side):
     assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
         refusal.reason
     )
+    tolerant = replace(compensator, largest_position_error=1.0, largest_orientation_error=1.0)
+    assert 'the command' in only_refusal(compensate(tolerant, q)).reason
     for beyond, said in ((0.5, False), (2.0, True)):  # of what a command may lie beyond a limit
         q[1, 2] = side * (np.pi + beyond * EXACT)
         reasons = ' '.join(each.reason for each in compensate(compensator, q).refusals)
@@ -363,6 +365,7 @@ def test_approaches_are_the_last_moves():
         ({'largest_shift': np.inf}, 'largest_shift must be a positive number, not inf'),
         ({'largest_change': np.nan}, 'largest_change must be a positive number, not nan'),
         ({'orientation_weight': -1.0}, 'orientation_weight must be a positive number'),
+        ({'tool': (0.0, 0.0)}, 'tool must be three finite numbers'),
         ({'tool': (0.0, np.inf, 0.0)}, 'tool must be three finite numbers'),
     ],
 )
@@ -382,6 +385,7 @@ def test_chains_of_other_joints_are_refused():
         (np.zeros((2, 5)), r'shape \(N, 6\), not \(2, 5\)'),
         (np.zeros((0, 6)), r'shape \(N, 6\)'),
         (np.full((2, 6), np.nan), 'joint values of point 0'),
+        (np.repeat([[0.0], [0.0], [np.inf]], 6, axis=1), 'joint values of point 2 '),
     ],
 )
 def test_wrong_joint_values_are_refused(joints, complaint):

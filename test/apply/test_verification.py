@@ -151,6 +151,9 @@ def test_pass_fail_and_undecided(cell, arm, program):
     assert 5 < near.needed < 500
     text = in_words(near)
     assert f'about {near.needed} poses' in text
+    assert f'(RMS {near.comparison.figures[1].rms_mrad:.3f} mrad)' in text
+    errors = 1e3 * near.comparison.after.position[near.group == 2]
+    assert near.each[2].after == pytest.approx(np.linalg.norm(errors.mean(axis=0)))
     heads = [line.split() for line in text.splitlines()]
     table = heads[heads.index(['pose', 'measured', 'before', 'after', 'repeatability', *_UNIT]) :]
     for k, (pose, row) in enumerate(zip(near.each, table[1:6], strict=True), 1):
@@ -227,6 +230,8 @@ def test_a_device_that_stands_elsewhere(cell, arm):
     assert found.rms == pytest.approx(same.rms, rel=0.1)
     assert found.upper / found.rms > same.upper / same.rms
     assert 'moved' not in in_words(same)
+    anew = 'fitted anew, before and after alike: base'
+    assert (anew in in_words(found), 'fitted anew' in in_words(same)) == (True, False)
 
 
 @pytest.mark.parametrize('oriented', [True, False])

@@ -7,6 +7,7 @@ import pytest
 from fits import NO_PRIOR, UR10E, arm, rms
 
 from calib_ros.apply.simulation import measure
+from calib_ros.identification import evidence
 from calib_ros.identification.considered import considered
 from calib_ros.identification.evidence import Posterior, _device, group_of
 from calib_ros.identification.identification import Problem, identify
@@ -265,3 +266,21 @@ def test_what_another_device_adds_is_what_marginalising_leaves(rng):
     alone = np.linalg.inv(full[:count, :count])
     expected = np.linalg.inv(full)[:count, :count] - alone
     np.testing.assert_allclose(found @ found.T, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_only_what_is_fitted_is_doubted(monkeypatch):
+    """Of joint values that were rounded, those whose parameters are not fitted tell nothing."""
+
+    class AskedError(Exception):
+        pass
+
+    def told_of(chain, names, system, noise, beside, *_):
+        assert (noise, beside) == (2.0, {'elbow_joint.theta': 1e-3})
+        raise AskedError
+
+    monkeypatch.setattr(evidence, 'told_of', told_of)
+    doubts = {'elbow_joint.theta': 1e-3, 'wrist_1_joint.theta': 2e-3}
+    with pytest.raises(AskedError):
+        evidence.posterior_of(
+            UR10E, UR10E, ['base.x', 'elbow_joint.theta'], System(()), 2.0, {}, doubts=doubts
+        )

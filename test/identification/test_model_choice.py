@@ -378,13 +378,15 @@ def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monke
     def identified(given, simpler=None, progress=None):
         assert (simpler is before) == bool(given.effects)
         progress(0.5)
-        return replace(richer, richer=True) if given.effects else before
+        return replace(richer, richer=True) if simpler else before
 
     def chosen(given, result, progress):
         progress(0.5)
         return ('elbow_joint.ratio',), verdicts
 
     monkeypatch.setattr(model_choice, 'identify', identified)
+    monkeypatch.setattr(model_choice, '_chosen', lambda *_: ((), verdicts))
+    assert identify_model(problem, 'auto') == replace(before, verdicts=verdicts)
     monkeypatch.setattr(model_choice, '_chosen', chosen)
     found = identify_model(problem, 'auto', lambda told: shares.append(told))
     assert found.richer is (reason is None)

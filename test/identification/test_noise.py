@@ -166,3 +166,15 @@ def test_noise_of_covariances_is_that_of_all_components_together():
     np.testing.assert_allclose(sum(shares), matrix, rtol=1e-9, atol=1e-6 * matrix.max())
     expected = variance * np.linalg.inv(matrix)
     np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-6, atol=1e-16)
+
+
+def test_a_part_with_less_than_one_degree_of_freedom_tells_its_noise():
+    """Weights that leave half an equation more than the parameters take of the positions."""
+    *_, seen = measured_arm(5, 30)
+    taken = 90.0 - found(seen)[-1]
+    least = int(np.argmax(taken))
+    weights = np.full(30, (taken[least] + 0.5) / 90.0)
+    noise, _, _, _, squares, freedom = found(seen, weights=weights)
+    assert freedom[least] == pytest.approx(0.5, abs=1e-3)
+    expected = tuple(np.sqrt(squares / freedom))
+    assert (noise.position, noise.orientation) == pytest.approx(expected, rel=1e-6)

@@ -7,6 +7,7 @@ import pytest
 from fits import UR10E, arm
 
 from calib_ros.apply.simulation import Camera, before_camera, measure, photograph
+from calib_ros.identification import samples as samples_module
 from calib_ros.identification.samples import Samples, residual_arrays, seen_residuals
 
 SPREAD = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]) + 0.5
@@ -86,3 +87,20 @@ def test_rows_of_positions_among_poses_are_those_of_each_alone(correlated):
         square = expected[same] @ np.linalg.solve(covariances[k, same, same], expected[same])
         assert whitened[k, same] @ whitened[k, same] == pytest.approx(square)
         assert found[-1, :, k] @ found[-1, :, k] == pytest.approx(square)
+
+
+@pytest.mark.parametrize('block', [3, 4, 6, 7])
+def test_rows_are_the_same_in_blocks_of_any_size(block, monkeypatch):
+    """Three, two or one of them, the last one shorter; weights count by their roots."""
+    rng = np.random.default_rng(0)
+    seen = measure(arm(0), UR10E.random_joints(7, rng), rng, 5e-5, 2e-4)
+    names, weights = UR10E.parameter_names[:9], rng.uniform(size=7)
+    whole = Samples(seen, 3e-4, 7e-4).rows_of(UR10E, names)
+    expected = np.concatenate(residual_arrays(UR10E, seen), axis=1).T
+    monkeypatch.setattr(samples_module, 'BLOCK', block)
+    found = Samples(seen, 3e-4, 7e-4).weighted(weights)
+    np.testing.assert_allclose(found.rows_of(UR10E, names), np.sqrt(weights) * whole, atol=1e-9)
+    wanted = expected / np.repeat([[3e-4], [7e-4]], 3, axis=0)
+    np.testing.assert_allclose(whole[-1], wanted, rtol=1e-6, atol=1e-9)
+    few = found.select(np.array([5, 1]))
+    np.testing.assert_allclose(few.rows_of(UR10E, names), found.rows_of(UR10E, names)[..., [5, 1]])

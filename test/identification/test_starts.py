@@ -90,6 +90,8 @@ def test_halves_are_of_every_set_and_slightly_more(rng):
     together = drawn[:, 40:].reshape(-1, 23, 3)
     np.testing.assert_array_equal(together.all(axis=2), together.any(axis=2))
     assert len(np.unique(drawn[:, :40], axis=0)) > 490  # of 658,008
+    alone = system.sets[0].select(np.zeros(4, dtype=int))  # one configuration, always drawn
+    assert _Halves(replace(system, sets=(alone,)), 0.25).draw(0.25).all()
     squares = rng.random((300, 109))
     masks, sums = halves.concentrate(squares)
     for part, size in ((slice(0, 40), 25), (slice(40, 109), 44)):

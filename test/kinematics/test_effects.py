@@ -153,6 +153,12 @@ def test_effects_may_be_a_third_of_an_arc_minute_or_one_of_what_bends():
         assert sizes.pop() == pytest.approx(minute if bends else minute / 3.0, rel=0.05)
 
 
+def test_couplings_are_those_of_the_last_three_joints():
+    found = effects.members(load_chain('kuka_iiwa14'), 'coupling')
+    pairs = [('joint_6', 'joint_5'), ('joint_7', 'joint_5'), ('joint_7', 'joint_6')]
+    assert found == tuple(f'{joint}.coupling_{other}' for joint, other in pairs)
+
+
 def by_hand(true, values, q, approach):
     """Return poses (N, 4, 4) with effects that are written out here, torques excepted."""
     moved = q.copy()
@@ -268,6 +274,7 @@ def test_without_signs_of_the_approach_backlash_is_refused(rng):
         ('ratios', 'ratio'),
         ('excentricity', 'eccentricity'),
         ('elbow_joint.ratios', 'ratio'),
+        ('elbow_joint.ratio_2', 'ratio'),
         ('elbow_jont.ratio', 'elbow_joint'),
         ('elbow_joint.coupling_wrist', 'wrist_1_joint'),
         ('elbow_joint.gravity_hand', 'wrist_3_joint'),
@@ -344,7 +351,9 @@ def test_effects_shift_joint_values_and_nothing_else(rng):
     np.testing.assert_array_equal(zero.forward(q), chain.forward(q))
 
 
-@pytest.mark.parametrize('orders', [range(1, 41), (7, 40), (2.5, 1.0, 3.0), (0, -1, 1)])
+@pytest.mark.parametrize(
+    'orders', [range(1, 41), (7, 40), (2.5, 1.0, 3.0), (1.5, 2.5), (0, -1, 1)]
+)
 def test_waves_are_sines_and_cosines_however_many(rng, orders):
     joint = UR10E.joint_names[1]
     names = [name for order in orders for name in effects.waves(joint, order)]
