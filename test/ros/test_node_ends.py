@@ -217,7 +217,9 @@ def test_a_full_disk(tmp_path, recording):
             assert said in heard[-1].status[0].message
 
         level(DiagnosticStatus.ERROR, 'poses are in memory only')
-        cell.spin_until(lambda: status[-1].data.startswith('poses are in memory only: '))
+        cell.spin_until(
+            lambda: status and status[-1].data.startswith('poses are in memory only: ')
+        )
         assert heard[-1].status[0].message.count('in memory only') == 1
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
