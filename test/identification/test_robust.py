@@ -421,7 +421,7 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
     assert min(ways, 1.0) <= found <= min(60.0 * ways, 1.0)
     mean = spare / (spare + shifts)
     tail = (share / mean) ** spare * ((1.0 - share) / (1.0 - mean)) ** shifts
-    assert found == pytest.approx(min(special.comb(30, out) * tail, 1.0), rel=1e-9)
+    assert found == pytest.approx(min(special.comb(30, out) * tail, 1.0), rel=1e-9, abs=0.0)
     second.fit.normal.cost = 0.0  # too small for a float
     assert 0.0 <= robust._chance(['a', 'b', 'c', 'd'], system, second, second) < 1e-200
 
