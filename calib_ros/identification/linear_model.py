@@ -114,7 +114,7 @@ class LinearModel:
                 rest = column[count:] - basis @ (basis.T @ column[count:])
                 rest -= basis @ (basis.T @ rest)
                 size = float(np.linalg.norm(rest))
-                if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)) and size > 0.0:
+                if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)):
                     basis = np.column_stack([basis, rest / size])
                     kept.append(name)
         return found

@@ -404,7 +404,7 @@ def test_distances_are_lengths_in_standard_deviations(dimensions):
     np.testing.assert_allclose(found[2:], expected, rtol=0.05, atol=1e-6)
 
 
-@pytest.mark.parametrize(('out', 'share'), [(2, 0.3), (5, 0.05), (5, 0.6), (0, 0.3), (5, 0.95)])
+@pytest.mark.parametrize(('out', 'share'), [(2, 0.3), (5, 0.05), (5, 0.6), (0, 0.3), (1, 0.999)])
 def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, monkeypatch):
     """Chernoff's bound is above the tail of the beta distribution, and not by far."""
     system = SimpleNamespace(rows=90, count=30, prior=SimpleNamespace(sigmas={'a': 1.0}))
@@ -416,11 +416,14 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
     monkeypatch.setattr(robust, 'minimise', lambda *_, **__: least)
     found = robust._chance(['a', 'b', 'c', 'd'], system, second, second)
     spare, shifts = 0.5 * (90 - 3 - 3 * out), 0.5 * 3 * out
-    if not out or share == 0.95:
+    if not out or share > 0.99:  # all of them, or more than left out by chance
         assert found == (1.0 if out else 0.0)
         return
     ways = special.comb(30, out) * stats.beta.cdf(share, spare, shifts)
     assert min(ways, 1.0) <= found <= min(60.0 * ways, 1.0)
+    mean = spare / (spare + shifts)
+    tail = (share / mean) ** spare * ((1.0 - share) / (1.0 - mean)) ** shifts
+    assert found == pytest.approx(min(special.comb(30, out) * tail, 1.0), rel=1e-9, abs=0.0)
     second.fit.normal.cost = 0.0  # too small for a float
     assert 0.0 <= robust._chance(['a', 'b', 'c', 'd'], system, second, second) < 1e-200
 

@@ -373,6 +373,14 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(monkeypatch):
         assert form.value == pytest.approx(np.einsum('cn,nm,cm->', own, matrix, own))
 
 
+def test_where_nothing_is_left_nothing_is_shared():
+    units = drawn(np.random.default_rng(6))
+    for part in units.parts:
+        part[-1] = 0.0
+    forms = shared_errors._Forms(units, np.zeros((0, 4)))
+    assert forms.test(0, units.links('near')) == (0.0, 0.0)
+
+
 def test_too_few_stops_share_nothing():
     """Fewer than tell how large a spread is."""
     _, true, seen = measured_arm(0, 7)
