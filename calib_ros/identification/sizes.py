@@ -48,9 +48,10 @@ def mixed(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (P,) and covariance (P, P) over means and roots that may as well be."""
     means = np.array([mean for mean, _ in solutions])
-    covariance = np.average([root @ root.T for _, root in solutions], axis=0, weights=weights)
-    spread = np.cov(means, rowvar=False, ddof=0, aweights=weights)
-    return np.average(means, axis=0, weights=weights), covariance + spread
+    mean = np.average(means, axis=0, weights=weights)
+    away = [np.outer(each - mean, each - mean) for each in means]
+    squares = [root @ root.T + more for (_, root), more in zip(solutions, away, strict=True)]
+    return mean, np.average(squares, axis=0, weights=weights)
 
 
 def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
