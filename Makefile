@@ -8,8 +8,8 @@ unexport PYTHONDONTWRITEBYTECODE
 # it trusts the certificates of the system, as behind a company's proxy.
 export UV_SYSTEM_CERTS := 1
 define packages
-{ $(BIN)/uv pip install --quiet --python $(BIN)/python $(1) \
-	|| $(BIN)/python -m pip install --quiet --disable-pip-version-check $(1); }
+{ $(BIN)/uv pip install --quiet --python $(or $(2),$(BIN)/python) $(1) \
+	|| $(or $(2),$(BIN)/python) -m pip install --quiet --disable-pip-version-check $(1); }
 endef
 
 .PHONY: demo prepared test fuzz mutants lint oldest screenshots docs clean
@@ -46,19 +46,18 @@ lint: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# The oldest versions that setup.py allows, on the Python of Ubuntu 24.04; not part of CI.
+# The oldest versions that setup.py allows: those of Ubuntu 24.04, and its Python.
 OLDEST_PYTHON ?= python3.12
 OLDEST := .venv-oldest
 OLDEST_TESTS ?= test/cli test/files test/kinematics test/identification/test_identification.py \
 	test/sampling/test_session.py test/ros/test_node.py test/test_packaging.py
 
 oldest: $(OLDEST)/installed
-	$(OLDEST)/bin/python -m pytest $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)
+	$(OLDEST)/bin/python -m pytest -n auto --dist worksteal $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)
 
-$(OLDEST)/installed: setup.py pyproject.toml test/oldest.txt
+$(OLDEST)/installed: setup.py pyproject.toml test/oldest.txt | $(BIN)/python
 	$(OLDEST_PYTHON) -m venv --clear $(OLDEST) || { echo 'needs $(OLDEST_PYTHON) with venv'; exit 1; }
-	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check \
-		--constraint test/oldest.txt --editable '.[ros,test]'
+	$(call packages,--constraint test/oldest.txt --editable '.[$(TESTS)]',$(OLDEST)/bin/python)
 	touch $@
 
 COMMANDS := bags,report,terminal
