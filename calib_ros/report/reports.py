@@ -111,6 +111,8 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     What the fit left, by its ratio to the stated noise, is that noise in the same figure. A fit of
     few poses leaves less, and does not show that an arm is good.
     """
+    if result.accepted:
+        return ()
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
         lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
