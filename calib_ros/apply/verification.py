@@ -195,7 +195,7 @@ def verify(
     lost = new_base * in_base + new_tool * in_tool
     rms = _rms(moments, lost)
     most = max(len(moments), DECIDING)
-    numbers = np.unique(np.geomspace(len(moments), most, 200).astype(int))
+    numbers = np.unique(np.geomspace(len(moments), most, 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     holds = arm.holds(rms)
