@@ -49,7 +49,7 @@ lint: $(VENV)/installed
 # The oldest versions that setup.py allows: those of Ubuntu 24.04, and its Python.
 OLDEST_PYTHON ?= python3.12
 OLDEST := .venv-oldest
-OLDEST_TESTS ?= test/cli test/files test/kinematics test/identification/test_identification.py \
+OLDEST_TESTS ?= test/apply test/cli test/files test/kinematics test/identification/test_identification.py \
 	test/sampling/test_session.py test/ros/test_node.py test/test_packaging.py
 
 oldest: $(OLDEST)/installed
