@@ -49,8 +49,9 @@ lint: $(VENV)/installed
 # The oldest versions that setup.py allows: those of Ubuntu 24.04, and its Python.
 OLDEST_PYTHON ?= python3.12
 OLDEST := .venv-oldest
-OLDEST_TESTS ?= test/apply test/cli test/files test/kinematics test/identification/test_identification.py \
-	test/sampling/test_session.py test/ros/test_node.py test/test_packaging.py
+OLDEST_TESTS ?= test/apply test/cli test/files test/kinematics \
+	test/identification/test_identification.py test/sampling/test_session.py \
+	test/ros/test_node.py test/test_packaging.py
 
 oldest: $(OLDEST)/installed
 	$(OLDEST)/bin/python -m pytest -n auto --dist worksteal $(OLDEST_TESTS) $(PYTEST_ARGUMENTS)
