@@ -130,8 +130,8 @@ def distribution(poses: Poses) -> Section:
     return section(
         'cumulated',
         f'How many {poses.things} are within an error',
-        ('' if chosen.all() else 'Outliers are left out. ')
-        + 'The further left a curve, the better.',
+        'Outliers are left out.' if poses.outlier.any() else '',
+        'The further left a curve, the better.',
         figure=figures.cumulated(before, after, poses.things),
         height=400,
     )
