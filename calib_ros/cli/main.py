@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import os
+import re
 import shlex
 import sys
 import textwrap
@@ -76,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115
     try:
         options = _options(given)
-        options.typed = shlex.join(('calib_ros', *given))
+        options.typed = re.sub('://[^/@]*@', '://', shlex.join(('calib_ros', *given)))  # no secret
         module, function = options.home.split('.')
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
         status: int = run(options, Screen(options.quiet))

@@ -81,7 +81,7 @@ class Columns:
         """Return the integers (N,) of a column, for empty cells those given if any are."""
         texts = self.texts(name)
         if re.fullmatch('(-?[0-9]{1,19},)*', ','.join([*texts, ''])):
-            with suppress(OverflowError):  # of which cell, is told below
+            with suppress(ValueError, OverflowError):  # of which cell, is told below
                 return np.array(list(map(int, texts)), dtype=np.int64)
         numbers = [
             int(blank[row])

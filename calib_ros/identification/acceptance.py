@@ -177,6 +177,8 @@ def _loss_by_chance(validation: Comparison) -> float:
     known = ~np.isnan(squares).any(axis=0)
     numbers = validation.after.configurations[known]
     _, group, sizes = np.unique(numbers, return_inverse=True, return_counts=True)
+    if len(sizes) < 2:
+        return np.inf
     means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
     error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(len(sizes))
     likely = special.stdtrit(len(sizes) - 1, CERTAIN) * error

@@ -77,6 +77,9 @@ class Explanation(Shown):
         """Return what has changed, and by how much where it is one parameter."""
         if len(self.names) > 1:
             return f'{self.owner} ({", ".join(name.kind for name in self.names)})'
+        if self.names == (SCALE_OF_DEVICE,):
+            change, sigma = 1e6 * self.change[0], 1e6 * self.sigma[0]
+            return f'the scale of the device by {change:+.0f} ± {sigma:.0f} ppm'
         unit = {'m': 'mm', 'rad': 'mrad'}.get(self.names[0].unit, self.names[0].unit)
         scale = 1e3 if unit in ('mm', 'mrad') else 1.0
         change, sigma = scale * self.change[0], scale * self.sigma[0]

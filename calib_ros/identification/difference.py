@@ -127,6 +127,8 @@ def difference(first: Calibration, second: Calibration) -> Difference:
             f'{", ".join(arms[1].joint_names)} ({arms[1].convention}) are of other robots'
         )
     names, chain, change, left = _in_parameters_of(first, second)
+    if not names:
+        raise InputError('the calibrations have fitted no parameter of the arm')
     square, lacking = np.zeros((2, len(names), len(names)))
     for number, each in enumerate((first, second), 1):
         if each.covariance is None:

@@ -119,8 +119,8 @@ class Problem(Shown):
         for name, sigma in (self.sigmas | priors).items():
             if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
-        if not isinstance(self.folds, Integral):
-            raise ConfigError(f'folds must be an integer, not {self.folds}')
+        if not isinstance(self.folds, Integral) or self.folds < 2:
+            raise ConfigError(f'folds must be an integer of at least 2, not {self.folds}')
         for name in ('fixed', 'effects'):
             if isinstance(getattr(self, name), str):
                 raise ConfigError(f'{name} must be a list of names, not "{getattr(self, name)}"')

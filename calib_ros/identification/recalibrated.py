@@ -25,8 +25,8 @@ class Recalibration(Shown):
     as those that are left. `before` and `after` are errors of the new poses by the earlier
     calibration, and by what the other poses tell; `anew` tells whether there are new frames, which
     are fitted to all of the new poses for `before`. `reused` is the share of the poses that the
-    earlier calibration was fitted to: they would count twice. `odd` is the set and the pose
-    without which the others would be accepted, if there is one.
+    earlier calibration was fitted to: they would count twice. `odd` names the pose without
+    which the others would be accepted, if there is one.
     """
 
     calibration: Calibration
@@ -36,7 +36,7 @@ class Recalibration(Shown):
     after: ErrorFigures
     reused: float = 0.0
     anew: bool = False
-    odd: tuple[int, int] | None = None
+    odd: str = ''
 
     @property
     def accepted(self) -> bool:
@@ -50,7 +50,7 @@ class Recalibration(Shown):
     def scale(self) -> Explanation | None:
         """Return by how much the device's scale has changed, if that explains most."""
         first = (reasons[0] for reasons in self.changed)
-        return next((e for e in first if e.owner == changes.SCALE_OF_DEVICE.owner), None)
+        return next((e for e in first if e.names == (changes.SCALE_OF_DEVICE,)), None)
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values."""
@@ -83,11 +83,10 @@ class Recalibration(Shown):
                 f'{sigma:.0f} ppm; check it with a known length, and the temperature and pressure '
                 'set in it'
             )
-        elif self.odd is not None:
-            where = f'pose {self.odd[1] + 1}' + f' of set {self.odd[0] + 1}' * bool(self.odd[0])
+        elif self.odd:
             why = (
-                f'{where} contradicts all others, which would be accepted without it; measure it '
-                'again, or leave it out'
+                f'{self.odd} contradicts all others, which would be accepted without it; measure '
+                'it again, or leave it out'
             )
         elif self.unexplained <= changes.FALSE:
             why = 'no few parameters explain what has changed; identify anew'

@@ -91,7 +91,9 @@ def recalibrate(
         chain = others.calibration.chain
         away = residuals(chain, (*problem.sets, *problem.judging)[number]).position[pose]
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
-            return replace(found, odd=(number, pose))
+            where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
+            held_out = 'held-out ' if number >= len(problem.sets) else ''
+            return replace(found, odd=f'{held_out}pose {pose + 1}{where}')
     return found
 
 
@@ -112,7 +114,10 @@ def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Pro
             for at, each in enumerate(sets)
         ]
         one, *more = (each for each in rest if len(each))
-        yield number, pose, replace(problem, observations=one, more=tuple(more), held_out=None)
+        left = {each.base for each in (one, *more)}
+        apart = tuple(pair for pair in problem.separations if {*pair[:2]} <= left)
+        without = replace(problem, separations=apart)
+        yield number, pose, replace(without, observations=one, more=tuple(more), held_out=None)
 
 
 def _recalibrated(
@@ -138,7 +143,7 @@ def _recalibrated(
     while len(changed) < changes.MOST_CHANGES and (
         reasons := changes.reasons_of(found.told.beside(arm.square), columns, previous.freedom)
     ):
-        if reasons[0].owner == SCALE_OF_DEVICE.owner and abs(reasons[0].change[0]) < SCALE:
+        if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
             columns = Columns(arm.chain, arm.names, movable)  # as much is usual
             continue
         changed.append(reasons)
@@ -157,9 +162,13 @@ def _recalibrated(
 
 
 def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
-    """Tell whether all was measured by one device whose scale would show in positions."""
+    """Tell whether all was measured by one device whose scale would show in positions.
+
+    The travel of prismatic joints, which no parameter stretches, would not grow with it.
+    """
     bases = {each.base for each in sets}
     free = len(bases) == 1 and not any(chain.frame(base).fixed for base in bases)
+    free = free and all(joint.type == 'revolute' for joint in chain.joints)
     return free and all(
         each.distances is None and each.pixels is None and not (each.socket or each.inverse)
         for each in sets
@@ -321,5 +330,5 @@ def _updated(
         covariance=found.covariance[np.ix_(own, own)],
         region=region,
         record=record,
-        rows=Fingerprint.of(problem.sets, previous.rows),
+        rows=Fingerprint.of((*problem.sets, *problem.judging), previous.rows),
     )

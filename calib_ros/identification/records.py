@@ -58,8 +58,10 @@ def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> Flo
     numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
     widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
     matrix = np.zeros((count, max(widths, default=0)))
+    whole = True
     for row, given, width in zip(matrix, numbers, widths, strict=True):
-        row[:width] = given
+        whole = whole and len(given) == width
+        row[:width] = given if whole else np.nan
     if not np.isfinite(matrix).all():
         raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
     return matrix

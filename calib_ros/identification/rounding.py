@@ -89,9 +89,9 @@ def may_be_rounding(
         value, level = np.unique(joints[:, number], return_inverse=True)
         if joint.name in steps and 2 * len(value) <= len(joints):
             levels[joint.driven] = level
-    if not levels:
-        return False
     arm = [name for name in names if not before.owns_frame(name)]
+    if not (levels and arm):
+        return False
     frames = [name for name in names if before.owns_frame(name)]
     chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
     wanted = list(dict.fromkeys([*frames, *arm, *levels]))

@@ -9,8 +9,9 @@ residuals, a group explains, of the remaining squares,
     e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
 
 Products of all columns are summed from the end of the session and serve every stop. Gross errors
-excluded by the robust fit are included with bounded influence, because a step may hide there;
-known distances between sockets are not, for they say nothing about time.
+excluded by the robust fit are included with bounded influence, because a step may hide there,
+unless they are fewer than a step has on the shorter side (`few_gross`). Known distances between
+sockets are not, for they say nothing about time.
 
 Unmodelled effects follow the joints, and no step in time explains more than half of their
 residuals. A drift is no step: a few cosines over the session explain it better.

@@ -36,8 +36,8 @@ class Advice:
     again: str = AGAIN
 
 
-ENOUGH = 30
-"""Different poses that are worth judging: as many as an arm of six joints has parameters."""
+ENOUGH = 25
+"""Different poses that are worth judging: as many as `calib_ros plan` chooses unless told."""
 SPREAD = 'spread over the whole workspace, with every joint moved through most of its range'
 
 
@@ -84,7 +84,7 @@ COARSE = (
     'the units.'
 )
 """What to check first where the measurements are far too coarse."""
-FEW = 'Only {} different poses were measured: too few to tell anything about the arm.'
+FEW = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
     'What is left is as if the device had a noise of {:.2g} mm in each direction; {:.2g} mm are '
     'set (sigma_position).'

@@ -18,7 +18,6 @@ from typing import Any, Literal, TypeAlias
 
 import calib_ros
 from calib_ros.report.advice import Advice
-from calib_ros.shown import some
 from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
@@ -110,8 +109,8 @@ class Report:
 
     @property
     def of(self) -> str:
-        """Return the names of what was read."""
-        return ', '.join(some([*dict.fromkeys(x.name.split('/')[0] for x in self.origin.inputs)]))
+        """Return the name of what was measured, the first that was read."""
+        return next((each.name.split('/')[0] for each in self.origin.inputs), '')
 
     @property
     def shown(self) -> tuple[Section, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.configurations import distinct
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.linear_model import COMPARED
@@ -118,7 +119,9 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
-    poses = len(np.unique(result.fitted.after.configurations))
+    held_out = () if judged is None or judged.repeated is None else (judged,)
+    numbers = (each.after.configurations for each in (result.fitted, *held_out))
+    poses = sum(map(distinct, numbers))
     return advice(
         result.refusals, Situation(poses, noise, result.noise.given.get('sigma_position'))
     )

@@ -264,7 +264,7 @@ class Collector:
         plan = Plan(self._settled_ns, self._sampled_ns)
         if self.settings.mode == 'continuous':
             for end in (*(each - self._late_ns for each in rounds[:-1]), until):
-                plan.sample(0, end)
+                plan.add(min(end, until), '')
         else:
             self._plan_stops(plan, until, rounds or (self.track.newest_ns,), ends_here)
         self._carry_out(plan)

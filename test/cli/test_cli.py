@@ -331,3 +331,13 @@ def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_pa
     assert document['warnings'] == [err.removeprefix('warning: ').rstrip('\n')]
     assert 15 < document['samples']['samples'] < 40
     assert document['warnings'][0] in (tmp_path / 'out' / 'report.md').read_text()
+
+
+def test_a_command_is_kept_without_what_logs_in(tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr('calib_ros.cli.identify._run', lambda options, _: kept.append(options))
+    url = 'memory://user:secret@host/x'
+    assert main(['identify', 'a table.csv', '--chain', 'ur10e', '--history', url]) is None
+    assert kept[0].typed == (
+        "calib_ros identify 'a table.csv' --chain ur10e --history memory://host/x"
+    )

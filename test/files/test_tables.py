@@ -249,3 +249,8 @@ def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
     warnings = read_table(path, 2).warnings
     assert len(warnings) == bool(said)
     assert all(said in each for each in warnings)
+
+
+def test_an_integer_with_separators_of_thousands_is_named_by_its_line(read):
+    with pytest.raises(InputError, match='line 2: stamp_ns must be an integer'):
+        read('stamp_ns,q1,q2,x,y,z\n"1,000",0.1,0.2,1,2,3\n')

@@ -14,7 +14,7 @@ from calib_ros.errors import ConfigError
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.records import nominal_document
+from calib_ros.identification.records import nominal_document, unpacked
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.settings import Settings
 
@@ -192,3 +192,10 @@ def test_a_record_by_which_nothing_can_be_judged_is_refused(key, value):
     parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
     with pytest.raises(ConfigError, match=f'c.yaml: calibration.{key} must be'):
         parse_calibration(calibrated_text(nominal, record | {key: value}), 'c.yaml', nominal)
+
+
+@pytest.mark.parametrize('rows', [['1', '2', '3 4 5'], ['1', '2 3', '4 5'], ['1', '2 3']])
+def test_rows_of_another_length_are_no_matrix(rows):
+    assert unpacked(['1', '2 3', '4 5 6'], 3).shape == (3, 3)
+    with pytest.raises(ValueError, match=r'rows|zip|broadcast'):
+        unpacked(rows, 3)

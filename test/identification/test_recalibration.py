@@ -15,6 +15,7 @@ from calib_ros.cli.main import main
 from calib_ros.errors import InputError
 from calib_ros.files.tables import read_table
 from calib_ros.identification.calibration import Calibration, parse_calibration
+from calib_ros.identification.changes import SCALE_OF_DEVICE, Explanation
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since
@@ -147,8 +148,14 @@ def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told)
     assert not found.accepted
     assert 1e6 * found.scale.change[0] == pytest.approx(ppm, abs=60.0)
     assert f'another scale than before, by {ppm:+.0f}'[:-3] in found.in_words()
-    assert found.odd is None
+    assert not found.odd
     assert recalibrate(previous, seen, 0.1, new=new).accepted
+
+
+def test_a_scale_is_told_in_ppm():
+    ppm = np.array([2.5e-4])
+    told = Explanation('device', (SCALE_OF_DEVICE,), 9.0, 0.0, 1.0, ppm, 0.1 * ppm)
+    assert told.in_words() == 'the scale of the device by +250 ± 25 ppm'
 
 
 @pytest.mark.parametrize('slip', [0.0, 2e-3])
@@ -161,9 +168,9 @@ def test_one_gross_error_among_few_poses_is_named(earlier, slip):
     wrong = replace(seen, observations=replace(seen.observations, positions=positions))
     found = recalibrate(previous, wrong, 0.1)
     assert not found.accepted
-    assert found.odd == (0, 3)
+    assert found.odd == 'pose 4'
     assert 'pose 4 contradicts all others' in found.in_words()
-    assert recalibrate(previous, seen, 0.1).odd is None
+    assert not recalibrate(previous, seen, 0.1).odd
 
 
 def test_another_arm_is_not_mended_by_8_poses(earlier):
