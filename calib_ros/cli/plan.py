@@ -23,6 +23,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told
+from calib_ros.report.advice import ENOUGH
 from calib_ros.report.applied import plan_report
 
 TESTS = (
@@ -91,7 +92,7 @@ def _measurement(
         fewest = planning.fewest(design, candidates, task, 1e-3 * options.accuracy, **choice)
         needed = len(fewest)
         chosen = fewest if options.poses in (None, needed) else None
-    count = options.poses or needed or 25
+    count = options.poses or needed or ENOUGH
     choice |= {'velocities': np.broadcast_to(options.velocity, size), 'chosen': chosen}
     plan = planning.plan(design, candidates, task, count, **choice)
     words = planning.in_words(plan, len(candidates), options.accuracy, needed)

@@ -32,7 +32,7 @@ from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.steps import Step
-from calib_ros.identification.validation import COUNTS, Comparison, log_gain
+from calib_ros.identification.validation import COUNTS, Comparison, log_gain, mean_squares
 from calib_ros.shown import some
 
 if TYPE_CHECKING:
@@ -172,16 +172,13 @@ def _loss_by_chance(validation: Comparison) -> float:
     A gross error far larger than the correction gets larger or smaller by it as chance will have
     it: Student's t of the differences of squares, to which one outlier is one.
     """
-    both = (validation.before.position, validation.after.position)
-    squares = np.stack([(each**2).sum(axis=1) for each in both])
-    known = ~np.isnan(squares).any(axis=0)
-    numbers = validation.after.configurations[known]
-    _, group, sizes = np.unique(numbers, return_inverse=True, return_counts=True)
-    if len(sizes) < 2:
+    before, after = validation.before, validation.after
+    means = mean_squares(before.position, after.position, after.configurations)
+    count = means.shape[1]
+    if count < 2:
         return np.inf
-    means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
-    error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(len(sizes))
-    likely = special.stdtrit(len(sizes) - 1, CERTAIN) * error
+    error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(count)
+    likely = special.stdtrit(count - 1, CERTAIN) * error
     return 0.5 * float(likely / max(means[0].mean(), 1e-300))
 
 

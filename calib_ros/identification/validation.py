@@ -23,7 +23,7 @@ from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.shown import Shown, as_frame
 
 COUNTS = 0.005
@@ -370,6 +370,14 @@ def _leave_one_place_out(
     )
 
 
+def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:
+    """Return the mean squared errors (2, K) of K configurations by errors (N, 3) of pairs."""
+    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
+    known = ~np.isnan(squares).any(axis=0)
+    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+
+
 def log_gain(
     before: FloatArray,
     after: FloatArray,
@@ -381,13 +389,10 @@ def log_gain(
     Errors are (N, 3). The standard error is that of the difference of the two logarithms by the
     delta method, from the spread over configurations, because pairs of one are not independent.
     """
-    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
-    known = ~np.isnan(squares).any(axis=0)
-    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
-    count = len(sizes)
+    means = mean_squares(before, after, configurations)
+    count = means.shape[1]
     if count < 2:
         return 0.0, np.inf
-    means = np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
     totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
     deviation = np.diff(means / totals, axis=0).std(ddof=1)
     limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
