@@ -41,7 +41,7 @@ from calib_ros.kinematics.chain_file import (
     table_hash,
 )
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
 
@@ -135,7 +135,7 @@ class Calibration(Shown):
         before, after = self.before.forward(joints), self.chain.forward(joints)
         turn = se3.log_rotation(before[:, :3, :3] @ np.swapaxes(after[:, :3, :3], 1, 2))
         shift = before[:, :3, 3] - after[:, :3, 3]
-        return np.linalg.norm(shift, axis=1), np.linalg.norm(turn, axis=1)
+        return norms(shift), norms(turn)
 
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the standard deviation (N,) [m] of predicted positions; NaN if not known.

@@ -36,7 +36,7 @@ from calib_ros.identification.validation import ErrorFigures, left_out, residual
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
 
 FEWEST, SUSPECTS = 6, 4
@@ -100,7 +100,7 @@ def recalibrate(
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
     """Yield set and pose of those with the largest errors by a chain, and all without it."""
     sets = (*problem.sets, *problem.judging)
-    sizes = [np.linalg.norm(residuals(chain, each).position, axis=1) for each in sets]
+    sizes = [norms(residuals(chain, each).position) for each in sets]
     order = np.argsort(-np.concatenate(sizes))
     if not len(order) >= FEWEST or any(each.pixels is not None for each in sets):
         return

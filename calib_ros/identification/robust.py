@@ -35,7 +35,7 @@ from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, m
 from calib_ros.identification.levels import ALIKE, SURE
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum, unknown
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
@@ -222,7 +222,7 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
     for samples in system.sets:
         largest = np.zeros(samples.count)
         for part, row in samples.misfits(chain):
-            length = np.linalg.norm(part, axis=1) / np.sqrt(share)
+            length = norms(part) / np.sqrt(share)
             known = ~np.isnan(length)
             if known.any():
                 scale = np.median(length[known]) / _median_length(part.shape[1])

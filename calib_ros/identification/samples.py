@@ -28,7 +28,7 @@ from calib_ros.kinematics.lens import require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 
-Block: TypeAlias = tuple[slice | NDArray[np.intp], FloatArray, FloatArray, ErrorModel]
+Block: TypeAlias = tuple[slice, FloatArray, FloatArray, ErrorModel]
 Both: TypeAlias = tuple[FloatArray, FloatArray]
 """Residuals by position and orientation, or in the image and at the board."""
 
@@ -88,8 +88,8 @@ class Samples:
 
         Yields
         ------
-        which : slice or (B,)
-            The samples; of what shares rows the first.
+        which : slice
+            The samples.
         shift : (P + 1, c, B)
             Weighted derivative of the residual; the last row is the residual.
         turn : (P_rotational + 1, 3, B) or (0, 0, 0)
@@ -135,12 +135,15 @@ class Samples:
         """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
         size = len(names) + 1
         found = np.zeros((count, 2, size, size))
-        order = np.arange(size)
-        for which, shift, turn, model in self.blocks(chain, names):
+        order, samples, ends = np.arange(size), self, np.array([0, self.count])
+        if folds is not None:  # one after the other
+            samples = self.select(np.argsort(folds, kind='stable'))
+            ends = np.append(0, np.cumsum(np.bincount(folds, minlength=count)))
+        for which, shift, turn, model in samples.blocks(chain, names):
             last = len(turn) - 1
-            here = None if folds is None else folds[which]
-            for fold, (by_position, by_orientation) in enumerate(found):
-                part = slice(None) if here is None else np.flatnonzero(here == fold)
+            cuts = np.clip(ends - which.start, 0, shift.shape[2]).tolist()
+            for (by_position, by_orientation), *cut in zip(found, cuts, cuts[1:], strict=False):
+                part = slice(*cut)
                 rows = shift[..., part].reshape(size, -1)
                 by_position += rows @ rows.T
                 if last >= 0:

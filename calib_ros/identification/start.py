@@ -37,7 +37,7 @@ from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, norms
 
 GOOD = 0.03
 """A start is taken without a search when its RMS error is below this share of the spread."""
@@ -101,7 +101,7 @@ def _start_one(
             known = normal if len(told) == len(names) else None
             fitted = minimise(start, told, system, tolerance=1e-3, normal=known).chain
             # the median, which gross errors do not touch
-            error = np.median(np.linalg.norm(residual_arrays(fitted, subset)[0], axis=1))
+            error = np.median(norms(residual_arrays(fitted, subset)[0]))
             if error < least:
                 best, least, determined = fitted, error, told
         if least <= GOOD * spread:

@@ -23,7 +23,7 @@ from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame
 
 COUNTS = 0.005
@@ -88,10 +88,9 @@ class Residuals:
 
     def figures(self, which: NDArray[np.bool_]) -> ErrorFigures:
         """Return RMS, mean and maximum over the pairs of a mask (N,)."""
-        distance = 1e3 * np.linalg.norm(self.position[which], axis=1)
-        angle = 1e3 * np.linalg.norm(self.orientation[which], axis=1)
-        angle = angle[~np.isnan(angle)]
-        away = np.linalg.norm(self.pixels[which], axis=1)
+        parts = self.position, self.orientation, self.pixels
+        distance, angle, away = (norms(part[which]) for part in parts)
+        distance, angle = 1e3 * distance, 1e3 * angle[~np.isnan(angle)]
         away = away[~np.isnan(away)]
         return ErrorFigures(
             len(distance),
@@ -146,6 +145,8 @@ class Comparison(Shown):
     @cached_property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after with outliers."""
+        if not self.outliers:
+            return self.figures
         everything = np.ones_like(self.judged)
         return self.before.figures(everything), self.after.figures(everything)
 

@@ -123,6 +123,11 @@ def cross(first: FloatArray, second: FloatArray, out: FloatArray | None = None) 
     return found
 
 
+def norms(vectors: FloatArray) -> FloatArray:
+    """Return the lengths (N,) of vectors (N, c) in a third of the time of `np.linalg.norm`."""
+    return np.asarray(np.sqrt(np.einsum('nc,nc->n', vectors, vectors)))
+
+
 def left_jacobian_inverse(vector: FloatArray) -> FloatArray:
     """Return J_l(v)^-1 (3, 3) (Chirikjian 2012).
 
