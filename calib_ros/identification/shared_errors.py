@@ -22,7 +22,7 @@ the parameters is then H^-1 (J^T V J) H^-1.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +31,7 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from calib_ros.identification.leastsquares import Fit, System
+from calib_ros.identification.leastsquares import Fit, System, gram
 from calib_ros.identification.levels import CERTAIN, TELLING
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
@@ -185,34 +185,25 @@ class _Forms:
             self._known[part] = each.any(axis=0).T.astype(float)
             self.parts.append(part)
 
-    def _form(self, part: int, matrix: FloatArray) -> _Form:
-        basis, residual = self._basis[part], self._residual[part]
-        product = self._product(part, matrix)
-        return _Form(
-            part,
-            matrix,
-            product,
-            _inner(basis, product),
-            float((residual * (matrix @ residual)).sum()),
-        )
+    def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
+        """Return (F, F) the traces tr(A B C B) of forms, whose matrices (K, n, n) are by part."""
+        inner, alone = list[FloatArray](), list[FloatArray]()
+        for part, own in matrices.items():
+            basis, known, count = self._basis[part], self._known[part], len(own)
+            products = np.matmul(own, basis.reshape(len(basis), -1))
+            products = products.reshape(count, *basis.shape) * known[:, :, np.newaxis]
+            columns = basis.reshape(-1, basis.shape[2])
+            crossed = np.matmul(columns.T, products.reshape(count, *columns.shape))
+            inner.append(crossed.reshape(count, -1))
+            flat = own.reshape(count, -1)
+            both = (flat * (known @ known.T).ravel()) @ flat.T
+            alone.append(both - 2.0 * gram(products))
+        return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
 
-    def _product(self, part: int, matrix: FloatArray | csr_array) -> FloatArray:
-        """Return A Q (n, c, P), zero in rows that were not measured."""
-        basis = self._basis[part]
-        product = (matrix @ basis.reshape(len(basis), -1)).reshape(basis.shape)
-        return np.asarray(product * self._known[part][:, :, np.newaxis])
-
-    def _moments(self, forms: Sequence[_Form]) -> FloatArray:
-        """Return (F, F) the traces tr(A B C B) of forms A and C."""
-        inner = _flat(form.inner for form in forms)
-        found = inner @ inner.T
-        for part, known in self._known.items():
-            own = [k for k, form in enumerate(forms) if form.part == part]
-            matrices = _flat(forms[k].matrix for k in own)
-            products = _flat(forms[k].product for k in own)
-            both = (matrices * (known @ known.T).ravel()) @ matrices.T
-            found[np.ix_(own, own)] += both - 2.0 * (products @ products.T)
-        return np.asarray(found)
+    def _values(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
+        """Return (F,) the forms r^T A r."""
+        pairs = [(self._residual[part], own) for part, own in matrices.items()]
+        return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
     def test(self, part: int, links: csr_array) -> tuple[float, float]:
         """Return the correlation of linked residuals beyond the expected one, and its score.
@@ -220,7 +211,8 @@ class _Forms:
         The score is standard normal where nothing is shared.
         """
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
-        product = self._product(part, links)
+        product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
+        product *= known[:, :, np.newaxis]
         white, linked = _inner(basis, basis), _inner(basis, product)
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())
@@ -242,11 +234,11 @@ class _Forms:
         white = np.eye(len(self._units))
         every = dict.fromkeys(kernel for own in kernels.values() for kernel in own)
         known = {kernel: self._units.kernel(*kernel) for kernel in every}
-        forms = []
-        for part in self.parts:
-            matrices = [white, *(known[kernel] for kernel in kernels.get(part, ()))]
-            forms += [self._form(part, matrix) for matrix in matrices]
-        moments = self._moments(forms)
+        matrices = {
+            part: np.array([white, *(known[kernel] for kernel in kernels.get(part, ()))])
+            for part in self.parts
+        }
+        moments = self._moments(matrices)
         scale = np.sqrt(np.maximum(np.diag(moments), HALF_THE_DIGITS))
         scaled = moments / np.outer(scale, scale)
         # the covariance of the forms under white noise weighs the equations; those of no spread,
@@ -254,29 +246,10 @@ class _Forms:
         squares, directions = linalg.eigh(scaled)
         told = squares > HALF_THE_DIGITS * squares[-1]
         roots, directions = np.sqrt(squares[told]), directions[:, told]
-        values = np.array([form.value for form in forms]) / scale
-        found = optimize.nnls(roots[:, np.newaxis] * directions.T, values @ directions / roots)[0]
-        sizes = found / scale
-        return {
-            part: sizes[[k for k, form in enumerate(forms) if form.part == part]]
-            for part in self.parts
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class _Form:
-    """A form r^T A r of one part: A (n, n), A Q (n, c, P), Q^T A Q (P, P), and its value."""
-
-    part: int
-    matrix: FloatArray
-    product: FloatArray
-    inner: FloatArray
-    value: float
-
-
-def _flat(arrays: Iterable[FloatArray]) -> FloatArray:
-    """Return arrays as rows of one."""
-    return np.array([each.ravel() for each in arrays])
+        values = self._values(matrices) / scale
+        sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, values @ directions / roots)[0]
+        ends = np.cumsum([len(own) for own in matrices.values()])[:-1]
+        return dict(zip(self.parts, np.split(sizes / scale, ends), strict=True))
 
 
 def _inner(first: FloatArray, second: FloatArray) -> FloatArray:

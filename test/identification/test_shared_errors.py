@@ -234,7 +234,8 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
         [np.trace(whole(*first) @ left @ whole(*second) @ left) for second in cases]
         for first in cases
     ]
-    found = forms._moments([forms._form(*case) for case in cases])
+    matrices = np.array([units.kernel(*kernel) for kernel in kernels])
+    found = forms._moments(dict.fromkeys((0, 1), matrices))
     np.testing.assert_allclose(found, expected, atol=1e-9)
     links = units.links('successive')
     dense = whole(1, links.toarray())
@@ -353,14 +354,12 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(monkeypatch):
     assert forms.parts == [0, 1]
     kernels = {0: [('successive', 5.0), ('near', 0.5)], 1: [('near', 0.5)]}
     truth = [np.array([2.0, 0.0, 0.7]), np.array([0.3, 5.0])]
-    cases = [(k, m) for k in (0, 1) for m in (None, *kernels[k])]
-    matrices = [np.eye(20) if kernel is None else units.kernel(*kernel) for _, kernel in cases]
-    every = [forms._form(part, m) for (part, _), m in zip(cases, matrices, strict=True)]
-    values = forms._moments(every) @ np.concatenate(truth)
-    plain, left = forms._form, iter(values.tolist())
-    monkeypatch.setattr(
-        forms, '_form', lambda part, matrix: replace(plain(part, matrix), value=next(left))
-    )
+    matrices = {
+        part: np.array([np.eye(20), *(units.kernel(*kernel) for kernel in own)])
+        for part, own in kernels.items()
+    }
+    values, expected = forms._values(matrices), forms._moments(matrices) @ np.concatenate(truth)
+    monkeypatch.setattr(forms, '_values', lambda _: expected)
     found = forms.sizes(kernels)
     for part in (0, 1):
         np.testing.assert_allclose(found[part], truth[part], rtol=1e-6, atol=1e-9)
@@ -368,9 +367,9 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(monkeypatch):
     rows = [part[:-1].reshape(4, -1).T for part in units.parts]
     basis = np.linalg.qr(np.concatenate([*rows, extra]))[0]
     residual -= basis @ (basis.T @ residual)
-    for (part, _), matrix, form in zip(cases, matrices, every, strict=True):
-        own = residual[60 * part : 60 * part + 60].reshape(3, 20)
-        assert form.value == pytest.approx(np.einsum('cn,nm,cm->', own, matrix, own))
+    own = residual[:120].reshape(2, 3, 20)
+    forms = [np.einsum('cn,knm,cm->k', own[part], matrices[part], own[part]) for part in (0, 1)]
+    np.testing.assert_allclose(values, np.concatenate(forms))
 
 
 def test_where_nothing_is_left_nothing_is_shared():
