@@ -115,10 +115,15 @@ def sigma_of(
     found = np.empty(len(joints))
     for first in range(0, len(joints), BLOCK):
         part = slice(first, first + BLOCK)
-        rows = model.jacobian(joints[part])[:, components]
-        flat = rows.reshape(-1, rows.shape[2])
-        found[part] = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
-    return np.sqrt(np.maximum(found, 0.0))
+        found[part] = _sizes(model.jacobian(joints[part])[:, components], square)
+    return found
+
+
+def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
+    """Return the expected sizes (N,) of what rows (N, c, P) make of errors of squares (P, P)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
@@ -170,18 +175,18 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    model = ErrorModel(posterior.chain, posterior.names, *ends)
-    near, far = (sigma_of(model, posterior.square, each) for each in (measured, drawn))
+    judge, count = _Judge(posterior, *ends, freedom), len(posterior.names)
+    here, there = (judge.rows(each) for each in (measured, drawn))
+    near, far = (_sizes(rows[..., :count], posterior.square) for rows in (here, there))
     order, limit = np.argsort(far), float(near.max())
-    judge = _Judge(posterior, *ends, freedom)
-    own, inside = judge.products(measured), far[order] <= limit
-    inner = own + judge.products(drawn[order[inside]])
+    own, inside = judge.products(here), far[order] <= limit
+    inner = own + judge.products(there[order[inside]])
     if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
         return None
     shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
-        added = judge.products(drawn[shell])
+        added = judge.products(there[shell])
         if not judge.risk(added, inner + added) < RISK:
             break
         inner, limit = inner + added, float(far[shell[-1]])
@@ -199,16 +204,25 @@ class _Judge:
         arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
         frames = [*parameters_of(base), *parameters_of(tool)[:3]]
         self._placed, self._freedom = len(frames), freedom
-        self._model = ErrorModel(chain, [*frames, *(names[k] for k in arm)], base, tool)
+        every = list(dict.fromkeys([*names, *frames]))
+        self._model = ErrorModel(chain, every, base, tool)
+        self._own = [*map(every.index, frames), *arm]
         self._offsets = posterior.offsets[arm]
         weights, means, covariances = zip(*posterior.doubted, strict=True)
         self._weights, self._means = np.array(weights), np.array(means)[:, arm]
         self._covariances = np.array(covariances)[:, arm][:, :, arm]
 
-    def products(self, joints: FloatArray) -> FloatArray:
-        """Return (K, K) the products of the columns with each other, over poses at (N, n)."""
-        rows = self._model.jacobian(joints)[:, :3].reshape(-1, len(self._model.names))
-        return np.asarray(rows.T @ rows)
+    def rows(self, joints: FloatArray) -> FloatArray:
+        """Return the rows (N, 3, P + F) of positions at joint values (N, n).
+
+        Columns are those of the posterior's names, then of frames that are not among them.
+        """
+        return self._model.jacobian(joints)[:, :3]
+
+    def products(self, rows: FloatArray) -> FloatArray:
+        """Return (K, K) the products of columns of frames, then of the arm, over some rows."""
+        flat = rows[..., self._own].reshape(-1, len(self._own))
+        return np.asarray(flat.T @ flat)
 
     def risk(self, which: FloatArray, around: FloatArray) -> float:
         """Return it for some poses, in frames fitted to those around; both by their products."""
