@@ -43,7 +43,8 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.files.export import converted
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 

@@ -48,7 +48,8 @@ from calib_ros.apply.planning import choose
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.workspace import place
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import transform

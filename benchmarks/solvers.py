@@ -65,7 +65,8 @@ def _positions(given):
 
 def ours(given):
     """Identify with everything: frames, rank, gross errors, covariance, residuals, judgement."""
-    from calib_ros.identification.identification import Problem, identify
+    from calib_ros.identification.identification import identify
+    from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain_file import load_chain
 
     judge = np.fromfile(given.folder / 'judge.bin')
@@ -148,7 +149,7 @@ def scipy(given):
     """Fit with scipy's least squares; the Jacobian is that of our error model, all at once."""
     from scipy.optimize import least_squares
 
-    from calib_ros.identification.identification import residuals
+    from calib_ros.identification.validation import residuals
     from calib_ros.kinematics.jacobian import ErrorModel
 
     start, names, sigmas = _start(given)

@@ -17,15 +17,13 @@ from calib_ros.identification.difference import (
     Difference as Difference,
     difference as difference,
 )
-from calib_ros.identification.identification import (
-    Identification as Identification,
-    identify as identify,
-)
+from calib_ros.identification.identification import identify as identify
 from calib_ros.identification.model_choice import identify_model as identify_model
 from calib_ros.identification.observations import Observations as Observations
 from calib_ros.identification.problem import Problem as Problem
 from calib_ros.identification.recalibrated import Recalibration as Recalibration
 from calib_ros.identification.recalibration import recalibrate as recalibrate
+from calib_ros.identification.result import Identification as Identification
 from calib_ros.kinematics.chain import Chain as Chain
 from calib_ros.kinematics.chain_file import dump_chain as dump_chain, load_chain as load_chain
 from calib_ros.kinematics.urdf import (

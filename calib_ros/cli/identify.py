@@ -19,11 +19,11 @@ from calib_ros.files import boards
 from calib_ros.files.history import identified as row_of
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import Identification
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.recalibration import recalibrate, years_since
+from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of

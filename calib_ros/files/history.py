@@ -30,8 +30,8 @@ from calib_ros.apply.confidence import rms_interval
 from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.identification.identification import Identification
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_document, parse_chain

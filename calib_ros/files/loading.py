@@ -15,11 +15,11 @@ from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import Table, read_table
-from calib_ros.identification.identification import Identification
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.records import Owner
+from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.sample import named

@@ -22,7 +22,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,12 +30,10 @@ from scipy import special
 from calib_ros.identification.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.result import Identification
 from calib_ros.identification.steps import Step
 from calib_ros.identification.validation import COUNTS, Comparison, log_gain, mean_squares
 from calib_ros.shown import some
-
-if TYPE_CHECKING:
-    from calib_ros.identification.identification import Identification
 
 
 def refusals(

@@ -11,194 +11,32 @@ need no guess, gauge freedoms found and named, and a judgement on poses that wer
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from scipy import special
 
-from calib_ros.errors import ConfigError, InputError
+from calib_ros.errors import InputError
 from calib_ros.identification import identifiability, mistakes, suspicions
 from calib_ros.identification.acceptance import refusals, remarks
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.considered import considered
 from calib_ros.identification.drift import chance_of_gain
-from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.fitting import SOME, Fitted, Simpler, fit, parameter_rows
 from calib_ros.identification.leastsquares import System, minimise, normal_equations
-from calib_ros.identification.levels import KNOWN
-from calib_ros.identification.misfits import Outlier, arms_own, outliers_of
-from calib_ros.identification.noise import Noise
+from calib_ros.identification.misfits import arms_own, outliers_of
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Reason
-from calib_ros.identification.region import Region, region_of
+from calib_ros.identification.region import region_of
+from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
-from calib_ros.identification.steps import Step, find_step
+from calib_ros.identification.steps import find_step
 from calib_ros.identification.validation import (
-    Comparison,
     ParameterRow,
     compare,
-    residuals,
     validate,
 )
-from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.shown import Shown, as_frame, as_html
-
-__all__ = ['Identification', 'Noise', 'Outlier', 'Problem', 'identify', 'residuals']
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Identification(Shown):
-    """The result; a poor fit is data in it, not an error."""
-
-    chain: Chain
-    before: Chain
-    """The nominal chain. Both have fitted frames."""
-    parameters: tuple[ParameterRow, ...]
-    """Every parameter of the model."""
-    names: tuple[str, ...]
-    """Fitted parameters, (P,)."""
-    uncertainty: identifiability.Uncertainty
-    """Their covariance for the noise found in the residuals."""
-    fitted: Comparison
-    """Residuals on the fitted pairs."""
-    validation: Comparison | None
-    """Residuals on pairs that were not fitted; None where there are too few poses for that."""
-    validated_by: str
-    """How these pairs were held out."""
-    noise: Noise
-    distances: tuple[FloatArray, ...]
-    """Size (N,) of the residuals of each set's samples, in the usual one (`robust.py`)."""
-    outliers: tuple[Outlier, ...]
-    """Samples of gross error; they carry no or little weight in the fit."""
-    gauges: dict[str, list[str]]
-    """For each parameter that was left out, the fitted ones that it trades against."""
-    observability: identifiability.Observability
-    priors: dict[str, float]
-    """Standard deviations [m, rad] that were known before."""
-    world_frame: str
-    iterations: int
-    converged: bool
-    chance: float | None
-    """Probability that errors shared by what was measured in succession, as of a drifting tracker,
-    would let the arm's parameters explain as much. None for a target in sockets."""
-    refusals: tuple[Reason, ...]
-    """Rules of acceptance that failed, in words; none when the result is accepted."""
-    posterior: Posterior
-    """What is known of the arm, effects that the model leaves out included."""
-    region: Region | None
-    """Where the calibration may be used; None where it may not be used anywhere."""
-    weak: tuple[str, ...] = ()
-    """Parameters that the poses hardly determine, held near their nominal values by a prior of the
-    size that this arm's errors have."""
-    verdicts: tuple[effects.Verdict, ...] = ()
-    """Where the model was chosen: what paid for itself and what did not."""
-    step: Step | None = None
-    """What moved while it was measured (`steps.py`)."""
-    remarks: tuple[str, ...] = ()
-    """What is suspicious though the figures are good, and what to do (`suspicions.py`)."""
-    coupled: bool = False
-    """Whether couplings of the wrist that are not fitted explain most of what is left."""
-    images: int = 0
-    """How many images of a board were fitted."""
-
-    @property
-    def accepted(self) -> bool:
-        """Tell whether the result may replace the nominal parameters."""
-        return not self.refusals
-
-    @property
-    def rank(self) -> int:
-        """Return the number of parameters that the poses determine."""
-        return len(self.names)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Return the covariance (P, P) of the fitted parameters."""
-        return self.uncertainty.covariance
-
-    @property
-    def unidentifiable(self) -> tuple[str, ...]:
-        """Return the parameters that were free but could not be determined."""
-        return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))
-
-    @property
-    def not_excited(self) -> tuple[Parameter, ...]:
-        """Return those of them that other poses would determine."""
-        return tuple(p.name for p in self.parameters if p.status == 'not excited')
-
-    def pose_covariance(self, q: FloatArray) -> FloatArray:
-        """Return the expected squares (N, 6, 6) [m, rad] of errors of the pose at q (N, n).
-
-        From the uncertainty of the parameters, and of effects that the model leaves out; position
-        and rotation in world axes.
-        """
-        return self.posterior.expected(q)
-
-    def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
-        """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
-
-        By the F distribution where the size of the noise was estimated from the residuals, by
-        chi-squared (its limit) where the sigmas given are right.
-        """
-        if not 0.0 < level < 1.0:
-            raise ConfigError(f'level must be between 0 and 1, as 0.95, not {level}')
-        jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
-        sources = self.uncertainty.parts
-        shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
-        freedom = self.uncertainty.freedom_of(shares)
-        values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
-        square = 3.0 * special.fdtri(3, np.minimum(freedom, KNOWN), level)
-        square = np.where(freedom > KNOWN, special.chdtri(3, 1.0 - level), square)
-        length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))
-        return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
-
-    def predicted_sigma(self, count: int = 300) -> FloatArray:
-        """Return standard deviations (count,) [m] of positions predicted all over the joint range.
-
-        The root of the trace of the position's covariance, at seeded random configurations.
-        """
-        q = self.chain.random_joints(count, np.random.default_rng(0))
-        return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
-
-    def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
-        """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
-        return identifiability.correlated(self.covariance, self.names, threshold)
-
-    def to_frame(self) -> Any:
-        """Return the parameters as a pandas.DataFrame [m, rad]; `within_95` are half widths."""
-        rows = self.parameters
-        return as_frame(
-            {
-                'parameter': [str(p.name) for p in rows],
-                'value': [p.value for p in rows],
-                'offset': [p.offset for p in rows],
-                'std': [p.std for p in rows],
-                'within_95': [p.half_width() for p in rows],
-                'unit': [p.name.unit for p in rows],
-                'status': [p.status for p in rows],
-            }
-        )
-
-    def _repr_html_(self) -> str:
-        """Return the verdict, its reasons and what was fitted, for notebooks."""
-        before, after = (self.validation or self.fitted).figures
-        rows = [('parameter', 'offset [mm, mrad]', '± (95 %)')]
-        rows += [
-            (str(p.name), f'{1e3 * p.offset:+.4f}', f'{1e3 * (p.half_width() or 0.0):.4f}')
-            for p in self.parameters
-            if p.std is not None
-        ]
-        figures = f'RMS {before.rms_mm:.3f} → {after.rms_mm:.3f} mm, by {self.validated_by}'
-        verdict = 'accepted' if self.accepted else 'not accepted'
-        notes = (figures, *self.refusals, *self.remarks)
-        return as_html(f'{self.chain.name}: {verdict}', notes, rows)
 
 
 def identify(

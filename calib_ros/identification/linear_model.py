@@ -18,11 +18,11 @@ from scipy import linalg
 
 from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
-from calib_ros.identification.identification import Identification
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
+from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import COUNTS, log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict

@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
+from calib_ros.identification.result import Identification
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms, movable
 from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
@@ -39,9 +40,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.se3 import FloatArray
-
-if TYPE_CHECKING:
-    from calib_ros.identification.identification import Identification
 
 POLISHED = 6
 """Suspects that are polished (benchmarks/mistakes.py)."""

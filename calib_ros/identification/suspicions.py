@@ -26,7 +26,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import special
@@ -36,6 +35,7 @@ from calib_ros.identification.leastsquares import stacked
 from calib_ros.identification.levels import NEARER, SCALE, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.sizes import SPREAD, TYPICAL
 from calib_ros.identification.start import likened
@@ -45,9 +45,6 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-
-if TYPE_CHECKING:
-    from calib_ros.identification.identification import Identification
 
 LEAST_SCALE = 0.5 * SCALE
 """Of a device of which it is told: half of what those of good ones scatter by."""

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.identification import Identification
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import DH_KINDS

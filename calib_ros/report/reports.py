@@ -12,11 +12,11 @@ import numpy as np
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.linear_model import COMPARED
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
+from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of

@@ -14,10 +14,12 @@ import numpy as np
 import calib_ros
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import FALSE, reason_in_words
-from calib_ros.identification.identification import Identification, Noise, Outlier
+from calib_ros.identification.misfits import Outlier
+from calib_ros.identification.noise import Noise
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
 from calib_ros.identification.region import Region
+from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain

@@ -26,9 +26,10 @@ from calib_ros.files.history import (
     settings_hash,
 )
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import Identification, Outlier
+from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash

@@ -16,7 +16,8 @@ from calib_ros.cli.main import main
 from calib_ros.cli.options import NOT_ACCEPTED
 from calib_ros.files.programs import joints_csv, read_program
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame

@@ -18,7 +18,8 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.layouts import joint_columns
 from calib_ros.files.programs import csv_of, joints_csv, read_joints
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Residuals
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert, to_quat

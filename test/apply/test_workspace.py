@@ -13,7 +13,8 @@ from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.files.programs import csv_of, read_joints, read_poses
 from calib_ros.identification.calibration import Calibration, load_calibration
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.kinematics.se3 import to_quat, transform

@@ -9,7 +9,8 @@ import pytest
 from fits import SIGMAS, UR10E, measured_arm
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import load_chain
 

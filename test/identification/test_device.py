@@ -9,8 +9,9 @@ import pytest
 from measured import bent
 
 from calib_ros.identification.considered import bends
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain_file import load_chain
 

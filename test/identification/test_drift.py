@@ -14,9 +14,10 @@ from scipy.signal import lfilter
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification import drift as drift_module
 from calib_ros.identification.drift import Shifts, chance, chance_of_gain
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics import effects

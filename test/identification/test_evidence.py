@@ -10,9 +10,10 @@ from calib_ros.apply.simulation import measure
 from calib_ros.identification import evidence
 from calib_ros.identification.considered import considered
 from calib_ros.identification.evidence import Posterior, _device, group_of
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.sizes import TYPICAL
 from calib_ros.kinematics import effects, se3

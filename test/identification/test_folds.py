@@ -10,9 +10,10 @@ from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.identification.configurations import configurations
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import numbered
+from calib_ros.identification.problem import Problem
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 

@@ -15,7 +15,8 @@ from calib_ros.identification.identifiability import (
     observability,
     trades,
 )
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import log_rotation
 from calib_ros.report.words import weakly_determined

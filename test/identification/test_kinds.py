@@ -8,8 +8,10 @@ from fits import NOISE, SIGMAS, UR10E, fitted
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
-from calib_ros.identification.identification import Problem, identify, residuals
+from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
+from calib_ros.identification.validation import residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 

@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification import leastsquares
 from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.identification import Problem, identify, residuals
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import (
     SEPARATION_SIGMA,
     Prior,
@@ -23,8 +23,10 @@ from calib_ros.identification.leastsquares import (
     triangular_factor,
     without_each,
 )
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import BLOCK, Samples
 from calib_ros.identification.start import start_frames
+from calib_ros.identification.validation import residuals
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 

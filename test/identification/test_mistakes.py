@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.mistakes import explained
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.suspects import QUARTERS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint

@@ -11,7 +11,6 @@ from scipy import stats
 
 from calib_ros.apply.simulation import measure
 from calib_ros.identification import noise as noise_module
-from calib_ros.identification.identification import Problem
 from calib_ros.identification.leastsquares import (
     Prior,
     System,
@@ -20,6 +19,7 @@ from calib_ros.identification.leastsquares import (
     triangular_factor,
 )
 from calib_ros.identification.noise import noise_of
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.shared_errors import Shared
 

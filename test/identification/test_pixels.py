@@ -14,11 +14,12 @@ from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, meas
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification import identification
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import System, products_of, stacked
 from calib_ros.identification.mistakes import explained
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.pixels import PixelSamples
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.resection import _from_homography, board_poses, resect
 from calib_ros.identification.samples import seen_residuals
 from calib_ros.kinematics.chain import Frame

@@ -11,7 +11,8 @@ from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameEr
 from calib_ros.identification.identifiability import (
     structurally_independent,
 )
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.report.words import summary
 

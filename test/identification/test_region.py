@@ -12,7 +12,8 @@ from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.identification.calibration import Calibration, load_calibration
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.region import region_of_record
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame

@@ -11,8 +11,9 @@ from scipy import special, stats
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification import robust
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import System, minimise
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import INNER, LOSSES, OUTER, OUTLIER, distances_of, weights_of
 from calib_ros.identification.samples import Samples
 from calib_ros.kinematics import se3

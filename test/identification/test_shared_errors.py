@@ -11,8 +11,9 @@ from scipy.stats import norm
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification import samples as samples_module, shared_errors
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import System, minimise
+from calib_ros.identification.problem import Problem
 from calib_ros.report.words import as_document, neighbours_in_words
 
 

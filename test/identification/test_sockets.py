@@ -13,8 +13,9 @@ from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.report.words import summary

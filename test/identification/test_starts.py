@@ -10,8 +10,9 @@ from fits import UR10E, worst_prediction
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification import trimmed
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import Prior, System
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import _shortest, closed_forms, start_frames
 from calib_ros.identification.trimmed import _Halves, _Linear, trimmed_sum

@@ -11,9 +11,10 @@ from fits import NOISE, SIGMAS, UR10E, along_path
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.identification import fitting
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.robust import Robust
 from calib_ros.identification.steps import find_step

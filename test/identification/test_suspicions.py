@@ -7,7 +7,8 @@ import pytest
 from fits import rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.suspicions import _common, scale_of
 from calib_ros.kinematics.chain_file import load_chain

@@ -13,8 +13,9 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import Problem, identify
+from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.suspicions import _apart
 from calib_ros.kinematics import se3
