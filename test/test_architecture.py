@@ -24,7 +24,7 @@ MODULES = {
 ROS = {'rclpy', 'sensor_msgs', 'tf2_msgs', 'geometry_msgs', 'trajectory_msgs', 'std_srvs'}
 ONLY = {
     **dict.fromkeys(ROS, ('ros.',)),
-    'rosbags': ('files.bags',),
+    'rosbags': ('files.bags', 'files.stored'),
     'matplotlib': ('report.plots',),
     **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
     'weasyprint': ('report.page',),
@@ -43,17 +43,12 @@ ONLY = {
 
 @cache
 def imports(path):
-    """Return the names that a module imports, inside functions as well.
-
-    Imports for type checking alone do not count.
-    """
+    """Return the names that a module imports, inside functions and for type checking as well."""
     found = set()
     waiting = [ast.parse(path.read_text())]
     while waiting:
         node = waiting.pop()
         if isinstance(node, ast.expr):
-            continue
-        if isinstance(node, ast.If) and getattr(node.test, 'id', '') == 'TYPE_CHECKING':
             continue
         waiting += ast.iter_child_nodes(node)
         if isinstance(node, ast.Import):

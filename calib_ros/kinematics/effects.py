@@ -22,17 +22,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
+from calib_ros.kinematics.joint import Frame, Joint
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cross
+from calib_ros.kinematics.walk import Walk
 
-if TYPE_CHECKING:
-    from calib_ros.kinematics.chain import Chain
+
+class _Arm(Protocol):
+    """What effects need of a chain."""
+
+    @property
+    def joints(self) -> tuple[Joint, ...]: ...
+    @property
+    def joint_names(self) -> tuple[str, ...]: ...
+    @property
+    def effects(self) -> tuple[tuple[str, float], ...]: ...
+    @property
+    def gravity(self) -> tuple[float, float, float]: ...
+    @property
+    def walk(self) -> Walk: ...
+    def frame(self, name: str) -> Frame: ...
 
 
 @dataclass(frozen=True)
@@ -59,7 +74,7 @@ def group_of(name: str) -> str:
     return first
 
 
-def members(chain: Chain, group: str) -> tuple[Parameter, ...]:
+def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
     """Return the names of all effects of a group for a chain."""
     names, wrist = chain.joint_names, chain.joint_names[-3:]
     revolute = [joint.name for joint in chain.joints if joint.type == 'revolute']
@@ -94,7 +109,7 @@ def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:
     return tuple(Parameter(joint, f'{wave}_{harmonic:g}') for wave in WAVES)
 
 
-def resolve(chain: Chain, name: str) -> tuple[str, ...]:
+def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
     """Return the effects that a group or a single name stands for."""
     if name in GROUPS:
         return members(chain, name)
@@ -134,7 +149,7 @@ def expected(name: str) -> float:
 
 
 def basis(
-    chain: Chain, names: Sequence[str], q: FloatArray, approach: FloatArray | None
+    chain: _Arm, names: Sequence[str], q: FloatArray, approach: FloatArray | None
 ) -> FloatArray:
     """Return phi (E, B) of the named effects at joint values (n, B).
 
@@ -178,7 +193,7 @@ def _wave(
     return np.asarray(circles[joint][orders.astype(int) - 1])
 
 
-def moved(chain: Chain, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
+def moved(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) with what effects add to them, by their phi (E, B)."""
     known = dict(chain.effects)
     values = [known[name] for name in names]
@@ -216,7 +231,7 @@ def _by_kind(
 
 
 def _torques(
-    chain: Chain, q: FloatArray, joints: NDArray[np.intp], ends: FloatArray | None
+    chain: _Arm, q: FloatArray, joints: NDArray[np.intp], ends: FloatArray | None
 ) -> FloatArray:
     """Return torques of gravity (E, B) on joints at joint values (n, B).
 
