@@ -36,6 +36,13 @@ from calib_ros.report.reports import identification_report
 
 SIZES = (500, 20_000, 500_000)
 SCREENS = {'': (1280, 800), '_phone': (400, 800)}
+FIGURES = {
+    'cumulated': 'How many poses are within an error',
+    'angles': 'Angles found',
+    'gauges': 'What the poses determine',
+    'correlations': 'Which parameters stand in for each other',
+}
+"""Sections by their titles, of which pictures stand in docs/."""
 UR10 = ('ur10_ipa_leica', '--session', 'B', '--tolerance', '0.5', '--device', 'Leica T-Mac')
 RESULTS = {'accepted': UR10, 'refused': ('positioner_2axis_pose',)}
 
@@ -99,12 +106,19 @@ def screenshots(folder: Path, data: Path) -> None:
                     page.wait_for_selector('#space canvas')
                     page.wait_for_timeout(2000)  # it turns up bit by bit
                     save(page, folder / f'report_space{ending}.jpg')
+                    for figure, title in FIGURES.items() if not ending else ():
+                        section = page.locator(
+                            'section', has=page.get_by_role('heading', name=title)
+                        )
+                        section.scroll_into_view_if_needed()
+                        page.wait_for_timeout(1000)  # drawn when it comes into view
+                        save(section, folder / f'report_{figure}.jpg')
                 page.close()
 
 
-def save(page, path: Path) -> None:
-    """Write what is in view."""
-    page.screenshot(path=path, type='jpeg', quality=80)
+def save(part, path: Path) -> None:
+    """Write what is in view of a page, or a part of it."""
+    part.screenshot(path=path, type='jpeg', quality=80)
     print(f'wrote {path}: {path.stat().st_size / 1e3:.0f} kB')
 
 
