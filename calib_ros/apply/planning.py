@@ -198,11 +198,12 @@ def _root(information: FloatArray) -> FloatArray:
 def efficiency(
     design: Design, candidates: FloatArray, chosen: Index, task: FloatArray | None
 ) -> float:
-    """Return a lower bound on how good a choice is against the best choice of as many candidates.
+    """Return a lower bound on how good a choice (K,) is against the best of as many candidates.
 
-    For the criterion `d`, or `task` with the poses of one, as a share of poses: with 0.9 even the
-    best choice would need 90 % of them. Both criteria are convex, and the tangent at the choice
-    (Kiefer and Wolfowitz 1960) bounds what the candidates with the steepest slopes would bring.
+    For the criterion `d`, or `task` with the joint values (M, n) of one; `candidates` are (N, n).
+    As a share of poses: with 0.9 even the best choice would need 90 % of them. Both criteria are
+    convex, and the tangent at the choice (Kiefer and Wolfowitz 1960) bounds what the candidates
+    with the steepest slopes would bring.
     """
     space = Candidates(design, candidates)
     ridge = HALF_THE_DIGITS * np.eye(len(space.known))
@@ -271,8 +272,9 @@ def plan(
 ) -> Plan:
     """Plan a number of measurements, and compare them with so many random draws.
 
-    `chosen` are indices that `fewest` found already; `choose` and `visit_order` say what the other
-    arguments mean.
+    `candidates` (N, n) and those of a `task` (M, n) are joint values, `velocities` (n,) their
+    largest rates. `chosen` (K,) are indices that `fewest` found already; `choose` and
+    `visit_order` say what the other arguments mean.
     """
     excited = design.determined_by(candidates)
     if chosen is None:

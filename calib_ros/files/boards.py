@@ -262,7 +262,10 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
 def observed(
     found: Detections, board: Board, places: Mapping[str, FloatArray], on_flange: bool
 ) -> tuple[Observations, tuple[str, ...]]:
-    """Return the corners of images at which the arm is known, stamped by line, and warnings."""
+    """Return the corners of images at which the arm is known, stamped by line, and warnings.
+
+    `places` are joint values (n,) by the names of images.
+    """
     known = np.array([name in places for name in found.names], dtype=bool)
     if not known.any():
         raise InputError(

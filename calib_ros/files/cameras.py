@@ -98,7 +98,7 @@ def image_of(message: Any) -> Image:
 
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
-    """Return the content of a sensor_msgs/Image in grey; refuse unknown encodings and sizes."""
+    """Return a sensor_msgs/Image of data (B,) in grey (H, W); refuse encodings and sizes."""
     if encoding not in ENCODINGS:
         raise UnknownNameError('encoding of images', encoding, ENCODINGS)
     channels, kind = ENCODINGS[encoding]

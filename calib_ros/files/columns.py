@@ -108,7 +108,7 @@ class Columns:
         raise NotImplementedError
 
     def select(self, rows: NDArray[np.generic] | slice) -> Columns:
-        """Return some of the rows, by a mask, by indices or by a slice."""
+        """Return some of the rows, by a mask (N,), by indices (K,) or by a slice."""
         raise NotImplementedError
 
     def codes(self, name: str) -> Codes:
@@ -136,7 +136,7 @@ class MadeColumns(Columns):
         object.__setattr__(self, 'header', (*self.words, *self.values))
 
     def select(self, rows: NDArray[np.generic] | slice) -> MadeColumns:
-        """Return some of the rows, by a mask, by indices or by a slice."""
+        """Return some of the rows, by a mask (N,), by indices (K,) or by a slice."""
         index = np.arange(len(self.lines))[rows].tolist()
         return replace(
             self,

@@ -47,7 +47,7 @@ class TextColumns(Columns):
         return [data[begin:end].decode() for begin, end in places]
 
     def select(self, rows: NDArray[np.generic] | slice) -> TextColumns:
-        """Return some of the rows, by a mask, by indices or by a slice."""
+        """Return some of the rows, by a mask (N,), by indices (K,) or by a slice."""
         index, width = np.arange(len(self.lines))[rows], len(self.header)
         begins, ends = self._ends[:-1:width][index] + 1, self._ends[width::width][index]
         places = zip(begins.tolist(), ends.tolist(), strict=True)

@@ -70,7 +70,7 @@ def read_image(path: Path) -> Image:
 
 
 def decoded(data: NDArray[np.uint8]) -> Image:
-    """Return a compressed image in grey; without pixels where it is none."""
+    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) where it is none."""
     cv2 = opencv()
     try:
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)

@@ -73,7 +73,7 @@ class Measurements:
     spread: FloatArray
 
     def select(self, rows: NDArray[np.generic]) -> Measurements:
-        """Return some of the rows, by a mask or by indices."""
+        """Return some of the rows, by a mask (N,) or by indices (K,)."""
         found: dict[str, object] = {}
         for item in fields(self):
             value = getattr(self, item.name)

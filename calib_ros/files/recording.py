@@ -36,7 +36,10 @@ class Recording:
     def of_dwells(
         cls, joint_names: tuple[str, ...], observations: Observations, held_out: NDArray[np.bool_]
     ) -> Recording:
-        """Turn a table into a recording: the arm stands for 0.4 s at every row, once a second."""
+        """Turn a table into a recording: the arm stands for 0.4 s at every row, once a second.
+
+        `held_out` (N,) tells which rows are for the topic that is not fitted.
+        """
         begin = (1 + np.arange(len(observations))[:, np.newaxis]) * 1_000_000_000
         stamps = begin + np.arange(5) * 100_000_000
         joints = np.repeat(observations.joints, stamps.shape[1], axis=0)

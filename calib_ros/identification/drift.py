@@ -212,7 +212,10 @@ def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
 
 
 def chance(shares: FloatArray) -> float:
-    """Return how often moved residuals are explained as well as those in place, the first."""
+    """Return how often moved residuals are as well explained as those in place, by shares (S,).
+
+    The first is that of those in place.
+    """
     return float(np.mean(shares[1:] >= shares[0]))
 
 

@@ -57,7 +57,10 @@ def independent(
 
 
 def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the parameters that measured poses determine: frames by more than arms' errors."""
+    """Return the parameters that measured poses determine, by their factor R (P, P).
+
+    Frames by more than arms' errors.
+    """
     return independent(factor, names, DEGENERATE)
 
 
@@ -297,7 +300,10 @@ def indices_of(singular: FloatArray) -> dict[str, FloatArray]:
 def correlated(
     matrix: FloatArray, names: Sequence[str], threshold: float
 ) -> tuple[tuple[str, str, float], ...]:
-    """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
+    """Return pairs of parameters whose correlation exceeds a threshold, strongest first.
+
+    By their covariance (P, P).
+    """
     std = np.sqrt(np.diag(matrix))
     correlation = matrix / np.outer(std, std)
     strong = np.argwhere(np.triu(np.abs(correlation) > threshold, 1)).tolist()

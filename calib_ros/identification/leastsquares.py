@@ -93,7 +93,7 @@ class System(Shown):
         return rows / SEPARATION_SIGMA, residual
 
     def select(self, chosen: Sequence[NDArray[np.generic]]) -> System:
-        """Return the samples chosen by masks or indices, set by set, with their weights."""
+        """Return the samples chosen by masks (N,) or indices (K,) by set, with their weights."""
         pairs = zip(self.sets, chosen, strict=True)
         return replace(self, sets=tuple(samples.select(index) for samples, index in pairs))
 

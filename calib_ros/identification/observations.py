@@ -126,7 +126,9 @@ class Observations(Shown):
     def from_arrays(
         cls, joints: FloatArray, positions: FloatArray, rotations: FloatArray | None = None
     ) -> Observations:
-        """Make observations (N) from arrays; position only when `rotations` is None.
+        """Make observations of joint values (N, n) [rad or m] and positions (N, 3) [m].
+
+        And of `rotations` (N, 3, 3); without them of positions only.
 
         Raises
         ------
@@ -157,7 +159,7 @@ class Observations(Shown):
         images: NDArray[np.intp],
         on_flange: bool = False,
     ) -> Observations:
-        """Make observations (N) of a board: `images` (N,) numbers the image of each row.
+        """Make observations of a board: `images` (N,) numbers the image of each row.
 
         The joint values (N, n) are those of the image, the `points` (N, 3) [m] those of the board
         that are seen at `pixels` (N, 2).
@@ -174,13 +176,13 @@ class Observations(Shown):
 
     @classmethod
     def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
-        """Make observations (N) of a point at the tool that touched one plane."""
+        """Make observations of a point that touched one plane, at joint values (N, n)."""
         heights = np.zeros(len(joints))
         plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
     def select(self, mask: NDArray[np.generic] | slice) -> Observations:
-        """Return the pairs chosen by a mask, by indices or a slice; they have been checked."""
+        """Return the pairs of a mask (N,), of indices (K,) or a slice; they have been checked."""
         chosen = object.__new__(Observations)
         vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
         count = len(self.stamps_ns[mask])

@@ -133,7 +133,7 @@ class PixelSamples(Samples):
         return pixels / self.sigmas[0], np.full((self.count, 3), np.nan)
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
-        """Yield the residuals of all points, and of all images: what their points share.
+        """Yield the residuals (M, 2) of all points, and of all images: what their points share.
 
         No point counts for more than INNER usual ones in its image.
         """

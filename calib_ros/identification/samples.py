@@ -72,7 +72,7 @@ class Samples:
         """Square roots of the weights (N,) of a robust loss; None where all count fully."""
 
     def select(self, index: NDArray[np.generic]) -> Samples:
-        """Return the samples chosen by a mask or by indices, with their weights."""
+        """Return the samples chosen by a mask (N,) or by indices (K,), with their weights."""
         few = type(self)(self.observations.select(index), *self.sigmas)
         few.weights = None if self.weights is None else self.weights[index]
         return few

@@ -84,7 +84,7 @@ def turned(x: float, y: float, z: float) -> FloatArray:
 
 
 def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the cosines and sines of angles [rad], from the tangents of half of them."""
+    """Return the cosines and sines of angles (...) [rad], from the tangents of half of them."""
     tangent = np.tan(0.5 * angles)
     square = tangent * tangent
     scale = 1.0 / (1.0 + square)

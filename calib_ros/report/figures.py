@@ -214,7 +214,7 @@ def error_map(survey: Survey) -> Figure:
 
 
 def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | None) -> Figure:
-    """Return the error that 1, 2, ... K planned poses promise [m], and so many random ones."""
+    """Return the errors (K,) [m] that 1, 2, ... K planned poses promise, and random ones."""
     count = np.arange(1.0, len(accuracy) + 1)
     data = []
     for name, errors, line in (('planned', accuracy, SOLID), ('at random', at_random, DASHED)):

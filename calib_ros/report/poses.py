@@ -104,7 +104,7 @@ class Poses:
         return f'{stamp // 10**9}.{stamp % 10**9:09d} s'
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
-        """Return some of the poses by a mask or by indices."""
+        """Return some of the poses by a mask (N,) or by indices (K,)."""
         of_all = ('tools', 'lines', 'images')
         names = (each.name for each in fields(self) if each.name not in of_all)
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
@@ -213,7 +213,7 @@ def poses_to_verify(
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
-    """Return an array as lists with so many significant digits; None for NaN."""
+    """Return an array (...) as lists with so many significant digits; None for NaN."""
     flat = [None if x != x else float(f'{x:.{digits}g}') for x in values.ravel().tolist()]
     shaped: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
     return shaped

@@ -186,7 +186,7 @@ class Keeper:
         return path
 
     def exportable(self) -> tuple[Calibration, FloatArray | None]:
-        """Return the calibration, and the joint values of the samples, as they are now."""
+        """Return the calibration, and the joint values (N, n) of the samples, as they are now."""
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
@@ -195,7 +195,10 @@ class Keeper:
             return session.calibration, joints if len(joints) else None
 
     def export(self, found: tuple[Calibration, FloatArray | None]) -> tuple[bool, str]:
-        """Write a calibration in all forms; return success, and where in words."""
+        """Write a calibration in all forms, checked at joint values (N, n).
+
+        Return success, and where in words.
+        """
         (calibration, joints), nominal = found, self._session.chain
         chain, record = calibration.chain, calibration.record
         links = self._given.links

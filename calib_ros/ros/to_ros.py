@@ -66,7 +66,7 @@ def transform(matrix: FloatArray) -> Transform:
 
 
 def joints(names: Sequence[str], values: FloatArray, stamp: Any) -> JointState:
-    """Return joint values (n) by name."""
+    """Return joint values (n,) by name."""
     message = JointState(name=list(names), position=values.tolist())
     message.header.stamp = stamp
     return message

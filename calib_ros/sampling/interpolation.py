@@ -66,7 +66,7 @@ def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def unwrapped(steps: FloatArray, revolute: Flags) -> FloatArray:
-    """Return differences of joint values; a driver may count angles within one turn."""
+    """Return differences (M, n) of joint values; a driver may count angles in one turn."""
     turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
     return np.asarray(steps - np.where(revolute, turn, 0.0))
 

@@ -64,7 +64,7 @@ class Readings(NamedTuple):
         return self.strings[1] if len(self.strings) > 1 else ''
 
     def rows(self, which: slice | NDArray[np.generic]) -> Readings:
-        """Return some of them."""
+        """Return some of them, by a slice, a mask (N,) or indices (K,)."""
         return Readings(self.stamps_ns[which], self.strings, self.numbers[which])
 
 

@@ -60,7 +60,7 @@ class Rows:
         self.count = end
 
     def keep(self, index: NDArray[np.generic]) -> None:
-        """Keep only the rows of a mask or an index, in its order."""
+        """Keep only the rows of a mask (N,) or an index (K,), in its order."""
         stamps = self.stamps[index]
         self._values[: len(stamps)] = self.values[index]
         self._stamps[: len(stamps)] = stamps
@@ -172,7 +172,7 @@ class Slice:
         return Slice(_by_arrival(pieces), self.begin + begin, self.joints[part], self.times[part])
 
     def where(self, kind: str) -> Index:
-        """Return the numbers of the messages of a kind."""
+        """Return the numbers (K,) of the messages of a kind."""
         return np.flatnonzero(self.joints if kind == JOINTS else ~self.joints)
 
 
