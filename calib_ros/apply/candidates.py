@@ -47,7 +47,7 @@ class Visibility:
 
     def sees(self, design: Design, joints: FloatArray) -> Flags:
         """Return (N,) whether the target can be measured at joint values (N, n)."""
-        base = {'base': design.chain.base, **dict(design.chain.frames)}[design.base]
+        base = design.chain.all_frames[design.base]
         poses = design.targets(joints)
         if not self.world:
             poses = se3.invert(design.chain.frame(design.base).matrix) @ poses

@@ -206,6 +206,6 @@ def _with_assumed_tool(chain: Chain, tool: str) -> Chain:
 
     On the axis, where a frame of no size would put it, its position hides the last joint.
     """
-    if {'tool': chain.tool, **dict(chain.frames)}[tool] is not None:
+    if chain.all_frames[tool] is not None:
         return chain
     return chain.with_frame(tool, Frame(se3.transform(np.eye(3), np.array(ASSUMED_TOOL))))

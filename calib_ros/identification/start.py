@@ -57,8 +57,8 @@ def start_frames(
     """
     found: set[str] = set()
     for observations in sets:
-        known = {'base': chain.base, 'tool': chain.tool, **dict(chain.frames)}
-        known |= {name: replace(chain.frame(name), fixed=True) for name in found}
+        placed = {name: replace(chain.frame(name), fixed=True) for name in found}
+        known = {**chain.all_frames, **placed}
         base, tool = observations.base, observations.tool
         view = replace(chain, base=known[base], tool=known[tool])
         alone = replace(observations, base='base', tool='tool')

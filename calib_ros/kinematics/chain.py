@@ -147,7 +147,7 @@ class Chain(Shown):
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
         """Return the names of all base and tool frames."""
-        return ('base', 'tool', *(name for name, _ in self.frames))
+        return tuple(self.all_frames)
 
     @property
     def table(self) -> FloatArray:
@@ -182,11 +182,11 @@ class Chain(Shown):
 
     def frame(self, name: str) -> Frame:
         """Return a base or tool frame by its name, the identity when nothing is known."""
-        return self._frames[name] or ANYWHERE
+        return self.all_frames[name] or ANYWHERE
 
     def owns_frame(self, parameter: str) -> bool:
         """Tell whether a parameter belongs to a base or tool frame."""
-        return parameter.partition('.')[0] in self._frames
+        return parameter.partition('.')[0] in self.all_frames
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with another base or tool frame, which may be a new one."""
@@ -202,7 +202,7 @@ class Chain(Shown):
             if name.partition('.')[0] not in self._joints:
                 raise UnknownNameError('parameter', name, self.parameter_names)
             effects.check(name, self.joint_names)
-        kept = ('joint_names', 'frame_names', 'walk', '_frames', '_joints')
+        kept = ('joint_names', 'frame_names', 'walk', 'all_frames', '_joints')
         return _with(self, {'effects': (*self.effects, *added)}, kept)
 
     def with_effect_values(self, values: Mapping[str, float]) -> Chain:
@@ -230,7 +230,7 @@ class Chain(Shown):
             joints.append(_with(joint, values, ('parameters', 'driven')) if values else joint)
         frames = {
             key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
-            for key, frame in self._frames.items()
+            for key, frame in self.all_frames.items()
         }
         found: dict[str, object] = {
             'joints': tuple(joints),
@@ -314,7 +314,8 @@ class Chain(Shown):
         return _parameters(self.joint_names, self.frame_names, tuple(self._effect_values))
 
     @cached_property
-    def _frames(self) -> Mapping[str, Frame | None]:
+    def all_frames(self) -> Mapping[str, Frame | None]:
+        """Return base, tool and further frames by name; None where nothing is known."""
         return {'base': self.base, 'tool': self.tool, **dict(self.frames)}
 
     @cached_property
