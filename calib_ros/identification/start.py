@@ -40,7 +40,7 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 
 GOOD = 0.03
-"""A start is taken without a search when its RMS error is below this share of the spread."""
+"""Share of the spread below which an error needs no search, and two starts are the same."""
 
 
 def start_frames(
@@ -93,17 +93,21 @@ def _start_one(
         return thorough_fit(start, lengths, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
     determined: tuple[str, ...] = ()
-    best, least = chain, np.inf
+    best, least, left = chain, np.inf, np.full_like(subset.positions, np.inf)
     for starts in _starts(chain, subset):
         for start in starts:
+            away = norms(residual_arrays(start, subset)[0] - left)
+            if np.median(away) <= GOOD * spread:  # the same, before it is fitted
+                continue
             normal = normal_equations(start, names, system)
             told = excited(factor_of(start, names, system, normal), names)
             known = normal if len(told) == len(names) else None
             fitted = minimise(start, told, system, tolerance=1e-3, normal=known).chain
             # the median, which gross errors do not touch
-            error = np.median(norms(residual_arrays(fitted, subset)[0]))
+            residual = residual_arrays(fitted, subset)[0]
+            error = np.median(norms(residual))
             if error < least:
-                best, least, determined = fitted, error, told
+                best, least, determined, left = fitted, error, told, residual
         if least <= GOOD * spread:
             break
     return robust_fit(best, determined, system, loss).fit.chain
