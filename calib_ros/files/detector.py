@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
 from calib_ros.files.stored import LARGEST_IMAGE
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
@@ -31,7 +31,7 @@ Corners = tuple[NDArray[np.intp], FloatArray]
 Markers = tuple[FloatArray, NDArray[np.intp]]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
-FEWEST = len(parameters_of('base'))
+FEWEST = IN_A_FRAME
 """Corners of an image that is used: half of their coordinates make its pose, half check it."""
 WINDOW = 0.6
 """Half the window that refines a corner, by the distance to the nearest marker; measured, as is

@@ -11,6 +11,7 @@ that matrix is well conditioned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
@@ -23,6 +24,7 @@ from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
+from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[NDArray[np.intp]]
@@ -34,8 +36,8 @@ PATIENCE = 3
 """Steps in succession that may raise the cost before they are damped."""
 SEPARATION_SIGMA = 1e-5
 """Standard deviation [m] of a known distance between sockets."""
-SMALL_STEP = 1e-3
-"""Step [m or rad] whose second order, half its square, is a thousandth of a millimetre at most."""
+SMALL_STEP = math.sqrt(Limits.largest_position_error)
+"""Step [m or rad] whose second order, half its square, is an error that may remain."""
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,20 @@ ALIKE = 1.5
 NEARER = 0.3
 """Ratio of two errors from which what leaves the smaller one explains clearly more
 (benchmarks/mistakes.py)."""
+CLEARLY = 5.0
+"""Ratio of two sizes from which on they are clearly two: distances of configurations and of the
+visits of one, steps of rounding (both benchmarks/harm.py), what is left of orientations and of
+positions (docs/mistakes.md)."""
 MOST_OUTLIERS = 0.35
 """Share of gross errors beyond which nothing is believed: half of the samples must tell the
 rest."""
 TELLING = 8
 """Values from which on their spread tells anything: it is known to a quarter, (2 n)^-1/2."""
+FEW = TELLING // 2
+"""Values with fewer of which nothing can be said about their spread: it is known to a third."""
+LEAST_ASIDE = 3
+"""Stops or rows before and after what happened once: fewer are gross errors
+(benchmarks/harm.py)."""
 KNOWN = 1.0 / HALF_THE_DIGITS
 """Degrees of freedom that are as good as infinite."""
 SCALE = 1e-4

@@ -38,6 +38,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 
 if TYPE_CHECKING:
@@ -110,7 +111,7 @@ def explained(problem: Problem) -> Explained | None:
         for each in problem.sets
         if each.distances is None and _of_images(problem) == (each.pixels is not None)
     )
-    if not sets or max(map(len, sets)) < 6:
+    if not sets or max(map(len, sets)) < IN_A_FRAME:
         return None  # base and tool alone explain nearly all of them
     if not any(each.socket for each in sets):
         sets = (max(sets, key=len),)

@@ -35,12 +35,12 @@ from calib_ros.identification.robust import OUTLIER
 from calib_ros.identification.validation import ErrorFigures, left_out, residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import GROWTH
 
-FEWEST, SUSPECTS = 6, 4
-"""Poses of which one may contradict the others, and those tried, with the largest errors."""
+SUSPECTS = 4
+"""Poses that may contradict the others and are left out in turn, those of the largest errors."""
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -102,7 +102,7 @@ def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Pro
     sets = (*problem.sets, *problem.judging)
     sizes = [np.linalg.norm(residuals(chain, each).position, axis=1) for each in sets]
     order = np.argsort(-np.concatenate(sizes))
-    if not len(order) >= FEWEST or any(each.pixels is not None for each in sets):
+    if not len(order) >= IN_A_FRAME or any(each.pixels is not None for each in sets):
         return
     owner = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
     first = np.cumsum([0, *(len(each) for each in sets)])

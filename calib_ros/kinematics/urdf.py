@@ -37,9 +37,10 @@ from calib_ros.kinematics.chain import (
 )
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
+from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES, SAME
 
-MOST_APART = 0.2
+MOST_APART = 2.0 * Settings.largest_angle
 """Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
 
 

@@ -15,6 +15,7 @@ from calib_ros.identification.configurations import distinct
 from calib_ros.identification.identification import Identification
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.linear_model import COMPARED
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.validation import Comparison
@@ -35,8 +36,8 @@ UNPROVEN = (
 )
 CAUSES = {Rule.MISTAKE, Rule.MOVED, Rule.ENCODER}
 """What names its cause, so that it is said first."""
-SURVEYED = 4000
-"""Random poses of the error map."""
+SURVEYED = 20 * SOME_POSES
+"""Random poses of the error map: some for each of its cells."""
 
 
 def identification_report(

@@ -27,8 +27,9 @@ from calib_ros.settings import Settings
 from calib_ros.shown import some
 from calib_ros.texts import dump_yaml
 
-WEAK = 0.01
-"""A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
+WEAK = Settings.largest_error
+"""A parameter with a larger standard deviation [m or rad] is named as weakly determined: an arm
+that errs by more is not accepted."""
 
 
 def summary(

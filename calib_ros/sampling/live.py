@@ -45,7 +45,7 @@ from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import ANGLES, DELAY, Parameter, parameters_of
+from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
 from calib_ros.settings import EXCEPTION, Settings
@@ -53,7 +53,7 @@ from calib_ros.settings import EXCEPTION, Settings
 WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)
 """Standard deviations [m, rad] of arm parameters before anything is measured: five times as much
 is another robot."""
-START = len(parameters_of('base'))
+START = IN_A_FRAME
 """Configurations with which two frames are found: of three coordinates each, for two unknowns."""
 MOST_THOROUGH = 60
 """Parameters up to which it begins with the thorough fit: it takes 4 s instead of 1 s for 200."""
