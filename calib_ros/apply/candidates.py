@@ -127,9 +127,10 @@ def travel_times(joints: FloatArray, velocities: FloatArray) -> FloatArray:
     return np.asarray(np.abs((joints[:, None] - joints[None]) / velocities).max(axis=2))
 
 
-AROUND = ((1, 1), (1, -1), (-1, -1), (-1, 1))
-CORNERS = 0.5 * np.array([[x, y, side * x] for side in (1, -1) for x, y in AROUND])
-PLANE = range(len(AROUND))
+CORNERS = 0.5 * np.array(
+    [[x, y, z * x] for z in (1, -1) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+)
+PLANE = range(len(CORNERS) // 2)
 """Corners of the plane x = z of the cube, round about: they come first."""
 
 

@@ -37,7 +37,7 @@ from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 
@@ -212,7 +212,7 @@ def _in_names(
 
 def _told(names: tuple[Parameter, ...], change: FloatArray, square: FloatArray) -> Told:
     scale = np.sqrt(np.diag(square))
-    inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=1e-12) / np.outer(scale, scale)
+    inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=ROUNDING) / np.outer(scale, scale)
     return Told(names, inverse, inverse @ change)
 
 

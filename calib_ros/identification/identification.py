@@ -26,7 +26,7 @@ from calib_ros.identification.drift import chance_of_gain
 from calib_ros.identification.evidence import Posterior
 from calib_ros.identification.fitting import SOME, Fitted, Simpler, fit, parameter_rows
 from calib_ros.identification.leastsquares import System, minimise, normal_equations
-from calib_ros.identification.levels import KNOWN
+from calib_ros.identification.levels import CONFIDENT, KNOWN
 from calib_ros.identification.misfits import Outlier, arms_own, outliers_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Problem
@@ -141,7 +141,7 @@ class Identification(Shown):
         """
         return self.posterior.expected(q)
 
-    def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
+    def confidence_ellipsoid(self, q: FloatArray, level: float = CONFIDENT) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
 
         By the F distribution where the size of the noise was estimated from the residuals, by

@@ -296,7 +296,7 @@ def minimise(
         promised = foreseen if normal is best else promised
         normal = normal_equations(chain, names, system)
         gain = best.cost - normal.cost
-        if gain >= -1e-12 * best.cost:
+        if gain >= -ROUNDING * best.cost:
             best, best_chain, growth = normal, chain, 2.0
             if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)

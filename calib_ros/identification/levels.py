@@ -10,6 +10,8 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 
 CONFIDENT = 0.95
 """Of intervals, and of gains: one in twenty is allowed to be chance."""
+INTERVAL = 0.5 + 0.5 * CONFIDENT
+"""One-sided confidence of each limit of an interval."""
 CERTAIN = 0.99
 """Of what is held against a result, and where several tests are made."""
 SURE = 0.999

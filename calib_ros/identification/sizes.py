@@ -11,10 +11,11 @@ from scipy import special
 from scipy.linalg import lapack
 
 from calib_ros.identification.levels import CONFIDENT
+from calib_ros.kinematics.effects import EXPECTED
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 
-TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'coupling': 1e-3}
-TYPICAL |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': EXPECTED['gear'], 'coupling': 1e-3}
+TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backlash')}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;

@@ -96,7 +96,7 @@ def chain_from_urdf(
         bends = [Joint('straight'), *rows[:-1]]
         pairs = zip(rows, bends, strict=True)
         rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
-    x, y, z = (_clean(-9.81 * part) for part in first[2, :3].tolist())
+    x, y, z = (_clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
     ends = _ends(chain)
     return replace(

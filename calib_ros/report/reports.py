@@ -13,7 +13,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.identification import Identification
-from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.levels import CONFIDENT, INTERVAL
 from calib_ros.identification.linear_model import COMPARED
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
@@ -117,7 +117,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         return ()
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
+        lower, _ = sections.limits_of(judged, 0, INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
     held_out = () if judged is None or judged.repeated is None else (judged,)

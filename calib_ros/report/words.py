@@ -176,7 +176,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
     def parameter(p: ParameterRow) -> dict[str, Any]:
         found = {'value': p.value, 'offset': p.offset, 'std': p.std}
-        found['half_width_95'] = p.half_width(0.95)
+        found['half_width_95'] = p.half_width()
         return found | {'unit': p.name.unit, 'status': p.status}
 
     judged = result.validation

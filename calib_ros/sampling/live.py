@@ -46,7 +46,7 @@ from calib_ros.identification.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
-from calib_ros.kinematics.se3 import ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
 from calib_ros.settings import EXCEPTION, Settings
 
@@ -251,7 +251,7 @@ class LiveEstimate:
     def _scaled(self) -> tuple[FloatArray, FloatArray]:
         """Return scales (P,), and the information matrix with a diagonal of one by them."""
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
-        matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        matrix = self._information * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
         return scale, matrix
 
     def _step(self) -> FloatArray:
