@@ -38,7 +38,7 @@ WINDOW = 0.6
 WIDEST, by benchmarks/images.py."""
 WIDEST = 10
 """Half of the widest such window [px]."""
-COARSE = 700
+SMALLEST_SIDE = 700
 """Longer side [px] of the smallest image in which markers are sought."""
 
 
@@ -92,7 +92,7 @@ def _dictionary(name: str) -> Any:
 
 
 def _halvings(image: Image) -> int:
-    return int(np.log2(max(*image.shape[:2], COARSE) / COARSE))
+    return int(np.log2(max(*image.shape[:2], SMALLEST_SIDE) / SMALLEST_SIDE))
 
 
 def marker_cells(board: Board) -> list[NDArray[np.bool_]]:

@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from calib_ros.identification.levels import CLEARLY, TELLING
+from calib_ros.identification.levels import ALIKE, CLEARLY, TELLING
 from calib_ros.kinematics.se3 import FloatArray, cos_sin
 from calib_ros.settings import Settings
 
@@ -20,8 +20,6 @@ STILL = 2.0 * Settings.still
 """Joint values [rad or m] that differ by less are one configuration: both may leave it."""
 SCATTER = 0.02
 """Distance [rad or m] up to which visits of one configuration may scatter (benchmarks/harm.py)."""
-EXTENT = 2.0
-"""Size of a configuration's visits in units of the longest step between them."""
 
 
 def distinct(numbers: NDArray[np.intp]) -> int:
@@ -88,7 +86,7 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
         number, label = connected_components(links, directed=False)
         middle = np.stack([np.bincount(label, row) for row in place.T]) / np.bincount(label)
         extent = np.linalg.norm(place - middle.T[label], axis=1).max()
-        if number >= TELLING and extent <= EXTENT * reach:
+        if number >= TELLING and extent <= ALIKE * reach:
             return np.asarray(label, dtype=np.intp)
     return apart
 

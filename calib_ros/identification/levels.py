@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from scipy import special
 
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 
 CONFIDENT = 0.95
@@ -32,9 +33,15 @@ TELLING = 8
 """Values from which on their spread tells anything: it is known to a quarter, (2 n)^-1/2."""
 FEW = TELLING // 2
 """Values with fewer of which nothing can be said about their spread: it is known to a third."""
-LEAST_ASIDE = 3
-"""Stops or rows before and after what happened once: fewer are gross errors
-(benchmarks/harm.py)."""
+LEAST_ASIDE = 1 + IN_A_FRAME // 3
+"""Stops or rows before and after what happened once: the freedoms of a frame explain the positions
+of fewer, which are gross errors."""
+SEVERAL = 3
+"""Causes that are looked for one after the other: what needs more is something else. Changes of an
+arm (benchmarks/recalibration.py), mistakes at once (benchmarks/mistakes.py), and harmonics, before
+all of them are tried (benchmarks/real_robots.py)."""
+TRIED = 6
+"""Candidates, the best by a rough look, that are looked at closely (benchmarks/mistakes.py)."""
 KNOWN = 1.0 / HALF_THE_DIGITS
 """Degrees of freedom that are as good as infinite."""
 SCALE = 1e-4

@@ -27,7 +27,7 @@ LOST = (0, 1, -1, 2, -2)
 """Rows that may be missing; more at once are no slip (benchmarks/mistakes.py loses one)."""
 FEWEST_ROWS = 3 * IN_A_FRAME
 """Rows of a table: base and tool alone explain nearly all of fewer in a third of it."""
-MOST_ROWS = 10 * SOME_POSES
+MOST_SEARCHED = 10 * SOME_POSES
 """Rows that are looked at."""
 EXPLAINED_ROWS = 1.0 - EXCEPTION
 """Share of the rows that a loss must explain."""
@@ -67,7 +67,7 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
     pairs; up to `largest` they are those of a faulty arm.
     """
     count = len(seen)
-    if not FEWEST_ROWS <= count <= MOST_ROWS:
+    if not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
     best: Loss | None = None
     good = EXPLAINED_ROWS * count

@@ -37,10 +37,7 @@ from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import Settings
-
-GOOD = 0.03
-"""A start is taken without a search when its RMS error is below this share of the spread."""
+from calib_ros.settings import EXCEPTION, Settings
 
 
 def start_frames(
@@ -104,7 +101,7 @@ def _start_one(
             error = np.median(np.linalg.norm(residual_arrays(fitted, subset)[0], axis=1))
             if error < least:
                 best, least, determined = fitted, error, told
-        if least <= GOOD * spread:
+        if least <= EXCEPTION * spread:  # no other valley is as low: no search is needed
             break
     return robust_fit(best, determined, system, loss).fit.chain
 

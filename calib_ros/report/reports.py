@@ -22,7 +22,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, Situation, advice
+from calib_ros.report.advice import GOOD_ARM, SPREAD_OUT, Advice, Situation, advice
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
@@ -168,7 +168,7 @@ def _steps(
         'gravity and play add, where that helps.': beyond and not result.chain.effects,
         'Compare what is left with the accuracy of the measuring device: no calibration gets '
         'below that.': beyond,
-        f'Measure more poses to decide about the tolerance, {SPREAD}.': undecided,
+        f'Measure more poses to decide about the tolerance, {SPREAD_OUT}.': undecided,
         f'{NOT_YET}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': True,
