@@ -26,7 +26,7 @@ EXCEPTION = 0.1
 standard deviations 5 % larger, less than their own uncertainty; more may be a part of the
 workspace."""
 LEVER = 0.3
-"""Length [m] at which a turn counts as much as a shift."""
+"""Length [m] at which a turn counts as much as a shift; a convention."""
 GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')

@@ -25,7 +25,7 @@ ROUNDED = 1e-3
 """Share of a whole that numbers of three digits leave: of the length of a quaternion, of a step
 that joint values are multiples of."""
 SAME = 1e-9
-"""Lengths [m] and angles [rad] that differ by less are the same."""
+"""Lengths [m] and angles [rad] that differ by less are the same; a convention."""
 LARGEST = 1e6
 """Largest number [m or rad] that is measured or set; some devices send the largest float for
 none."""

@@ -38,7 +38,8 @@ from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 SOME = 2 * SOME_POSES
 """Pairs that are enough for a first fit, or for a linear model of them."""
 FOLLOWED = 2.0
-"""Part of what it lacks that the geometric model does not follow: one over this."""
+"""Part of what it lacks that the geometric model does not follow: one over this
+(benchmarks/real_robots.py)."""
 
 
 @dataclass(frozen=True, eq=False)

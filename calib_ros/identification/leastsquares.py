@@ -31,11 +31,11 @@ Folds: TypeAlias = Sequence[NDArray[np.intp]]
 """The number (N,) of the fold of every sample, set by set."""
 STEP_TOLERANCE = 1e-6
 """The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
-larger, in RMS residuals)."""
+larger, in RMS residuals): a thousandth of what a million rows tell."""
 PATIENCE = 3
-"""Steps in succession that may raise the cost before they are damped."""
+"""Steps in succession that may raise the cost before they are damped; a convention."""
 SEPARATION_SIGMA = 1e-5
-"""Standard deviation [m] of a known distance between sockets."""
+"""Standard deviation [m] of a known distance between sockets: of what is machined, assumed."""
 SMALL_STEP = math.sqrt(Limits.largest_position_error)
 """Step [m or rad] whose second order, half its square, is an error that may remain."""
 

@@ -10,7 +10,8 @@ from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 
 CONFIDENT = 0.95
-"""Of intervals, and of gains: one in twenty is allowed to be chance."""
+"""Of intervals, and of gains: one in twenty is allowed to be chance. A convention, as all three
+are."""
 INTERVAL = 0.5 + 0.5 * CONFIDENT
 """One-sided confidence of each limit of an interval."""
 CERTAIN = 0.99
@@ -28,7 +29,7 @@ visits of one, steps of rounding (both benchmarks/harm.py), what is left of orie
 positions (docs/mistakes.md)."""
 MOST_OUTLIERS = 0.35
 """Share of gross errors beyond which nothing is believed: half of the samples must tell the
-rest."""
+rest. A fit stands 40 % (benchmarks/outliers.py)."""
 TELLING = 8
 """Values from which on their spread tells anything: it is known to a quarter, (2 n)^-1/2."""
 FEW = TELLING // 2
@@ -45,9 +46,10 @@ TRIED = 6
 KNOWN = 1.0 / HALF_THE_DIGITS
 """Degrees of freedom that are as good as infinite."""
 SCALE = 1e-4
-"""Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3."""
+"""Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3
+(assumed)."""
 PRINTED = 5e-3
-"""The same of a printed board."""
+"""The same of a printed board (assumed): 1 mm of 200."""
 
 
 def chance_of(squares: float, rank: int, freedom: float) -> float:

@@ -36,7 +36,8 @@ HARMONICS = range(3, 41)
 HARMONIC_SIZES = (TYPICAL['drive'], TYPICAL['drive'] / CLEARLY)
 """Sizes [rad] of which all harmonics together may be (benchmarks/real_robots.py)."""
 COMPARED = 3000
-"""Samples by which effects are compared; of more, every so many are taken."""
+"""Samples by which effects are compared; of more, every so many are taken, to save time.
+By 2,000 errors are the same within 1e-4 (benchmarks/real_robots.py)."""
 
 
 class LinearModel:

@@ -31,7 +31,7 @@ SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
 
 
 TOOL = 1.0
-"""Length [m] that no target on a flange exceeds."""
+"""Length [m] that no target on a flange exceeds, assumed."""
 
 
 @dataclass(frozen=True)

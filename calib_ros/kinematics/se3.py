@@ -19,7 +19,7 @@ FloatArray: TypeAlias = NDArray[np.float64]
 Flags: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = NDArray[np.intp]
 ROUNDS = 100
-"""Steps to a fixed point, which ends in far fewer unless there is none."""
+"""Steps to a fixed point, which ends in far fewer unless there is none. A convention."""
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))
 """A share whose square is rounding: after such a Newton step nothing is left, and a column of
 which no more is left depends on those before it."""

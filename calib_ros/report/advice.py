@@ -37,7 +37,8 @@ class Advice:
 
 
 ENOUGH = 25
-"""Different poses that are worth judging, and that `calib_ros plan` chooses unless told."""
+"""Different poses that are worth judging, and that `calib_ros plan` chooses unless told: a
+convention."""
 SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'
 
 

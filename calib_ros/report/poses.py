@@ -39,7 +39,8 @@ SINGLE = MANY
 WORST = 2 * SOME_POSES
 """Poses of the largest errors, and outliers, that are listed of more."""
 BANDS = 60
-"""Parts of the session, and of each joint's values, whose quantiles are shown."""
+"""Parts of the session, and of each joint's values, whose quantiles are shown; a
+convention."""
 CELLS = round(SINGLE ** (1 / 3))
 """Cells along the longest edge of the workspace: no more of them than single poses."""
 SHARES = (1.0 - CONFIDENT, 0.5, CONFIDENT)

@@ -63,7 +63,8 @@ deviations shrink by EXCEPTION."""
 MOST_AT_ONCE = 4 * SOME
 """Samples that one update adds at most; the rest waits for the next ones."""
 LITTLE = 0.35
-"""Range [rad] of a joint over all samples that is too little; a tenth of it [m]."""
+"""Range [rad] of a joint over all samples that is too little: 20 degrees; a tenth of it [m].
+A convention."""
 
 
 @dataclass(frozen=True, eq=False)

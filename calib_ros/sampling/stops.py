@@ -23,7 +23,8 @@ from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
 
 MOST_SPREAD = 2.0
-"""Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
+"""Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone.
+A convention."""
 NEAR = 2.0 * MOST_SPREAD
 """Distance [noise] to the later half within which a measurement is taken to have settled."""
 SPIKE = 3.0 * MOST_SPREAD
