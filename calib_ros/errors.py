@@ -8,11 +8,12 @@ import errno
 from collections.abc import Iterable
 
 LONGEST = 400
-"""Characters of a message; what is quoted from a file may be of any length."""
+"""Characters of a message; what is quoted from a file may be of any length. A convention."""
 LONGEST_NAME = LONGEST // 2
 """Characters of a name, a number or an expression: a message has room for it and more."""
 MOST_ENTRIES = 1000
-"""Of a list, of columns, and characters of an entry, that somebody may have written."""
+"""Of a list, of columns, and characters of an entry, that somebody may have written:
+a convention, of which other limits are parts and multiples."""
 
 
 def shortened(text: str, longest: int = LONGEST) -> str:

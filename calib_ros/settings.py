@@ -25,6 +25,8 @@ EXCEPTION = 0.1
 """Share of a whole up to which it is the exception. So many samples fewer, at random, make
 standard deviations 5 % larger, less than their own uncertainty; more may be a part of the
 workspace."""
+LEVER = 0.3
+"""Length [m] at which a turn counts as much as a shift; a convention."""
 GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')
@@ -56,7 +58,7 @@ class Limits:
     orientation_weight: float | None = _setting(
         None,
         'position error that counts as much as one radian, where both cannot vanish [m/rad]; if '
-        'not given 0.3, or 0.001 for arms that cannot reach every orientation',
+        f'not given {LEVER}, or 0.001 for arms that cannot reach every orientation',
     )
     largest_change: float = _setting(
         0.5, 'largest change of the correction between successive samples, relative to the move'
@@ -71,7 +73,7 @@ class Settings:
         1e-4, 'standard deviation of a measured position without its own covariance [m]', 1e-9
     )
     sigma_orientation: float = _setting(
-        1e-4 / 0.3,
+        1e-4 / LEVER,
         'standard deviation of a measured orientation without its own covariance [rad]',
         1e-9,
     )

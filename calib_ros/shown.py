@@ -15,7 +15,7 @@ import numpy as np
 from calib_ros.errors import ConfigError
 
 NAMED = 5
-"""Things of a kind that a sentence names."""
+"""Things of a kind that a sentence names; a convention."""
 LISTED = 4 * NAMED
 """Things of a kind that a table or a longer text lists, as four sentences."""
 

@@ -27,7 +27,7 @@ LARGEST_TABLE = 10 * LARGEST_TEXT
 """Bytes of a table."""
 MOST_ROWS = LARGEST_TABLE // 500
 """Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""
-DEEPEST = 20
+DEEPEST = MOST_ENTRIES // 50
 """Levels of nested YAML."""
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20

@@ -21,16 +21,17 @@ from calib_ros.errors import (
     UnknownNameError,
 )
 
-QUATERNION_TOLERANCE = 1e-3
-"""A quaternion whose length differs from 1 by more is refused as not being one."""
+ROUNDED = 1e-3
+"""Share of a whole that numbers of three digits leave: of the length of a quaternion, of a step
+that joint values are multiples of."""
 SAME = 1e-9
-"""Lengths [m] and angles [rad] that differ by less are the same."""
+"""Lengths [m] and angles [rad] that differ by less are the same; a convention."""
 LARGEST = 1e6
 """Largest number [m or rad] that is measured or set; some devices send the largest float for
 none."""
 LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
-LARGEST_SETTING = 2.0**31 - 1.0
+LARGEST_SETTING = float(np.iinfo(np.int32).max)
 """Largest number that is set; ROS has integers of as many bits."""
 MOST_NAMES = MOST_ENTRIES // 20
 """What a cell has of each kind: joints of a chain, frames, targets, sets of joint names."""

@@ -127,9 +127,11 @@ def travel_times(joints: FloatArray, velocities: FloatArray) -> FloatArray:
     return np.asarray(np.abs((joints[:, None] - joints[None]) / velocities).max(axis=2))
 
 
-CORNERS = 0.5 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-PLANE = [7, 5, 0, 2]
-"""Corners of the plane x = z of the cube, round about."""
+CORNERS = 0.5 * np.array(
+    [[x, y, z * x] for z in (1, -1) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+)
+TILTED = range(len(CORNERS) // 2)
+"""Corners of the plane x = z of the cube, round about: they come first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +184,8 @@ def iso_9283_poses(
         )
     travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
     best = cubes.select(travel.argmin()[np.newaxis])
-    wanted = _poses(design, best.centres, 0.8 * edge)[0, PLANE]
-    found = inverse.solve(design.chain, wanted, best.corners[0, PLANE], design.base, design.tool)
+    wanted = _poses(design, best.centres, 0.8 * edge)[0, TILTED]
+    found = inverse.solve(design.chain, wanted, best.corners[0, TILTED], design.base, design.tool)
     if not found.converged.all():
         raise InputError(
             'the arm does not reach the inside of the cube that it reaches: try --seed'

@@ -91,7 +91,8 @@ def moments_of(errors: FloatArray, group: Index) -> FloatArray:
 
 
 SLOPES = (0.5, 2.0)
-"""References k: shifts of one and of four standard deviations show soonest."""
+"""References k of both charts, by Page (1954) half of the shifts that are to show soonest: of one
+and of four standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.spatial import cKDTree
 
-from calib_ros.apply.candidates import PLANE
+from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
@@ -52,7 +52,7 @@ from calib_ros.shown import LISTED, Shown
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None: 'no verdict'}
-NEEDED = 1 + len(PLANE)
+NEEDED = 1 + len(TILTED)
 """Configurations from which a verdict is given, those of a fitted frame not counted: the test
 poses of ISO 9283."""
 DECIDING = 10 * MOST_ENTRIES

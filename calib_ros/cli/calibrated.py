@@ -35,7 +35,7 @@ def _compare(options: argparse.Namespace, screen: Screen) -> int:
         screen.title(found.in_words(), found.same)
         if not found.same:
             screen.table(found.rows())
-    return 0 if found.same else common.NOT_ACCEPTED
+    return 0 if found.same else common.Status.NOT_ACCEPTED
 
 
 def _compensate(options: argparse.Namespace, screen: Screen) -> int:
@@ -62,7 +62,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
             screen.warn(refusal.reason, source.places[refusal.sample])
         if more := result.refusals[NAMED:]:
             screen.warn(f'and {len(more)} more, up to {source.places[more[-1].sample]}', 'refused')
-        return common.NOT_ACCEPTED
+        return common.Status.NOT_ACCEPTED
     write_file(options.out, source.text_with(corrected), overwrite=options.force)
     screen.say(f'wrote {options.out}: {in_words(compensator, result)}')
     words, warning = arm.knowledge(result.joints, result.orientation_before)

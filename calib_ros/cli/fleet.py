@@ -50,8 +50,8 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     if options.out is not None:
         screen.say(f'wrote {options.out}: open {options.out / "index.html"}')
     if number['fine'] + number['unreadable'] < len(found):
-        return common.NOT_ACCEPTED
-    return common.INCOMPLETE if number['unreadable'] else 0
+        return common.Status.NOT_ACCEPTED
+    return common.Status.INCOMPLETE if number['unreadable'] else 0
 
 
 @contextmanager

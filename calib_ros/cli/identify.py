@@ -76,7 +76,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
         else:
             screen.say(common.written(options.out, contents))
-    return 0 if found.result.accepted else common.NOT_ACCEPTED
+    return 0 if found.result.accepted else common.Status.NOT_ACCEPTED
 
 
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
@@ -105,7 +105,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         screen.title(found.in_words(), found.accepted)
         if options.out is not None:
             screen.say(common.written(options.out, contents))
-    return 0 if found.accepted else common.NOT_ACCEPTED
+    return 0 if found.accepted else common.Status.NOT_ACCEPTED
 
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:

@@ -5,7 +5,7 @@
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
 result is not accepted, a program has samples that cannot be compensated, or a corrected arm does
-not pass; 130 interrupted.
+not pass; 4 measurements of some robots of a fleet cannot be used; 130 interrupted.
 """
 
 from __future__ import annotations

@@ -8,16 +8,13 @@ import argparse
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import Field, fields
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.errors import InputError
 from calib_ros.settings import Settings
-
-NOT_ACCEPTED, INCOMPLETE = 3, 4
-"""Exit status when the input was used but what came out does not do; of a fleet, when measurements
-of some robots could not be used and no robot needs a look."""
 
 Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
 Contents: TypeAlias = dict[str, str | bytes]
@@ -44,6 +41,14 @@ LAYOUT = (
     *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
 )
 """Options of tables of others."""
+
+
+class Status(IntEnum):
+    """Exit status when the input was used but what came out does not do."""
+
+    NOT_ACCEPTED = 3
+    INCOMPLETE = 4
+    """Of a fleet: measurements of some robots could not be used, and no robot needs a look."""
 
 
 def complete_robots(prefix: str, **_: Any) -> list[str]:

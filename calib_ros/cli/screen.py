@@ -20,8 +20,10 @@ from typing import Any, TextIO
 from calib_ros.progress import Progress
 
 WIDTH = 80
+"""Columns of a help, and of what is no terminal, by convention."""
 EVERY_S = 2.0
-"""Time between two signs of life; where they stay, as in a log, each time doubles it."""
+"""Time between two signs of life; where they stay, as in a log, each time doubles it.
+A convention."""
 FIRST_S = EVERY_S / 4.0
 """Time after which a bar shows on a terminal."""
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}

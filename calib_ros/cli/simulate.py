@@ -51,7 +51,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
     screen.say(against)
     show(found, screen)
     screen.say(common.written(options.out, contents))
-    return 0 if found.result.accepted else common.NOT_ACCEPTED
+    return 0 if found.result.accepted else common.Status.NOT_ACCEPTED
 
 
 def _write_simulation(

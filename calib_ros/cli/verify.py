@@ -52,7 +52,8 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     for warning in warnings:
         screen.warn(warning)
     show(found, screen)
-    status = common.NOT_ACCEPTED if STANDINGS[found.verdict][0].state in ('bad', 'open') else 0
+    passed = STANDINGS[found.verdict][0].state not in ('bad', 'open')
+    status = 0 if passed else common.Status.NOT_ACCEPTED
     if options.out is None:
         return status
     read = (options.measured, options.commanded, calibration_file(options.calibration))

@@ -19,7 +19,7 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
 from calib_ros.texts import from_cell
-from calib_ros.values import LARGEST, QUATERNION_TOLERANCE, cell_integer, parse_number
+from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 Row = tuple[int, Sequence[str]]
 """A line of a file, and the cells in it."""
@@ -187,7 +187,7 @@ def numbered(texts: Sequence[str]) -> Codes:
 def check_quaternions(columns: Columns, quat: FloatArray) -> None:
     """Refuse quaternions (N, 4) of rows that are not of length 1, but for NaN."""
     lengths = np.sqrt(np.einsum('ni,ni->n', quat, quat))
-    for row in np.flatnonzero(np.abs(lengths - 1.0) > QUATERNION_TOLERANCE)[:1].tolist():
+    for row in np.flatnonzero(np.abs(lengths - 1.0) > ROUNDED)[:1].tolist():
         raise InputError(
             f'{columns.where(row, "quaternion")} qx qy qz qw has length {lengths[row]:.6g}, '
             'expected 1: normalise it, and check the order of the columns'

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
 from calib_ros.files.stored import LARGEST_IMAGE
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
@@ -31,14 +31,14 @@ Corners = tuple[NDArray[np.intp], FloatArray]
 Markers = tuple[FloatArray, NDArray[np.intp]]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
-FEWEST = len(parameters_of('base'))
+FEWEST = IN_A_FRAME
 """Corners of an image that is used: half of their coordinates make its pose, half check it."""
 WINDOW = 0.6
 """Half the window that refines a corner, by the distance to the nearest marker; measured, as is
 WIDEST, by benchmarks/images.py."""
 WIDEST = 10
 """Half of the widest such window [px]."""
-COARSE = 700
+SMALLEST_SIDE = 700
 """Longer side [px] of the smallest image in which markers are sought."""
 
 
@@ -92,7 +92,7 @@ def _dictionary(name: str) -> Any:
 
 
 def _halvings(image: Image) -> int:
-    return int(np.log2(max(*image.shape[:2], COARSE) / COARSE))
+    return int(np.log2(max(*image.shape[:2], SMALLEST_SIDE) / SMALLEST_SIDE))
 
 
 def marker_cells(board: Board) -> list[NDArray[np.bool_]]:

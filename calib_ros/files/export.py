@@ -28,6 +28,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import CalibrationError
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.start import likened
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
@@ -273,5 +274,5 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
     chosen = {joint.driven for joint in start.joints} if 'zero' in kinds else set()
     chosen |= {name for name in start.parameter_names if Parameter(name).kind in kinds}
     names = [name for name in start.parameter_names if name in chosen or start.owns_frame(name)]
-    joints = joints[:: max(1, len(joints) // 200)]  # to be fitted; it is judged on all
+    joints = joints[:: max(1, len(joints) // SOME_POSES)]  # to be fitted; it is judged on all
     return likened(start, names, chain, joints, 1e-3)[0]

@@ -30,6 +30,7 @@ from calib_ros.apply.confidence import rms_interval
 from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.result import Identification
 from calib_ros.identification.validation import ErrorFigures
@@ -174,7 +175,7 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
         result.chain,
         'accepted' if result.accepted else 'refused',
         which.figures,
-        rms_interval(errors.position[shown], errors.configurations[shown], 0.975),
+        rms_interval(errors.position[shown], errors.configurations[shown], INTERVAL),
         reasons=tuple(map(str, result.refusals)),
         remarks=tuple(map(str, (*warnings, *result.remarks))),
         freedom=freedom if np.isfinite(freedom) else None,

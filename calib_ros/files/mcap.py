@@ -9,6 +9,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from enum import IntEnum
 from functools import cache
 from mmap import mmap
 from operator import itemgetter
@@ -19,8 +20,6 @@ from calib_ros.errors import InputError
 from calib_ros.texts import LARGEST_TABLE
 
 MAGIC = b'\x89MCAP0\r\n'
-SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
-CHUNK_INDEX, STATISTICS = 0x08, 0x0B
 _HEAD = struct.Struct('<BQ')  # kind and size
 _LOGGED = struct.Struct('<HIQQ')  # channel, sequence, and when it was logged and published
 MESSAGE_HEAD = _LOGGED.size
@@ -30,6 +29,18 @@ FOOTER = _HEAD.size + struct.calcsize('<QQI') + len(MAGIC)
 MODULES = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
 Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
+
+
+class Kind(IntEnum):
+    """Kinds of records, by their opcodes."""
+
+    SCHEMA = 0x03
+    CHANNEL = 0x04
+    MESSAGE = 0x05
+    CHUNK = 0x06
+    CHUNK_INDEX = 0x08
+    STATISTICS = 0x0B
+    DATA_END = 0x0F
 
 
 class Room:
@@ -63,7 +74,7 @@ def is_indexed(file: Path) -> bool:
             kind, length = _HEAD.unpack(content.read(_HEAD.size))
             kinds.add(kind)
             begin += _HEAD.size + length
-    return CHUNK_INDEX in kinds or {STATISTICS, SCHEMA} <= kinds
+    return Kind.CHUNK_INDEX in kinds or {Kind.STATISTICS, Kind.SCHEMA} <= kinds
 
 
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
@@ -72,12 +83,12 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
     One that is cut off is an EOFError after what it holds, a chunk in another one a ValueError,
     more in them than any recording holds an InputError.
     """
-    room = Room(len(content))
+    room, chunk = Room(len(content)), int(Kind.CHUNK)
     while start < len(content):
         kind, size = _HEAD.unpack_from(content, start)
         start += _HEAD.size
         record = content[start : start + size]
-        if kind == CHUNK:
+        if kind == chunk:
             if nested:
                 raise ValueError('a chunk is within a chunk')
             unpacked = _unpacked(record)
@@ -103,10 +114,10 @@ def logged(
     content = _unpacked(chunk)
     if len(content) != size or checksum not in (0, zlib.crc32(content)):
         raise ValueError('a chunk does not have its size and checksum')
-    found, problem = [], None
+    found, problem, message = [], None, int(Kind.MESSAGE)
     try:
         for kind, record in records(content, nested=True):
-            if kind == MESSAGE:
+            if kind == message:
                 key, _, time, _ = _LOGGED.unpack_from(record)
                 if key in channels and begin <= time <= end:
                     found.append((time, channels[key], record[MESSAGE_HEAD:]))

@@ -22,7 +22,7 @@ from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
-HEAD = 100
+HEAD_LINES = MOST_ENTRIES // 10
 """Lines that the header and the first row of numbers are looked for in."""
 LARGEST_SHEET = 3 * LARGEST_TABLE
 """Bytes of a workbook unpacked."""
@@ -74,7 +74,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
         if separator == ' ':
             text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
             text = re.sub(r'[ \t]+', ' ', text)
-        rows = _cells(path, text[: _after(text, HEAD)], separator)
+        rows = _cells(path, text[: _after(text, HEAD_LINES)], separator)
     decimal = layout.decimal or _decimal(rows, separator, notes)
     at, header = _header(path, rows, names, known)
     used = [header.index(n) for n in names if not n.startswith('#') and n in header]
@@ -179,7 +179,7 @@ def _cell(value: object) -> str:
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
-    lines = [line for line in text[: _after(text, HEAD)].split('\n') if line.strip()]
+    lines = [line for line in text[: _after(text, HEAD_LINES)].split('\n') if line.strip()]
     lines = lines[-30:]  # under most of what stands above the header
     if not lines:
         raise InputError(f'{path} has no rows')
@@ -223,7 +223,7 @@ def _header(
     wanted = {name for name in names if not name.startswith('#')}
     low = {name.lower() for name in known}
     best: tuple[int, set[str]] = (0, wanted)
-    for k, (_, cells) in enumerate(rows[:HEAD]):
+    for k, (_, cells) in enumerate(rows[:HEAD_LINES]):
         missing = wanted - set(cells)
         if wanted and not missing:
             return k, tuple(cells)
@@ -242,7 +242,7 @@ def _header(
 def _first(
     path: Path, rows: Sequence[Row], at: int, used: Sequence[int], decimal: str, notes: list[str]
 ) -> int:
-    limit = HEAD if at < 0 else at + 4  # three lines of units at most
+    limit = HEAD_LINES if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]
         if not used or any(_is_number(cell, decimal) for cell in cells):

@@ -238,17 +238,17 @@ def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
             if content[: len(mcap.MAGIC)] != mcap.MAGIC:
                 raise ValueError('no mcap file')
             for kind, record in mcap.records(content, len(mcap.MAGIC)):
-                if kind == mcap.SCHEMA:
+                if kind == mcap.Kind.SCHEMA:
                     (key,) = struct.unpack_from('<H', record)
                     schemas[key] = mcap.string(record, 2)
-                elif kind == mcap.CHANNEL:
+                elif kind == mcap.Kind.CHANNEL:
                     key, schema = struct.unpack_from('<HH', record)
                     channels[key] = mcap.string(record, 4)
                     found.topics[channels[key]] = schemas[schema]
-                elif kind == mcap.MESSAGE:
+                elif kind == mcap.Kind.MESSAGE:
                     (key,) = struct.unpack_from('<H', record)
                     yield channels[key], record[mcap.MESSAGE_HEAD :]
-                elif kind == mcap.DATA_END:
+                elif kind == mcap.Kind.DATA_END:
                     return
         found.problem = NOT_CLOSED
     except Exception as err:  # decompressors have errors of their own

@@ -43,8 +43,12 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.problems import Measured
 from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
+from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
+
+USUAL_SIGMAS = (Settings.sigma_position, Settings.sigma_orientation)
+"""Standard deviations [m, rad] if nothing else is said."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,7 +63,7 @@ def read_table(
     path: Path | str,
     joints: int,
     sessions: Sequence[str] = (),
-    sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
+    sigmas: tuple[float, float] = USUAL_SIGMAS,
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     told: Told = nobody,
@@ -117,7 +121,7 @@ def table_of(
     found: Columns,
     joints: int,
     sessions: Sequence[str] = (),
-    sigmas: tuple[float, float] = (1e-4, 1e-4 / 0.3),
+    sigmas: tuple[float, float] = USUAL_SIGMAS,
     eye_in_hand: bool = False,
     warnings: tuple[str, ...] = (),
 ) -> Table:

@@ -28,7 +28,7 @@ from calib_ros.progress import Told, nobody
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
 ANSWER_S = 60.0
-"""Time [s] for a scheduler and its first worker to answer."""
+"""Time [s] for a scheduler and its first worker to answer; a convention."""
 DASK = {
     'distributed.worker.profile.enabled': False,
     'distributed.admin.tick.interval': '1s',

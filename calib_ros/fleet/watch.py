@@ -39,12 +39,13 @@ from calib_ros.identification.changes import (
     likely,
     reason_in_words,
 )
-from calib_ros.identification.levels import KNOWN
+from calib_ros.identification.levels import KNOWN, TELLING
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 
-LAGS = (1, 2, 4, 8)
-"""Nights that a change is looked for in: a large one shows at once, a small one after some."""
+LAGS = tuple(2**k for k in range(TELLING.bit_length()))
+"""Nights, 1 to TELLING, that a change is looked for in: a large one shows at once, a small one
+after some."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -87,6 +87,7 @@ class Calibration(Shown):
         """Return that of an identification; `origin` tells of its samples, those `fitted`."""
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
+        rms_mm = round(after.rms_mm, 6)  # one that was loaded knows the same
         record = {
             **made(),
             'accepted': result.accepted,
@@ -95,7 +96,7 @@ class Calibration(Shown):
             'outliers': len(result.outliers),
             'validated_by': result.validated_by,
             'rms_mm_before': round(before.rms_mm, 6),
-            'rms_mm_after': round(after.rms_mm, 6),
+            'rms_mm_after': rms_mm,
             'noise_in_sigma': asdict(noise) | {'shared': list(noise.shared)},
             'not_identifiable': list(result.unidentifiable),
             **about(result.chain, result.before, region),
@@ -108,7 +109,7 @@ class Calibration(Shown):
             names=result.names,
             covariance=result.covariance,
             freedom=result.uncertainty.overall,
-            residual=1e-3 * after.rms_mm,
+            residual=1e-3 * rms_mm,
             noise=noise,
             region=region,
             world_frame=result.world_frame,

@@ -49,8 +49,6 @@ SIZES = {'m': 1e-3, 'rad': 2e-3}
 way costs half a unit of the evidence's logarithm."""
 SCALE_OF_DEVICE = Parameter('device', 'ratio')
 """Growth of all that a device measures: of the lengths of the arm, and of the way to it."""
-MOST_CHANGES = 3
-"""Changes that are looked for; an arm with more is another one."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
 """Kinds in the order in which they are named where two of a joint do the same."""
 

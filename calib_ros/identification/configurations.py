@@ -12,17 +12,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from calib_ros.identification.levels import TELLING
+from calib_ros.identification.levels import ALIKE, CLEARLY, TELLING
 from calib_ros.kinematics.se3 import FloatArray, cos_sin
+from calib_ros.settings import Settings
 
-STILL = 1e-3
-"""Joint values [rad or m] that differ by less are one configuration."""
+STILL = 2.0 * Settings.still
+"""Joint values [rad or m] that differ by less are one configuration: both may leave it."""
 SCATTER = 0.02
 """Distance [rad or m] up to which visits of one configuration may scatter (benchmarks/harm.py)."""
-GAP = 5.0
-"""Ratio of the distance of configurations to that of the visits of one."""
-EXTENT = 2.0
-"""Size of a configuration's visits in units of the longest step between them."""
 
 
 def distinct(numbers: NDArray[np.intp]) -> int:
@@ -69,7 +66,7 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
 def _repeats(place: FloatArray) -> NDArray[np.intp]:
     """Return (N,) which places (N, 2 n) are visits of one configuration that scatter.
 
-    Where the distances of nearest values leave a gap, from so much to GAP times as much, those
+    Where the distances of nearest values leave a gap, from so much to CLEARLY times as much, those
     below it are visits, as long as each configuration is as small as they are.
     """
     count = len(place)
@@ -77,19 +74,19 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
     if count < TELLING:
         return apart
     ranks = range(2, 2 + min(TELLING, count - 1))
-    far, near = cKDTree(place).query(place, k=ranks, distance_upper_bound=GAP * SCATTER)
+    far, near = cKDTree(place).query(place, k=ranks, distance_upper_bound=CLEARLY * SCATTER)
     first, which = np.nonzero(np.isfinite(far))
     graph = _graph(far[first, which], first, near[first, which], count)
     tree = minimum_spanning_tree(graph).tocoo()
-    lengths = np.append(np.sort(tree.data), GAP * SCATTER)
-    gaps = np.flatnonzero((lengths[1:] >= GAP * lengths[:-1]) & (lengths[:-1] <= SCATTER))
+    lengths = np.append(np.sort(tree.data), CLEARLY * SCATTER)
+    gaps = np.flatnonzero((lengths[1:] >= CLEARLY * lengths[:-1]) & (lengths[:-1] <= SCATTER))
     for reach in lengths[gaps[::-1]]:
         close = tree.data <= reach
         links = _graph(tree.data[close], tree.row[close], tree.col[close], count)
         number, label = connected_components(links, directed=False)
         middle = np.stack([np.bincount(label, row) for row in place.T]) / np.bincount(label)
         extent = np.linalg.norm(place - middle.T[label], axis=1).max()
-        if number >= TELLING and extent <= EXTENT * reach:
+        if number >= TELLING and extent <= ALIKE * reach:
             return np.asarray(label, dtype=np.intp)
     return apart
 

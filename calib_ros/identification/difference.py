@@ -30,14 +30,14 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import Columns, Explanation, Told
 from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import followed, structurally_independent
-from calib_ros.identification.levels import CONFIDENT, chance_of
+from calib_ros.identification.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import TYPICAL
 from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 
@@ -150,9 +150,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     told = _told(names, change, square)
     chance, beyond = _chance(told, freedom), _chance(_told(names, change, lacking), freedom)
     changed: list[tuple[Explanation, ...]] = []
-    while len(changed) < changes.MOST_CHANGES and (
-        reasons := changes.reasons_of(told, columns, freedom)
-    ):
+    while len(changed) < SEVERAL and (reasons := changes.reasons_of(told, columns, freedom)):
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
     predicted = _predicted(chain, names)
@@ -212,7 +210,7 @@ def _in_names(
 
 def _told(names: tuple[Parameter, ...], change: FloatArray, square: FloatArray) -> Told:
     scale = np.sqrt(np.diag(square))
-    inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=1e-12) / np.outer(scale, scale)
+    inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=ROUNDING) / np.outer(scale, scale)
     return Told(names, inverse, inverse @ change)
 
 

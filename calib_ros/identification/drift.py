@@ -30,15 +30,16 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from calib_ros.identification.leastsquares import System
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
 SLOW = 3
 """Cosines that are taken out of a series at most; no more than one for ten stops
 (benchmarks/drift.py)."""
-SHIFTS = 400
-"""Shifts that are tried at most; the first of them is none (benchmarks/drift.py)."""
+SHIFTS = 2 * SOME_POSES
+"""Shifts that are tried at most, forwards and backwards; the first of them is none
+(benchmarks/drift.py)."""
 
 
 @dataclass(frozen=True, eq=False)

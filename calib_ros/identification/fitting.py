@@ -35,10 +35,11 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 
-SOME = 500
+SOME = 2 * SOME_POSES
 """Pairs that are enough for a first fit, or for a linear model of them."""
 FOLLOWED = 2.0
-"""Part of what it lacks that the geometric model does not follow: one over this."""
+"""Part of what it lacks that the geometric model does not follow: one over this
+(benchmarks/real_robots.py)."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lapack
 
+from calib_ros.identification.sizes import TYPICAL
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -22,7 +23,7 @@ from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
-DEGENERATE = 1e-3
+DEGENERATE = TYPICAL['angle']
 """Share of the largest extent up to which there is none: of points of a board, of the column of a
 base or tool frame that those before it leave. Orientations that vary by a milliradian vary by no
 more than an arm's own errors: a tool that follows from them would be anywhere, kilometres away as

@@ -11,6 +11,7 @@ that matrix is well conditioned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeAlias
@@ -23,19 +24,20 @@ from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
+from calib_ros.settings import Limits
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[NDArray[np.intp]]
 """The number (N,) of the fold of every sample, set by set."""
 STEP_TOLERANCE = 1e-6
 """The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
-larger, in RMS residuals)."""
+larger, in RMS residuals): a thousandth of what a million rows tell."""
 PATIENCE = 3
-"""Steps in succession that may raise the cost before they are damped."""
+"""Steps in succession that may raise the cost before they are damped; a convention."""
 SEPARATION_SIGMA = 1e-5
-"""Standard deviation [m] of a known distance between sockets."""
-SMALL_STEP = 1e-3
-"""Step [m or rad] whose second order, half its square, is a thousandth of a millimetre at most."""
+"""Standard deviation [m] of a known distance between sockets: of what is machined, assumed."""
+SMALL_STEP = math.sqrt(Limits.largest_position_error)
+"""Step [m or rad] whose second order, half its square, is an error that may remain."""
 
 
 @dataclass(frozen=True)
@@ -294,7 +296,7 @@ def minimise(
         promised = foreseen if normal is best else promised
         normal = normal_equations(chain, names, system)
         gain = best.cost - normal.cost
-        if gain >= -1e-12 * best.cost:
+        if gain >= -ROUNDING * best.cost:
             best, best_chain, growth = normal, chain, 2.0
             if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)

@@ -19,10 +19,11 @@ from scipy import linalg
 from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
 from calib_ros.identification.leastsquares import owners, stacked
-from calib_ros.identification.levels import CERTAIN, CONFIDENT, SURE
+from calib_ros.identification.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.result import Identification
+from calib_ros.identification.sizes import TYPICAL
 from calib_ros.identification.validation import COUNTS, log_gain
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
@@ -32,10 +33,11 @@ from calib_ros.progress import Told, nobody
 
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
-SIZES = (1e-4, 2e-5)
+HARMONIC_SIZES = (TYPICAL['drive'], TYPICAL['drive'] / CLEARLY)
 """Sizes [rad] of which all harmonics together may be (benchmarks/real_robots.py)."""
 COMPARED = 3000
-"""Samples by which effects are compared; of more, every so many are taken."""
+"""Samples by which effects are compared; of more, every so many are taken, to save time.
+By 2,000 errors are the same within 1e-4 (benchmarks/real_robots.py)."""
 
 
 class LinearModel:
@@ -141,7 +143,7 @@ class LinearModel:
     def judge_all_harmonics(self, chosen: Sequence[str]) -> Verdict:
         """Judge all harmonics together, of the usual size and else of a smaller one."""
         new = [name for name in self.harmonics if name not in chosen]
-        for size in SIZES:
+        for size in HARMONIC_SIZES:
             verdict = self.judge(
                 chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn', size
             )

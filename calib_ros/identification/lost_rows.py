@@ -16,15 +16,21 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.levels import LEAST_ASIDE
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import EXCEPTION
 
-SHIFTS = (0, 1, -1, 2, -2)
-LEAST, ENOUGH = 18, 0.9
-"""Rows of a table, and the share of them that a loss must explain."""
-MOST = 2000
+LOST = (0, 1, -1, 2, -2)
+"""Rows that may be missing; more at once are no slip (benchmarks/mistakes.py loses one)."""
+FEWEST_ROWS = 3 * IN_A_FRAME
+"""Rows of a table: base and tool alone explain nearly all of fewer in a third of it."""
+MOST_SEARCHED = 10 * SOME_POSES
 """Rows that are looked at."""
+EXPLAINED_ROWS = 1.0 - EXCEPTION
+"""Share of the rows that a loss must explain."""
 
 Errors = Callable[[Chain, Observations], FloatArray]
 Framed = Callable[[Observations], Chain | None]
@@ -61,13 +67,13 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
     pairs; up to `largest` they are those of a faulty arm.
     """
     count = len(seen)
-    if not LEAST <= count <= MOST:
+    if not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
     best: Loss | None = None
-    good = ENOUGH * count
+    good = EXPLAINED_ROWS * count
     for chain in _frames(seen, framed):
-        tables = {s: _shifted(chain, seen, s, errors) for s in SHIFTS}
-        for before, after in product(SHIFTS, SHIFTS):
+        tables = {s: _shifted(chain, seen, s, errors) for s in LOST}
+        for before, after in product(LOST, LOST):
             if before == after or (before and after):
                 continue
             row = _where(tables[before] <= largest, tables[after] <= largest)
@@ -82,7 +88,7 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
 def _frames(seen: Observations, framed: Framed) -> Iterator[Chain]:
     """Yield the chain in the frames by the first and the last third, for each shift."""
     third = len(seen) // 3
-    for part, shift in product((slice(third), slice(-third, None)), SHIFTS):
+    for part, shift in product((slice(third), slice(-third, None)), LOST):
         rows = np.arange(len(seen))[part]
         rows = rows[(rows + shift >= 0) & (rows + shift < len(seen))]
         chain = framed(_paired(seen, rows, shift))
@@ -114,8 +120,8 @@ def _apart(before: FloatArray, after: FloatArray, row: int, largest: float) -> b
     """Tell whether either side fits by its own shift and not by that of the other."""
     sides = (before[:row], after[:row]), (after[row:], before[row:])
     return all(
-        len(own) >= 3
-        and np.mean(own <= largest) > ENOUGH - 0.1
+        len(own) >= LEAST_ASIDE
+        and np.mean(own <= largest) > EXPLAINED_ROWS - EXCEPTION
         and np.mean(other <= largest) < 0.5
         for own, other in sides
     )

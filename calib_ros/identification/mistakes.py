@@ -25,7 +25,7 @@ import numpy as np
 
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, factor_of, minimise
-from calib_ros.identification.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER
+from calib_ros.identification.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER, SEVERAL, TRIED
 from calib_ros.identification.lost_rows import lost
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
@@ -39,12 +39,8 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
-
-POLISHED = 6
-"""Suspects that are polished (benchmarks/mistakes.py)."""
-MOST_AT_ONCE = 4
-"""Mistakes made at once that are looked for (benchmarks/mistakes.py)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +104,7 @@ def explained(problem: Problem) -> Explained | None:
         for each in problem.sets
         if each.distances is None and _of_images(problem) == (each.pixels is not None)
     )
-    if not sets or max(map(len, sets)) < 6:
+    if not sets or max(map(len, sets)) < IN_A_FRAME:
         return None  # base and tool alone explain nearly all of them
     if not any(each.socket for each in sets):
         sets = (max(sets, key=len),)
@@ -146,7 +142,7 @@ def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explain
         found = _tried(each.chain or chain, each.undone(few))
         if found is not None and found.share < given.share:
             rough.append((found, each))
-    for found, each in sorted(rough, key=lambda one: one[0].share)[:POLISHED]:
+    for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
         so = _polished(problem, found)
         if so.error <= _largest(problem):  # an arm in mm fits places in mm, and is off by metres
             tried.append((so.share, so, each))
@@ -161,7 +157,7 @@ def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explain
     named = [each for each in named if each.rank == lowest]
     named += [each for share, _, each in tried if ALIKE * least < share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
-    return Explained(tuple(unlike.values())[:3], given.error, best.error)
+    return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
 
 def _largest(problem: Problem) -> float:
@@ -219,7 +215,7 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
     largest, share = min(_largest(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
     least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
-    for _ in range(MOST_AT_ONCE):
+    for _ in range(SEVERAL + 1):  # of joints, and one of how poses are written
         found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
         for some in kept:
             for each in options:
@@ -228,7 +224,7 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
                     trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
                     if trial is not None:  # others may be the same in other words
                         found.setdefault(round(trial.share, 6), (trial, more))
-        best = [found[key] for key in sorted(found)[:POLISHED]]
+        best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (len(best[0][1]) > 1 and best[0][0].share > CONFIDENT * least):
             return None
         least = best[0][0].share

@@ -18,15 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.identification.identification import identify
+from calib_ros.identification.levels import SEVERAL
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.result import Identification
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import Told, nobody, share_of
-
-SEVERAL = 3
-"""Harmonics that are added before all of them are tried at once (benchmarks/real_robots.py)."""
 
 
 def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:

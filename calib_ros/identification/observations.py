@@ -30,7 +30,8 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
 NO_ROTATION = 0.05
 """Difference of R^T R from the identity from which R is no rotation: two digits leave 0.02."""
 SOME_POSES = 200
-"""Poses that stand for many: random ones for the joint range, even ones for those measured."""
+"""Poses that stand for many: random ones for the joint range, even ones for those measured.
+A convention, of which other counts are multiples."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -24,13 +24,14 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 
 SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
 
 
 TOOL = 1.0
-"""Length [m] that no target on a flange exceeds."""
+"""Length [m] that no target on a flange exceeds, assumed."""
 
 
 @dataclass(frozen=True)
@@ -95,22 +96,22 @@ class Problem(Shown):
     chain: Chain
     observations: Observations
     held_out: Observations | Sequence[Observations] | None = None
-    sigma_position: float = 1e-4
-    sigma_orientation: float = 1e-4 / 0.3
+    sigma_position: float = Settings.sigma_position
+    sigma_orientation: float = Settings.sigma_orientation
     fixed: Sequence[str] = ()
-    folds: int = 5
-    largest_length: float = 0.05
-    largest_angle: float = 0.1
-    largest_error: float = 0.01
-    loss: str = 'redescending'
+    folds: int = Settings.folds
+    largest_length: float = Settings.largest_length
+    largest_angle: float = Settings.largest_angle
+    largest_error: float = Settings.largest_error
+    loss: str = Settings.loss
     priors: Mapping[str, float] = field(default_factory=dict)
     effects: Sequence[str] = ()
     more: Sequence[Observations] = ()
     world_frame: str = ''
     separations: Sequence[tuple[str, str, float]] = ()
     learned: Learned | None = None
-    sigma_pixel: float = 0.3
-    sigma_touch: float = 1e-4
+    sigma_pixel: float = Settings.sigma_pixel
+    sigma_touch: float = Settings.sigma_position
     of_messages: bool = False
 
     def __post_init__(self) -> None:

@@ -25,7 +25,7 @@ from calib_ros.identification.calibration import Calibration, about, made
 from calib_ros.identification.changes import SCALE_OF_DEVICE, Columns, Explanation, Told
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.leastsquares import System, minimise, normal_equations, products_of
-from calib_ros.identification.levels import SCALE, chance_of
+from calib_ros.identification.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
 from calib_ros.identification.problem import Problem
@@ -35,12 +35,9 @@ from calib_ros.identification.robust import OUTLIER
 from calib_ros.identification.validation import ErrorFigures, left_out, residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
-
-FEWEST, SUSPECTS = 6, 4
-"""Poses of which one may contradict the others, and those tried, with the largest errors."""
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -102,11 +99,11 @@ def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Pro
     sets = (*problem.sets, *problem.judging)
     sizes = [norms(residuals(chain, each).position) for each in sets]
     order = np.argsort(-np.concatenate(sizes))
-    if not len(order) >= FEWEST or any(each.pixels is not None for each in sets):
+    if not len(order) >= IN_A_FRAME or any(each.pixels is not None for each in sets):
         return
     owner = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
     first = np.cumsum([0, *(len(each) for each in sets)])
-    for k in order[:SUSPECTS].tolist():
+    for k in order[:TRIED].tolist():
         number = int(owner[k])
         pose = k - int(first[number])
         rest = [
@@ -140,7 +137,7 @@ def _recalibrated(
     changed: list[tuple[Explanation, ...]] = []
     earlier = arm.changed(np.zeros(len(arm.names)))
     found = arm.solved(system)
-    while len(changed) < changes.MOST_CHANGES and (
+    while len(changed) < SEVERAL and (
         reasons := changes.reasons_of(found.told.beside(arm.square), columns, previous.freedom)
     ):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:

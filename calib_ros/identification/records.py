@@ -33,7 +33,8 @@ Owner: TypeAlias = tuple[str, bool, bool, str]
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
 Hashes: TypeAlias = NDArray[np.uint64]
 KEPT = 256
-"""Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept."""
+"""Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept.
+Part of the format of files, as GRID."""
 GRID = 1.618e-6
 """Values [rad, m or px] in one cell are equal; no decimal number is near the edge of a cell."""
 

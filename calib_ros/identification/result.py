@@ -13,7 +13,7 @@ from scipy import special
 from calib_ros.errors import ConfigError
 from calib_ros.identification import identifiability
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.levels import KNOWN
+from calib_ros.identification.levels import CONFIDENT, KNOWN
 from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.reasons import Reason
@@ -116,7 +116,7 @@ class Identification(Shown):
         """
         return self.posterior.expected(q)
 
-    def confidence_ellipsoid(self, q: FloatArray, level: float = 0.95) -> FloatArray:
+    def confidence_ellipsoid(self, q: FloatArray, level: float = CONFIDENT) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
 
         By the F distribution where the size of the noise was estimated from the residuals, by

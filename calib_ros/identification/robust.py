@@ -39,11 +39,12 @@ from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
-INNER, OUTER = 5.0, 7.0
+OUTLIER = 6.0
+"""Distance [scale] beyond which a sample is named as an outlier: where it has lost half of its
+weight (benchmarks/outliers.py)."""
+INNER, OUTER = OUTLIER - 1.0, OUTLIER + 1.0
 """Distances [scale] at which a sample begins to lose weight, and has none left. Of Gaussian
 errors in three directions 2 of 100,000 lie beyond the first."""
-OUTLIER = 0.5 * (INNER + OUTER)
-"""Distance beyond which a sample is named as an outlier: where it has lost half of its weight."""
 MANY = 20_000
 """Samples that tell which of them are gross errors, a sample in ten thousand aside
 (benchmarks/end_to_end.py)."""

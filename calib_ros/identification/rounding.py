@@ -20,18 +20,15 @@ from scipy import linalg
 
 from calib_ros.identification.changes import Told
 from calib_ros.identification.leastsquares import owners, stacked
-from calib_ros.identification.levels import SURE, chance_of
+from calib_ros.identification.levels import CLEARLY, SURE, chance_of
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.values import ROUNDED
 
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
 """Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are wanted."""
-WIDER = 5
-"""How many times as wide a step must not fit as well (benchmarks/harm.py)."""
-WHOLE = 1e-3
-"""Share of a step by which multiples of it may be off."""
 
 
 def rounded(problem: Problem) -> dict[str, float]:
@@ -60,14 +57,14 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 def _step(values: FloatArray) -> float:
     """Return the step that different values (N,) are multiples of; zero where there is none."""
     few = values[:3, np.newaxis] / STEPS
-    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < WHOLE, STEPS).tolist()
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
     step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
-    wider = _are_multiples(values, WIDER * step) if step else True
+    wider = _are_multiples(values, CLEARLY * step) if step else True
     return 0.0 if wider or len(np.unique(values)) < 3 else step
 
 
 def _are_multiples(values: FloatArray, step: float) -> bool:
-    return bool(np.abs(values / step - np.round(values / step)).max() < WHOLE)
+    return bool(np.abs(values / step - np.round(values / step)).max() < ROUNDED)
 
 
 def may_be_rounding(

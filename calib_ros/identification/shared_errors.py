@@ -33,6 +33,7 @@ from scipy.spatial.distance import cdist
 
 from calib_ros.identification.leastsquares import Fit, System, gram
 from calib_ros.identification.levels import CERTAIN, TELLING
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
@@ -41,9 +42,8 @@ LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
 NEARBY = 3
 """Neighbours in joint space of each configuration that are tested (benchmarks/drift.py)."""
-MOST_STOPS = 400
-"""Stops on which sizes are estimated; of more, every so many runs of a
-twentieth."""
+MOST_STOPS = 2 * SOME_POSES
+"""Stops on which sizes are estimated; of more, every so many runs of a twentieth."""
 ELSEWHERE = 4.0 * LARGEST
 """Distance of the stops of different sets, which are no neighbours."""
 

@@ -11,10 +11,11 @@ from scipy import special
 from scipy.linalg import lapack
 
 from calib_ros.identification.levels import CONFIDENT
+from calib_ros.kinematics.effects import EXPECTED
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 
-TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': 1e-4, 'coupling': 1e-3}
-TYPICAL |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': EXPECTED['gear'], 'coupling': 1e-3}
+TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backlash')}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
 """Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
@@ -24,8 +25,9 @@ TAILS = 3.0
 SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
 """Logarithms of the ratio of probabilities beyond which effects show, and from which those of
 usual size are refuted."""
-SETTLED = 0.02
-"""Change of the logarithm of a size from which on it stands still."""
+SETTLED = 0.01 * float(np.log(SPREAD))
+"""Change of the logarithm of a size from which on it stands still: a hundredth of what is known of
+it beforehand."""
 LEAST_SIZE = SPREAD**-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 

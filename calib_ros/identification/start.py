@@ -34,13 +34,10 @@ from calib_ros.identification.robust import robust_fit, thorough_fit
 from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
-from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
-
-GOOD = 0.03
-"""Share of the spread below which an error needs no search, and two starts are the same."""
+from calib_ros.settings import EXCEPTION, Settings
 
 
 def start_frames(
@@ -97,7 +94,7 @@ def _start_one(
     for starts in _starts(chain, subset):
         for start in starts:
             away = norms(residual_arrays(start, subset)[0] - left)
-            if np.median(away) <= GOOD * spread:  # the same, before it is fitted
+            if np.median(away) <= EXCEPTION * spread:  # the same, before it is fitted
                 continue
             normal = normal_equations(start, names, system)
             told = excited(factor_of(start, names, system, normal), names)
@@ -108,7 +105,7 @@ def _start_one(
             error = np.median(norms(residual))
             if error < least:
                 best, least, determined, left = fitted, error, told, residual
-        if least <= GOOD * spread:
+        if least <= EXCEPTION * spread:  # no other valley is as low: no search is needed
             break
     return robust_fit(best, determined, system, loss).fit.chain
 
@@ -140,16 +137,16 @@ def likened(
     names: Sequence[str],
     arm: Chain,
     joints: FloatArray,
-    sigma_orientation: float = 1e-4 / LEVER,
+    sigma_orientation: float = Settings.sigma_orientation,
 ) -> tuple[Chain, float]:
     """Return a chain that does as an arm does at joint values (N, n), and the RMS distance [m].
 
     Parameters are fitted, the first ones of those that do the same, to exact poses; a turn by
-    `sigma_orientation` [rad] counts as much as a shift by 0.1 mm.
+    `sigma_orientation` [rad] counts as much as a shift by the usual sigma.
     """
     poses = arm.forward(joints)
     seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
-    system = System((Samples(seen, 1e-4, sigma_orientation),))
+    system = System((Samples(seen, Settings.sigma_position, sigma_orientation),))
     fitted = minimise(chain, structurally_independent(chain, names), system).chain
     left = fitted.forward(joints)[:, :3, 3] - seen.positions
     return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))

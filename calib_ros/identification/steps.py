@@ -30,7 +30,7 @@ from calib_ros.identification.configurations import stops
 from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, gram
-from calib_ros.identification.levels import SURE, chance_of
+from calib_ros.identification.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import Robust, weights_of
@@ -41,8 +41,6 @@ from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 EXPLAINED = 0.5
 """Share of the squares of the residuals from which on something explains them: most of them
 (benchmarks/harm.py)."""
-LEAST_ASIDE = 3
-"""Stops before and after a step: fewer are gross errors."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from scipy import special
 
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
-from calib_ros.identification.levels import NEARER, SCALE, SURE
+from calib_ros.identification.levels import CLEARLY, NEARER, SCALE, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.result import Identification
@@ -45,18 +45,16 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Limits
 
 LEAST_SCALE = 0.5 * SCALE
 """Of a device of which it is told: half of what those of good ones scatter by."""
-LARGEST_SCALE = 1e-3
-"""Growth of an arm by 40 degrees, if all of it is of aluminium (23 ppm a degree)."""
+LARGEST_SCALE = 10.0 * SCALE
+"""More than no arm grows by: 40 degrees do it, if all of it is of aluminium (23 ppm a degree)."""
 LEAST_NOISE = 0.04
 """Residuals in units of the sigmas given below which these are wrong: devices repeat ten times as
 well as they measure, and mm are thousandths."""
-OUTWEIGHED = 5.0
-"""Ratio of what is left of orientations and of positions, in units of their sigmas, from which on
-the orientations spoil an arm: 9 make it 2.8 times worse, 30 eight times (docs/mistakes.md)."""
-SIMULATED = 1e-6
+SIMULATED = Limits.largest_position_error
 """Residuals [m or rad] below which no device measured them."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths that are tried."""
@@ -200,7 +198,7 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         left = f'{1e3 * size * given:.2g} m{unit} are left'
         if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
             found.append(f'{name}, and only {left}: was m{unit} meant?')
-        elif k and size > OUTWEIGHED * max(noise.position, 1.0) and size * given < most:
+        elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
             found.append(
                 f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
                 f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'

@@ -47,7 +47,7 @@ class ParameterRow:
     status: str
     freedom: float = np.inf
 
-    def half_width(self, level: float = 0.95) -> float | None:
+    def half_width(self, level: float = CONFIDENT) -> float | None:
         """Return half the width of the interval that holds the truth, by Student's t."""
         if self.std is None:
             return None

@@ -32,7 +32,7 @@ from calib_ros.texts import dump_yaml, parse_yaml
 from calib_ros.values import (
     LARGEST,
     MOST_NAMES,
-    QUATERNION_TOLERANCE,
+    ROUNDED,
     parse_mapping,
     parse_name,
     parse_number,
@@ -288,7 +288,7 @@ def _frame(value: object, where: str) -> Frame | None:
     xyz = parse_numbers(content.get('xyz', [0.0, 0.0, 0.0]), 3, f'{where}.xyz')
     quat = parse_numbers(content.get('quat_xyzw', [0.0, 0.0, 0.0, 1.0]), 4, f'{where}.quat_xyzw')
     length = float(np.linalg.norm(quat))
-    if abs(length - 1.0) > QUATERNION_TOLERANCE:
+    if abs(length - 1.0) > ROUNDED:
         raise ConfigError(f'{where}.quat_xyzw must have length 1 (x, y, z, w), not {length:.6g}')
     delay = content.get('delay')
     return Frame(

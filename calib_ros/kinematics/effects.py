@@ -64,6 +64,10 @@ GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 
 """Groups of effects that can be switched on together. `gear` has the harmonics at the gear ratio
 and twice that of joints that give one; others are found from data (`model_choice.py`). `coupling`
 is that of the wrist, the last three joints."""
+EXPECTED = dict.fromkeys(GROUPS, 1e-4)
+EXPECTED |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
+"""Size [rad] that an effect may have, by its group: a third of an arc minute of a drive's own
+errors, an arc minute of what bends (for a torque arm of a metre) or has play."""
 
 
 def group_of(name: str) -> str:
@@ -141,11 +145,10 @@ def check(name: str, joints: Sequence[str]) -> None:
 def expected(name: str) -> float:
     """Return the size that an effect may have: the standard deviation of its prior.
 
-    A third of an arc minute of a drive's own errors, an arc minute of what bends (for a torque arm
-    of a metre) or has play. Without it a harmonic that is sampled over part of a turn trades
-    against constants without bound, and misleads wherever else the arm goes.
+    Without it a harmonic that is sampled over part of a turn trades against constants without
+    bound, and misleads wherever else the arm goes.
     """
-    return 3e-4 if group_of(name) in ('gravity', 'compliance', 'backlash') else 1e-4
+    return EXPECTED[group_of(name)]
 
 
 def basis(

@@ -44,11 +44,9 @@ from calib_ros.kinematics.se3 import (
 )
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Told, nobody
+from calib_ros.settings import LEVER as LEVER
 from calib_ros.shown import Shown
 from calib_ros.values import SAME
-
-LEVER = 0.3
-"""Length [m] at which a turn counts as much as a shift."""
 
 
 @dataclass(frozen=True, eq=False)

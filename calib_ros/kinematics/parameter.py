@@ -86,3 +86,7 @@ def _unit(name: Parameter) -> str:
 def parameters_of(owner: str, kinds: Iterable[str] = FRAME_KINDS) -> tuple[Parameter, ...]:
     """Return parameters of one owner; those of a frame's place if no kinds are given."""
     return tuple(Parameter(owner, kind) for kind in kinds)
+
+
+IN_A_FRAME = len(FRAME_KINDS)
+"""Parameters of a frame's place; base and tool alone explain nearly all of fewer poses."""

@@ -37,9 +37,10 @@ from calib_ros.kinematics.chain import (
 )
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
+from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES, SAME
 
-MOST_APART = 0.2
+MOST_APART = 2.0 * Settings.largest_angle
 """Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
 
 
@@ -95,7 +96,7 @@ def chain_from_urdf(
         bends = [Joint('straight'), *rows[:-1]]
         pairs = zip(rows, bends, strict=True)
         rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
-    x, y, z = (_clean(-9.81 * part) for part in first[2, :3].tolist())
+    x, y, z = (_clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
     ends = _ends(chain)
     return replace(

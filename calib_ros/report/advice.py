@@ -37,8 +37,9 @@ class Advice:
 
 
 ENOUGH = 25
-"""Different poses that are worth judging, and that `calib_ros plan` chooses unless told."""
-SPREAD = 'spread over the whole workspace, with every joint moved through most of its range'
+"""Different poses that are worth judging, and that `calib_ros plan` chooses unless told: a
+convention."""
+SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'
 
 
 @cache

@@ -17,11 +17,11 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
-from calib_ros.report.advice import SPREAD
+from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer, numbers, unit_of
 
-MOVED = (
+SOMETHING_MOVED = (
     'Check that the measuring device, the target and the robot stand as they did for the '
     'calibration; if not, use --new-base or --new-tool.'
 )
@@ -34,18 +34,18 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     'FAIL': (
         Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
         (
-            MOVED,
+            SOMETHING_MOVED,
             'Check that the correction is active in the controller (--commanded tells).',
             'Calibrate again with new poses; try --model auto.',
         ),
     ),
     'UNDECIDED': (
         Verdict('open', 'UNDECIDED: too few measurements to tell'),
-        (f'Measure more poses, {SPREAD}, and verify again with all of them.',),
+        (f'Measure more poses, {SPREAD_OUT}, and verify again with all of them.',),
     ),
     'does not hold': (
         Verdict('bad', 'The calibration does not hold any more'),
-        (MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
+        (SOMETHING_MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
     ),
     'holds': (Verdict('good', 'The calibration holds: the error is as it was'), (TOLERANCE,)),
     'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),

@@ -11,6 +11,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.apply.workspace import Survey, rms_map
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -23,7 +24,7 @@ Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
 DOTTED = {'color': LIMIT, 'dash': 'dot'}
-QUANTILES = 400
+QUANTILES = 2 * SOME_POSES
 """Points of a curve that stands for any number of poses."""
 REVERSED = {'autorange': 'reversed', 'automargin': True}
 """A vertical axis with the first row on top."""

@@ -22,7 +22,7 @@ from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line
 
 MARGIN = 0.01
-"""What is left free around a board [m]."""
+"""What is left free around a board [m]; a convention."""
 
 
 def before_after_png(result: Identification) -> bytes:

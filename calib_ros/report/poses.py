@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.observations import Observations
+from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.result import Identification
+from calib_ros.identification.robust import MANY
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import DH_KINDS
@@ -32,15 +34,17 @@ from calib_ros.texts import one_line
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted; left out to judge; left out at a fitted configuration."""
-SINGLE = 20_000
+SINGLE = MANY
 """Poses that are shown one by one; of more so many, evenly spread, give the quantiles."""
-WORST = 300
+WORST = 2 * SOME_POSES
 """Poses of the largest errors, and outliers, that are listed of more."""
 BANDS = 60
-"""Parts of the session, and of each joint's values, whose quantiles are shown."""
-CELLS = 24
-"""Cells along the longest edge of the workspace."""
-SHARES = (0.05, 0.5, 0.95)
+"""Parts of the session, and of each joint's values, whose quantiles are shown; a
+convention."""
+CELLS = round(SINGLE ** (1 / 3))
+"""Cells along the longest edge of the workspace: no more of them than single poses."""
+SHARES = (1.0 - CONFIDENT, 0.5, CONFIDENT)
+"""Quantiles that are shown."""
 ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
 WHEN = ('before', 'after')
 NAMELESS: Mapping[int, str] = {}

@@ -12,8 +12,9 @@ import numpy as np
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.levels import CONFIDENT, INTERVAL
 from calib_ros.identification.linear_model import COMPARED
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.result import Identification
@@ -21,7 +22,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import GOOD_ARM, SPREAD, Advice, Situation, advice
+from calib_ros.report.advice import GOOD_ARM, SPREAD_OUT, Advice, Situation, advice
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
@@ -35,8 +36,8 @@ UNPROVEN = (
 )
 CAUSES = {Rule.MISTAKE, Rule.MOVED, Rule.ENCODER}
 """What names its cause, so that it is said first."""
-SURVEYED = 4000
-"""Random poses of the error map."""
+SURVEYED = 20 * SOME_POSES
+"""Random poses of the error map: some for each of its cells."""
 
 
 def identification_report(
@@ -116,7 +117,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         return ()
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = sections.limits_of(judged, 0, sections.INTERVAL)
+        lower, _ = sections.limits_of(judged, 0, INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
     held_out = () if judged is None or judged.repeated is None else (judged,)
@@ -167,7 +168,7 @@ def _steps(
         'gravity and play add, where that helps.': beyond and not result.chain.effects,
         'Compare what is left with the accuracy of the measuring device: no calibration gets '
         'below that.': beyond,
-        f'Measure more poses to decide about the tolerance, {SPREAD}.': undecided,
+        f'Measure more poses to decide about the tolerance, {SPREAD_OUT}.': undecided,
         f'{NOT_YET}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': True,

@@ -12,7 +12,7 @@ import numpy as np
 import calib_ros
 from calib_ros.apply.confidence import rms_interval
 from calib_ros.files.history import is_time
-from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -20,8 +20,6 @@ from calib_ros.report import figures
 from calib_ros.report.page import Origin, Section, section
 from calib_ros.report.poses import Poses
 
-INTERVAL = 0.5 + 0.5 * CONFIDENT
-"""One-sided confidence of each limit of an interval of 95 %."""
 ISO_9283 = (
     'Errors are position accuracies in the terms of ISO 9283: the distance between the pose '
     'commanded and the mean of the poses attained. Where a pose was measured once, its '

@@ -29,8 +29,9 @@ from calib_ros.settings import Settings
 from calib_ros.shown import some
 from calib_ros.texts import dump_yaml
 
-WEAK = 0.01
-"""A parameter with a larger standard deviation [m or rad] is named as weakly determined."""
+WEAK = Settings.largest_error
+"""A parameter with a larger standard deviation [m or rad] is named as weakly determined: an arm
+that errs by more is not accepted."""
 
 
 def summary(
@@ -177,7 +178,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
     def parameter(p: ParameterRow) -> dict[str, Any]:
         found = {'value': p.value, 'offset': p.offset, 'std': p.std}
-        found['half_width_95'] = p.half_width(0.95)
+        found['half_width_95'] = p.half_width()
         return found | {'unit': p.name.unit, 'status': p.status}
 
     judged = result.validation

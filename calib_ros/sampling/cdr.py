@@ -24,7 +24,7 @@ from calib_ros.sampling.messages import JOINT_STATE, TRANSFORM, TRANSFORMS, Read
 from calib_ros.values import MOST_NAMES
 
 LITTLE_ENDIAN = b'\x00\x01'
-_HEAD = 4  # bytes of the encapsulation
+_HEAD = len(LITTLE_ENDIAN) + 2  # bytes of the encapsulation: how it is encoded, and options
 _FORMS: dict[str, tuple[int, int, str, int]] = {
     JOINT_STATE: (1, 0, '<f8', 0),
     TRANSFORM: (2, 0, '<f8', 7),

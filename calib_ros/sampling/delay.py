@@ -36,8 +36,8 @@ LEAST_MOTION = 3.0 * Settings.lateness
 """Time in motion that is needed [s]: so that most of it is compared at every delay."""
 ALIKE_ENOUGH = float(np.sqrt(1.0 - MOST_OUTLIERS))
 """Least correlation: no more of the speeds' variance may be something else than of samples."""
-RISE = 0.02
-"""Least rise of the correlation beyond a valley for another peak."""
+RISE = EXCEPTION * (1.0 - ALIKE_ENOUGH)
+"""Least rise of the correlation beyond a valley for another peak: a tenth of what it may lack."""
 MOST_TIME = 100.0 * LEAST_MOTION
 """Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
 

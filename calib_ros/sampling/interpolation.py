@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from calib_ros.identification.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.slices import Rows, Stamps
-from calib_ros.settings import Settings
 
-MOVED = 2.0 * Settings.still
+MOVED = STILL
 """A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
 
 

@@ -45,15 +45,15 @@ from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import ANGLES, DELAY, Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDS, FloatArray
+from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 from calib_ros.sampling.sample import Frames, Sample, collect
 from calib_ros.settings import EXCEPTION, Settings
 
 WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)
 """Standard deviations [m, rad] of arm parameters before anything is measured: five times as much
 is another robot."""
-START = len(parameters_of('base'))
+START = IN_A_FRAME
 """Configurations with which two frames are found: of three coordinates each, for two unknowns."""
 MOST_THOROUGH = 60
 """Parameters up to which it begins with the thorough fit: it takes 4 s instead of 1 s for 200."""
@@ -63,7 +63,8 @@ deviations shrink by EXCEPTION."""
 MOST_AT_ONCE = 4 * SOME
 """Samples that one update adds at most; the rest waits for the next ones."""
 LITTLE = 0.35
-"""Range [rad] of a joint over all samples that is too little; a tenth of it [m]."""
+"""Range [rad] of a joint over all samples that is too little: 20 degrees; a tenth of it [m].
+A convention."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +252,7 @@ class LiveEstimate:
     def _scaled(self) -> tuple[FloatArray, FloatArray]:
         """Return scales (P,), and the information matrix with a diagonal of one by them."""
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
-        matrix = self._information * np.outer(scale, scale) + 1e-12 * np.eye(len(scale))
+        matrix = self._information * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
         return scale, matrix
 
     def _step(self) -> FloatArray:

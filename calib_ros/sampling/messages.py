@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics.se3 import Flags, FloatArray
-from calib_ros.values import LARGEST as LARGEST, QUATERNION_TOLERANCE, covariance_fault
+from calib_ros.values import LARGEST as LARGEST, ROUNDED, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
@@ -135,7 +135,7 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
     if width >= 7:
         with np.errstate(over='ignore'):  # of numbers that are refused
             length = np.sqrt((numbers[:, 3:7] ** 2).sum(axis=1))
-        refuse(~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE), NOT_UNIT)
+        refuse(~(np.abs(length - 1.0) <= ROUNDED), NOT_UNIT)
     if width > 7:  # mostly all have the same
         rows = numbers[:, 7:]
         changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1

@@ -16,20 +16,19 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib_ros.identification.levels import MOST_OUTLIERS
+from calib_ros.identification.levels import FEW, MOST_OUTLIERS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
 
 MOST_SPREAD = 2.0
-"""Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone."""
+"""Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone.
+A convention."""
 NEAR = 2.0 * MOST_SPREAD
 """Distance [noise] to the later half within which a measurement is taken to have settled."""
 SPIKE = 3.0 * MOST_SPREAD
 """A single measurement further from the median [noise] is left out of the mean."""
-LEAST_COUNT = 4
-"""With fewer measurements nothing can be said about their spread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +53,7 @@ def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
     used, limits = np.ones(len(values), dtype=bool), np.full(len(begins), np.inf)
     rests = np.ones(len(begins), dtype=bool)
     ends = np.append(begins[1:], len(values))
-    for k in np.flatnonzero(ends - begins >= LEAST_COUNT).tolist():
+    for k in np.flatnonzero(ends - begins >= FEW).tolist():
         part = slice(begins[k], ends[k])
         noise = max(sigmas[k], _noise(values[part]))
         limits[k] = MOST_SPREAD * noise

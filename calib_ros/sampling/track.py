@@ -14,13 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib_ros.identification.levels import TELLING
+from calib_ros.identification.levels import FEW, TELLING
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.slices import Rows, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
-LOOKS_BACK = 4
+LOOKS_BACK = FEW
 """Samples within the window with which the present one is compared."""
 
 

@@ -13,7 +13,7 @@ from commanded import ROBOTS, UR, UR_TRUE, regular
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import Status
 from calib_ros.files.programs import joints_csv, read_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
@@ -198,7 +198,7 @@ def test_nothing_is_written_when_a_sample_is_refused(run, tmp_path, suffix, forc
         out.write_text('precious')
     text = table if suffix == '.csv' else trajectory(q)
     status, said, err = run(text, *(['--force'] if force else []), suffix=suffix)
-    assert (status, said) == (NOT_ACCEPTED, '')
+    assert (status, said) == (Status.NOT_ACCEPTED, '')
     first, second, third = err.splitlines()
     assert first.startswith('calib_ros: nothing is written, 1 of 3 points corrected')
     places = ('line 4', 'line 5') if suffix == '.csv' else ('point 2', 'point 3')
@@ -220,8 +220,8 @@ def test_options_reach_the_compensator(run):
     q[0, 4] = 0.0
     text = trajectory(q)
     tolerant = ('--largest-orientation-error', 0.005, '--orientation-weight', 1e-3)
-    assert run(text, suffix='.yaml')[0] == NOT_ACCEPTED
-    assert run(text, '--largest-turn', 1e-5, *tolerant, suffix='.yaml')[0] == NOT_ACCEPTED
+    assert run(text, suffix='.yaml')[0] == Status.NOT_ACCEPTED
+    assert run(text, '--largest-turn', 1e-5, *tolerant, suffix='.yaml')[0] == Status.NOT_ACCEPTED
     status, said, err = run(text, '--tool', 0.1, 0.2, 0.3, *tolerant, suffix='.yaml')
     assert (status, err) == (0, '')
     assert '1 corrected in part' in said

@@ -13,7 +13,7 @@ from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.design import Design
 from calib_ros.apply.verification import Attained, in_words, verify
 from calib_ros.cli.main import main
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import Status
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.layouts import joint_columns
 from calib_ros.files.programs import csv_of, joints_csv, read_joints
@@ -375,7 +375,7 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
     for calibration in ('result', 'result/calibration.yaml'):
         assert main([*judge, calibration, '--new-tool', '--new-base']) == 1
         assert 'at least 8 are needed' in capsys.readouterr().err
-        for tolerance, status, word in (('1', 0, 'PASS'), ('0.01', NOT_ACCEPTED, 'FAIL')):
+        for tolerance, status, word in (('1', 0, 'PASS'), ('0.01', Status.NOT_ACCEPTED, 'FAIL')):
             assert main([*judge, calibration, '--tolerance', tolerance]) == status
             out = capsys.readouterr().out
             assert out.startswith(f'{word}: ')
@@ -394,7 +394,7 @@ def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, capsy
     common += ['--tolerance', '1']
     assert main(common) == 0
     assert 'this judges the calibration' in ' '.join(capsys.readouterr().out.split())
-    assert main([*common, '--commanded', 'program.csv']) == NOT_ACCEPTED
+    assert main([*common, '--commanded', 'program.csv']) == Status.NOT_ACCEPTED
     assert 'this judges the calibration' not in capsys.readouterr().out
 
 

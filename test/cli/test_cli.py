@@ -13,7 +13,7 @@ from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_cs
 from calib_ros.apply import simulation
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import Status
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
@@ -163,7 +163,7 @@ def test_rows_marked_test_never_influence_the_fit(unsearched, identified, tmp_pa
         row.update({key: float(rng.uniform(-3.0, 3.0)) for key in ('q1', 'q4', 'x', 'y', 'z')})
         row.update(qx=0.0, qy=1.0, qz=0.0, qw=0.0)
     status, wild = identified('--csv', write_csv(tmp_path / 'b.csv', rows), '--chain', 'ur5e')
-    assert status == NOT_ACCEPTED
+    assert status == Status.NOT_ACCEPTED
     for key in ('parameters', 'fitted', 'rank', 'unidentifiable', 'iterations', 'noise_in_sigma'):
         assert wild[key] == expected[key]
     assert wild['validation']['after']['rms_mm'] > 100.0
@@ -239,7 +239,7 @@ def nothing_to_gain(seed=5, held_out=TEST):
 def test_where_nothing_is_to_gain_nothing_is_claimed(identified, tmp_path, seed, held_out):
     table = write_csv(tmp_path / 'cell.csv', nothing_to_gain(seed, held_out))
     status, document = identified('--csv', table, '--chain', 'ur5e')
-    assert status == NOT_ACCEPTED == 3
+    assert status == Status.NOT_ACCEPTED == 3
     assert document['accepted'] is False
     assert 'no gain on held-out poses' in document['refusals'][0]
 
@@ -251,7 +251,7 @@ def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, wri
     worse = write_csv(tmp_path / 'worse.csv', nothing_to_gain())
     arguments = ('identify', '--csv', worse, '--chain', 'ur5e', '--out', out, '--force')
     status, said, _ = run(*arguments)
-    assert status == NOT_ACCEPTED
+    assert status == Status.NOT_ACCEPTED
     assert 'NOT accepted' in said
     assert (out / 'calibration.previous.yaml').read_bytes() == accepted
     assert contents(out).keys() == {*RESULT_FILES, 'calibration.previous.yaml'} - {
@@ -268,7 +268,7 @@ def test_one_joint_that_never_moved_is_named(run, tmp_path):
         tmp_path / 'cell.csv', rows_of(simulation.measure(TRUE, joints, rng, 5e-5, 2e-4), 0)
     )
     status, out, _ = run('identify', '--csv', table, '--chain', 'ur5e')
-    assert status == NOT_ACCEPTED
+    assert status == Status.NOT_ACCEPTED
     assert 'the poses do not determine' in out
 
 
@@ -291,7 +291,8 @@ def test_one_session_of_several(identified, run, tmp_path):
     assert status == 1
     assert 'A, B' in err
     assert identified('--csv', table, '--chain', 'ur5e', '--session', 'A')[0] == 0
-    assert identified('--csv', table, '--chain', 'ur5e', '--session', 'B')[0] == NOT_ACCEPTED
+    status, *_ = identified('--csv', table, '--chain', 'ur5e', '--session', 'B')
+    assert status == Status.NOT_ACCEPTED
 
 
 def test_joint_names_map_those_of_the_bag_to_the_chain(run, identified, table, tmp_path):
@@ -321,7 +322,7 @@ def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_pa
     file.write_bytes(file.read_bytes()[: int(0.6 * file.stat().st_size)])
     given = ('identify', bag, '--chain', 'ur5e', '--json')
     status, said, _ = run(*given)
-    assert status == NOT_ACCEPTED
+    assert status == Status.NOT_ACCEPTED
     assert 'of the messages could not be read' in json.loads(said)['refusals'][0]
     status, said, err = run(*given, '--out', tmp_path / 'out', '--largest-loss', '0.5')
     assert status == 0

@@ -9,7 +9,7 @@ import pytest
 from distributed import LocalCluster
 
 from calib_ros.cli.main import main
-from calib_ros.cli.options import INCOMPLETE, NOT_ACCEPTED
+from calib_ros.cli.options import Status
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 
@@ -78,7 +78,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     command = ['fleet', 'plant.yaml', '--history', 'history', '--out', 'report']
     with LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=None) as local:
         command += ['--metrics', 'calib.prom', '--scheduler', local.scheduler_address]
-        assert main(command) == NOT_ACCEPTED
+        assert main(command) == Status.NOT_ACCEPTED
     said = capsys.readouterr()
     assert '1 changed, 1 unreadable, 1 fine' in said.out
     assert 'B, 2025-10-12: changed: elbow_joint.theta by +0.' in said.out
@@ -106,7 +106,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     assert main(command) == 0
     plant['robots'][1]['measured'] = 'nowhere/*.csv'
     (folder / 'plant.yaml').write_text(json.dumps(plant))
-    assert main(command) == INCOMPLETE
+    assert main(command) == Status.INCOMPLETE
 
 
 def test_what_cannot_be_asked_for(folder, capsys):

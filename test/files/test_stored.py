@@ -9,7 +9,7 @@ import pytest
 from recorded import STREAMS, record_in_chunks, session_of, storages
 from rosbags.rosbag2 import Reader
 
-from calib_ros.files.mcap import DATA_END, MAGIC, records
+from calib_ros.files.mcap import MAGIC, Kind, records
 from calib_ros.files.stored import CHUNK, STORAGE, read
 from calib_ros.sampling.intake import Stream
 from calib_ros.settings import STORAGES
@@ -55,7 +55,7 @@ def test_messages_without_chunks_come_as_they_stand_in_the_file(tmp_path, log_ti
     flat = MAGIC
     for kind, content in records(file.read_bytes(), len(MAGIC)):
         flat += struct.pack('<BQ', kind, len(content)) + content
-        if kind == DATA_END:
+        if kind == Kind.DATA_END:
             break
     file.write_bytes(flat + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + MAGIC)
     session, warnings = session_of(file)

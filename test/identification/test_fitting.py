@@ -12,7 +12,7 @@ from fits import UR10E, measured_arm
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import fitting
-from calib_ros.identification.fitting import Fitted, Simpler, parameter_rows
+from calib_ros.identification.fitting import SOME, Fitted, Simpler, parameter_rows
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Learned, Problem
@@ -73,12 +73,12 @@ def test_fewer_equations_than_parameters_are_refused():
         fitting._require_enough(empty, [])
 
 
-@pytest.mark.parametrize(('count', 'share'), [(1000, 1), (1001, 2), (2500, 3)])
+@pytest.mark.parametrize(('count', 'share'), [(2 * SOME, 1), (2 * SOME + 1, 2), (5 * SOME, 3)])
 def test_of_many_pairs_some_tell_the_priors_of_a_richer_model(count, share):
-    first = seen(5).select(np.arange(count - 500) % 5)
-    second = replace(first.select(np.arange(500) % 5), base='base_B')
+    first = seen(5).select(np.arange(count - SOME) % 5)
+    second = replace(first.select(np.arange(SOME) % 5), base='base_B')
     problem = Problem(UR10E, first, more=(second,))
-    simpler = Simpler(UR10E, (np.arange(count - 500.0), np.arange(500.0)), noise(1.0))
+    simpler = Simpler(UR10E, (np.arange(count - SOME), np.arange(SOME)), noise(1.0))
     few, told = fitting._some(problem, simpler)
     assert [len(each) for each in few.sets] == [-(-len(each) // share) for each in problem.sets]
     for distances, given in zip(told.distances, simpler.distances, strict=True):

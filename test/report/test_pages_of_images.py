@@ -10,7 +10,7 @@ from pages import Page
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
 from calib_ros.cli.main import main
-from calib_ros.cli.options import NOT_ACCEPTED
+from calib_ros.cli.options import Status
 from calib_ros.files.programs import csv_of
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.texts import csv_text, dump_yaml
@@ -70,7 +70,7 @@ def test_a_result_counts_images_and_corners(identified):
 
 def test_a_slip_is_told_by_its_image_and_line(identified):
     status, told, out = identified('slipped.csv')
-    assert status == NOT_ACCEPTED
+    assert status == Status.NOT_ACCEPTED
     line = 2 + SLIPPED * len(POINTS)
     assert f'something moved before image {SLIPPED + 1} (line {line}, ' in told
     assert json.loads((out / 'result.json').read_text())['step']['image'] == SLIPPED

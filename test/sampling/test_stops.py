@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from calib_ros.sampling.stops import LEAST_COUNT, MOST_SPREAD, averages
+from calib_ros.identification.levels import FEW
+from calib_ros.sampling.stops import MOST_SPREAD, averages
 
 SIGMA = 5e-5
 PLACE = np.array([1.2, -0.3, 0.8])
@@ -135,7 +136,7 @@ def test_a_stop_that_vibrates_all_the_time_is_refused(rng):
     assert average(values) is None
 
 
-@pytest.mark.parametrize('count', range(1, LEAST_COUNT))
+@pytest.mark.parametrize('count', range(1, FEW))
 def test_few_measurements_are_taken_as_they_are(count):
     values = np.arange(count)[:, np.newaxis] * np.ones(3)
     used, mean, _ = average(values)
@@ -162,4 +163,4 @@ def test_each_stop_is_averaged_by_itself(rng):
 def test_the_limit_of_the_spread_is_beyond_chance(rng):
     """A stop of a few measurements passes, however they fall."""
     for _ in range(2000):
-        assert average(noisy(rng, LEAST_COUNT))[2] < MOST_SPREAD * 2.0 * SIGMA
+        assert average(noisy(rng, FEW))[2] < MOST_SPREAD * 2.0 * SIGMA
