@@ -19,14 +19,15 @@ CERTAIN = 0.99
 SURE = 0.999
 """Of what changes the model or the noise: hundreds of tests are made in the life of a cell."""
 ALIKE = 1.5
-"""Ratio of two RMS errors up to which they are of one size (benchmarks/recalibration.py)."""
+"""Ratio of two RMS errors up to which they are of one size; a convention, which
+benchmarks/recalibration.py does not tell from 1."""
 NEARER = 0.3
 """Ratio of two errors from which what leaves the smaller one explains clearly more
 (benchmarks/mistakes.py)."""
 CLEARLY = 5.0
 """Ratio of two sizes from which on they are clearly two: distances of configurations and of the
-visits of one, steps of rounding (both benchmarks/harm.py), what is left of orientations and of
-positions (docs/mistakes.md)."""
+visits of one, steps of rounding, what is left of orientations and of positions: 9 make an arm 2.8
+times worse, 30 eight times (docs/mistakes.md)."""
 MOST_OUTLIERS = 0.35
 """Share of gross errors beyond which nothing is believed: half of the samples must tell the
 rest. A fit stands 40 % (benchmarks/outliers.py)."""
@@ -39,8 +40,9 @@ LEAST_ASIDE = 1 + IN_A_FRAME // 3
 of fewer, which are gross errors."""
 SEVERAL = 3
 """Causes that are looked for one after the other: what needs more is something else. Changes of an
-arm (benchmarks/recalibration.py), mistakes at once (benchmarks/mistakes.py), and harmonics, before
-all of them are tried (benchmarks/real_robots.py)."""
+arm, mistakes at once, and harmonics, before all of them are tried. A convention:
+benchmarks/recalibration.py changes one, mistakes.py makes three, and errors of real_robots.py are
+the same with 1."""
 TRIED = 6
 """Candidates, the best by a rough look, that are looked at closely (benchmarks/mistakes.py)."""
 KNOWN = 1.0 / HALF_THE_DIGITS

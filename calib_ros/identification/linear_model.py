@@ -20,7 +20,7 @@ from calib_ros.identification.drift import Columns, Shifts, chance
 from calib_ros.identification.evidence import group_of
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
-from calib_ros.identification.observations import numbered
+from calib_ros.identification.observations import SOME_POSES, numbered
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.result import Identification
 from calib_ros.identification.sizes import TYPICAL
@@ -34,8 +34,9 @@ from calib_ros.progress import Told, nobody
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
 HARMONIC_SIZES = (TYPICAL['drive'], TYPICAL['drive'] / CLEARLY)
-"""Sizes [rad] of which all harmonics together may be (benchmarks/real_robots.py)."""
-COMPARED = 3000
+"""Sizes [rad] of which all harmonics together may be: the usual, and a smaller one that decides
+nothing in benchmarks/real_robots.py."""
+COMPARED = 15 * SOME_POSES
 """Samples by which effects are compared; of more, every so many are taken, to save time.
 By 2,000 errors are the same within 1e-4 (benchmarks/real_robots.py)."""
 

@@ -33,6 +33,7 @@ from scipy import special
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.identification.levels import ALIKE, SURE
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.trimmed import trimmed_start, trimmed_sum, unknown
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
@@ -41,16 +42,17 @@ Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
 OUTLIER = 6.0
 """Distance [scale] beyond which a sample is named as an outlier: where it has lost half of its
-weight (benchmarks/outliers.py)."""
+weight; a convention (Hampel 1974)."""
 INNER, OUTER = OUTLIER - 1.0, OUTLIER + 1.0
 """Distances [scale] at which a sample begins to lose weight, and has none left. Of Gaussian
 errors in three directions 2 of 100,000 lie beyond the first."""
-MANY = 20_000
+MANY = 100 * SOME_POSES
 """Samples that tell which of them are gross errors, a sample in ten thousand aside
 (benchmarks/end_to_end.py)."""
 SUSPICIOUS = 1.2
 """Ratio of residuals to those expected from which gross errors, or errors that the samples of a
-configuration share, may hide in them (benchmarks/outliers.py)."""
+configuration share, may hide in them; a convention, which benchmarks/outliers.py does not tell
+from 1.5."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,8 @@ from calib_ros.values import LARGEST
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
 NEARBY = 3
-"""Neighbours in joint space of each configuration that are tested (benchmarks/drift.py)."""
+"""Neighbours in joint space of each configuration that are tested; a convention, which
+benchmarks/drift.py --quick does not tell from 1."""
 MOST_STOPS = 2 * SOME_POSES
 """Stops on which sizes are estimated; of more, every so many runs of a twentieth."""
 ELSEWHERE = 4.0 * LARGEST

@@ -25,9 +25,8 @@ TAILS = 3.0
 SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
 """Logarithms of the ratio of probabilities beyond which effects show, and from which those of
 usual size are refuted."""
-SETTLED = 0.01 * float(np.log(SPREAD))
-"""Change of the logarithm of a size from which on it stands still: a hundredth of what is known of
-it beforehand."""
+SETTLED = 0.02
+"""Change of the logarithm of a size from which on it stands still; a convention."""
 LEAST_SIZE = SPREAD**-3
 """Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
 

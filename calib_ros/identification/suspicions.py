@@ -45,15 +45,15 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import Limits
+from calib_ros.settings import EXCEPTION, Limits
 
 LEAST_SCALE = 0.5 * SCALE
 """Of a device of which it is told: half of what those of good ones scatter by."""
 LARGEST_SCALE = 10.0 * SCALE
 """More than no arm grows by: 40 degrees do it, if all of it is of aluminium (23 ppm a degree)."""
-LEAST_NOISE = 0.04
-"""Residuals in units of the sigmas given below which these are wrong: devices repeat ten times as
-well as they measure, and mm are thousandths."""
+LEAST_NOISE = NEARER * EXCEPTION
+"""Residuals in units of the sigmas given below which these are wrong: clearly less than a tenth,
+by which devices repeat better than they measure, while mm are thousandths."""
 SIMULATED = Limits.largest_position_error
 """Residuals [m or rad] below which no device measured them."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
