@@ -52,7 +52,7 @@ def test_expected_errors_add_up():
     q = UR.random_joints(50, np.random.default_rng(1))
     covariance = result.pose_covariance(q)[:, :3, :3]
     variance = np.trace(covariance, axis1=1, axis2=2)
-    rms = 1e-3 * result.validation.figures[1].rms_mm
+    rms = 1e-3 * round(result.validation.figures[1].rms_mm, 6)
     np.testing.assert_allclose(arm.sigma(q) ** 2, variance, rtol=1e-9)
     np.testing.assert_allclose(arm.expected(q, 'corrected') ** 2, variance + rms**2, rtol=1e-9)
     both = variance + rms**2 + arm.removed(q)[0] ** 2
