@@ -78,7 +78,8 @@ class TooFewObservationsError(InputError):
         self.needed = needed
         super().__init__(
             f'{configurations} measured poses are too few, at least {needed} are '
-            f'needed: {why}; measure more poses or fix parameters'
+            f'needed: {why}; measure more poses (calib_ros plan chooses '
+            'them) or hold parameters (fixed)'
         )
 
 
