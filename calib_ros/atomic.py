@@ -21,6 +21,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from calib_ros.errors import LONGEST_NAME, InputError
+from calib_ros.shown import some
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
@@ -225,7 +226,8 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
         )
     there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
     if there and not overwrite:
-        raise InputError(f'{path} holds {", ".join(there)} already: choose another or --force')
+        held = ', '.join(some(there))
+        raise InputError(f'{path} holds {held} already: choose another or --force')
 
 
 def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:

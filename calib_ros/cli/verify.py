@@ -38,7 +38,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
     history = given.history_of(options)
     nominal = load_chain(options.chain)
-    arm = given.calibration_of(options.calibration, 'verify', nominal)
+    arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance

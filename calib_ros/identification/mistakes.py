@@ -66,8 +66,8 @@ class Explained:
         """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
         return (
-            f'{" -- or ".join(whats)} (then the typical error is {1e3 * self.so:.2f} mm, not '
-            f'{float(f"{1e3 * self.given:.4g}"):g} mm)'
+            f'{" -- or ".join(whats)} (so the uncorrected arm is typically '
+            f'{1e3 * self.so:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
 
 

@@ -156,13 +156,15 @@ def plan_report(
         if known:
             predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
             verdict = replace(verdict, text=(*verdict.text, predicted))
-        if found.lacking or not known:
-            heading = 'Too little: these poses do not determine all parameters'
-            verdict = replace(verdict, state='open', heading=heading)
         steps = (
             'Drive to each pose, wait until the arm stands still, and measure.',
             'Then identify: calib_ros identify.',
         )
+        if found.lacking or not known:
+            heading = 'Too little: these poses do not determine all parameters'
+            verdict = replace(verdict, state='open', heading=heading)
+            more = 'Plan again with more poses (--poses), or candidates in which all joints move.'
+            steps = (more, *(steps if known else ()))
     return Report(
         kind='Plan of a measurement',
         robot=chain.name,

@@ -84,7 +84,7 @@ def _verdict(
         return _refused(result, reasons)
     how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
-    text = (*doubts(result), *filter(None, (how, where)), f'{NOT_YET}.')
+    text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
     heading = 'Accepted' + (f', {within}' if within else '')

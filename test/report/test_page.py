@@ -246,7 +246,7 @@ def test_a_doubt_about_an_accepted_result_stands_in_the_verdict(solved):
     problem, result = solved
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
     verdict = report_of(problem, doubtful).verdict
-    assert 'ur3' in verdict.text[0]
+    assert 'ur3' in verdict.text[1]
     assert verdict.state == 'open'
 
 
