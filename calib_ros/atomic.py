@@ -21,7 +21,6 @@ from hashlib import sha256
 from pathlib import Path
 
 from calib_ros.errors import LONGEST_NAME, InputError
-from calib_ros.shown import some
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
@@ -226,6 +225,8 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
         )
     there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
     if there and not overwrite:
+        from calib_ros.shown import some  # loads numpy, no `--help` needs it
+
         held = ', '.join(some(there))
         raise InputError(f'{path} holds {held} already: choose another or --force')
 
