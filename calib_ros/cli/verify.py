@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
+from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import given, options as common
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
@@ -21,6 +21,7 @@ from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.applied import STANDINGS, verification_report
 from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verdicts import each_in_words, in_words, remarks
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')

@@ -357,7 +357,10 @@ def test_a_verification_has_its_verdict_first(solved):
     found = verify(Calibration.of(result), sets, 1e-3)
     poses = poses_to_verify(result.chain, sets, found.comparison)
     page = page_of(verification_report(result.chain, found, poses, Origin()))
-    assert page.text.index('PASS') < page.text.index('Accuracy before')
+    order = ('PASS', 'not the robot with it', 'Accuracy before')
+    where = [page.text.index(words) for words in order]
+    assert where == sorted(where)
+    assert page.text.count('not the robot with it') == 1
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
 
