@@ -37,6 +37,7 @@ from calib_ros.report.reports import (
     doubts,
     identification_report,
     reasons_of,
+    somewhere,
     within_tolerance,
 )
 from calib_ros.sampling.problems import with_lenses
@@ -226,9 +227,10 @@ def show(found: Identified, screen: Screen) -> None:
     reasons = reasons_of(result)
     if result.accepted:
         within = within_tolerance(result.validation or result.fitted, found.wanted)
-        better = 'the calibration makes the arm better'
-        title = f'accepted: the arm gets better, {within}' if within else f'accepted: {better}'
-        screen.title(title, None if 'not' in within or result.remarks else True)
+        better = f'better{somewhere(result)}'
+        gained = f'the calibration makes the arm {better}'
+        gained = f'the arm gets {better}, {within}' if within else gained
+        screen.title(f'accepted: {gained}', None if 'not' in within or result.remarks else True)
     elif reasons[0].heading == GOOD_ARM.heading:
         screen.title('NOT accepted, nothing to correct: the robot stays as it was')
     else:

@@ -87,9 +87,15 @@ def _verdict(
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
-    heading = 'Accepted' + (f', {within}' if within else '')
+    heading = f'Accepted{somewhere(result)}' + (f', {within}' if within else '')
     open_yet = 'not' in within or bool(result.remarks)
     return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
+
+
+def somewhere(result: Identification) -> str:
+    """Return where alone an accepted calibration is valid; empty for everywhere."""
+    whole = result.region is None or result.region.whole
+    return '' if whole else ' near the measured poses'
 
 
 def doubts(result: Identification) -> tuple[str, ...]:

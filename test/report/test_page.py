@@ -242,6 +242,15 @@ def test_an_accepted_page_says_that_the_robot_is_not_changed_yet(solved):
     assert 'calib_ros compensate' in ' '.join(report.steps)
 
 
+def test_a_calibration_that_is_valid_somewhere_alone_is_accepted_there(solved):
+    problem, result = solved
+    near = replace(result, region=replace(result.region, limit=1e-3, share=0.1))
+    report = report_of(problem, near)
+    assert report.verdict.heading == 'Accepted near the measured poses'
+    assert report.steps[0].startswith('To use it beyond the measured poses')
+    assert report_of(problem, result).verdict.heading == 'Accepted'
+
+
 def test_a_doubt_about_an_accepted_result_stands_in_the_verdict(solved):
     problem, result = solved
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
