@@ -9,6 +9,7 @@ None where they are not installed. All text of others is escaped.
 from __future__ import annotations
 
 import hashlib
+import html
 import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -169,7 +170,8 @@ def filled(template: str, **values: Any) -> str | None:
         loader=loader, autoescape=True, undefined=undefined, finalize=_shown, trim_blocks=True
     )
     values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
-    environment.filters['typed'] = _typed
+    safe = environment.filters['safe']
+    environment.filters['typed'] = lambda text: safe(_typed(text))
     page: str = environment.get_template(template).render(**values)
     return page
 
@@ -178,11 +180,9 @@ def _template(name: str) -> str:
     return (resources.files('calib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
-def _typed(text: str) -> object:
-    """Return a text with its commands and options as what is typed, unbroken by their hyphens."""
-    from markupsafe import Markup, escape
-
-    return Markup(TYPED.sub(r'<code>\g<0></code>', str(escape(_shown(text)))))
+def _typed(text: str) -> str:
+    """Return a text as HTML, its commands and options as what is typed, unbroken by hyphens."""
+    return TYPED.sub(r'<code>\g<0></code>', html.escape(str(_shown(text))))
 
 
 def _shown(value: object) -> object:
