@@ -225,7 +225,10 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
         )
     there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
     if there and not overwrite:
-        raise InputError(f'{path} holds {", ".join(there)} already: choose another or --force')
+        from calib_ros.shown import some  # loads numpy, no `--help` needs it
+
+        held = ', '.join(some(there))
+        raise InputError(f'{path} holds {held} already: choose another or --force')
 
 
 def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:

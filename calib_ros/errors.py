@@ -6,6 +6,10 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 LONGEST = 400
 """Characters of a message; what is quoted from a file may be of any length. A convention."""
@@ -54,17 +58,11 @@ class UnknownNameError(ConfigError):
     """A name that does not exist; keeps the name and the valid alternatives."""
 
     def __init__(self, what: str, name: str, alternatives: Iterable[str]) -> None:
-        import difflib  # slow to load
-
         self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)
-        likely = self.alternatives[:MOST_ENTRIES] if len(str(name)) <= MOST_ENTRIES else ()
-        near = difflib.get_close_matches(str(name), likely, n=1, cutoff=0.5)
-        hint = f'did you mean "{near[0]}"? ' if near else ''
-        super().__init__(
-            f'unknown {what} "{name}": {hint}valid are {", ".join(self.alternatives)}'
-        )
+        hints = (near(str(name), self.alternatives), f'valid are {", ".join(self.alternatives)}')
+        super().__init__(f'unknown {what} "{name}": {" ".join(filter(None, hints))}')
 
 
 class ColumnsError(InputError):
@@ -79,8 +77,27 @@ class TooFewObservationsError(InputError):
         self.needed = needed
         super().__init__(
             f'{configurations} measured poses are too few, at least {needed} are '
-            f'needed: {why}; measure more poses or fix parameters'
+            f'needed: {why}; measure more poses (calib_ros plan chooses '
+            'them) or hold parameters (fixed)'
         )
+
+
+def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
+    """Return 'did you mean "...?"' with the one that is most like a name, if any is."""
+    import difflib  # slow to load
+
+    likely = list(alternatives)[:MOST_ENTRIES] if len(name) <= MOST_ENTRIES else []
+    found = difflib.get_close_matches(name, likely, n=1, cutoff=least)
+    return f'did you mean "{found[0]}"?' if found else ''
+
+
+def unreadable(path: Path, err: OSError, what: str = '') -> str:
+    """Return in words why a file, which `what` describes, is not read, and which one is near."""
+    said = f'cannot read {what}{path}: {err.strerror or err}'
+    if not isinstance(err, FileNotFoundError) or not path.parent.is_dir():
+        return said
+    hint = near(path.name, (each.name for each in path.parent.iterdir()), 0.7)
+    return f'{said}: {hint}' if hint else said
 
 
 def trouble(err: OSError) -> str:

@@ -19,7 +19,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, CalibrationError, ConfigError, InputError
+from calib_ros.errors import (
+    LONGEST_NAME,
+    MOST_ENTRIES,
+    CalibrationError,
+    ConfigError,
+    InputError,
+    unreadable,
+)
 
 LARGEST_TEXT = 10 * MOST_ENTRIES**2
 """Bytes of a chain file, calibration, URDF or YAML program: ten lists as long as can be."""
@@ -60,7 +67,7 @@ def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: st
         with path.open('rb') as file:
             data = file.read(largest + 1)
     except OSError as err:
-        raise error(f'cannot read {what}{path}: {err.strerror or err}') from err
+        raise error(unreadable(path, err, what)) from err
     if len(data) > largest:
         raise error(f'{what}{path} is larger than {largest // 10**6} MB: is it the right file?')
     return data

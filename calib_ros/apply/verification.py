@@ -37,9 +37,8 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import configurations
 from calib_ros.identification.identifiability import excited
 from calib_ros.identification.leastsquares import System, minimise, triangular_factor
-from calib_ros.identification.levels import CONFIDENT, NEARER
+from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.observations import Observations
-from calib_ros.identification.records import reused_in_words
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
@@ -337,64 +336,3 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
         frame = chain.frame(base)
         chain = chain.with_frame(base, replace(frame, matrix=motion @ frame.matrix))
     return chain
-
-
-def in_words(found: Verification) -> str:
-    """Return the verdict with all that it rests on."""
-    before, after = found.comparison.figures
-    share = 100.0 * found.confidence
-    lines = [
-        f'position error [mm] of {after.count} measurements at {found.configurations} poses',
-        '              RMS     mean      max   mean + 3 sigma',
-    ]
-    for label, figures in (('before', before), ('after', after)):
-        turn = '' if figures.rms_mrad is None else f'   (RMS {figures.rms_mrad:.3f} mrad)'
-        lines.append(
-            f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
-            f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
-        )
-    lines += each_in_words(found)
-    verdict = '' if found.tolerance is None else f'{found.verdict}: '
-    wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
-    lines.append(
-        f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
-        f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
-    )
-    return '\n'.join([*lines, *remarks(found)])
-
-
-def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the poses [mm], of which there may be none."""
-    again = any(pose.repeatability is not None for pose in found.each)
-    lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
-    for k, pose in enumerate(found.each, 1):
-        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
-        lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
-    return lines if found.each else []
-
-
-def remarks(found: Verification) -> list[str]:
-    """Return what to know besides the figures, and what to do."""
-    lines = [warning] if (warning := reused_in_words(found.reused)) else []
-    if found.fitted:
-        lines.append(f'fitted anew, before and after alike: {" and ".join(found.fitted)}')
-    if not found.by_program:
-        lines.append(
-            'this judges the calibration: give the program before its correction (--commanded) '
-            'to see whether the correction reaches the arm'
-        )
-    if found.verdict == 'UNDECIDED':
-        enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
-        lines.append(f'{enough} poses with the same RMS error would decide')
-    if found.verdict == 'does not hold':
-        lines.append(
-            'the error is larger than it was when the calibration was made: was the tracker, the '
-            'target or the robot moved?'
-        )
-    if found.common < NEARER:
-        lines.append(
-            f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
-            'the error would be left: was the measuring device moved? If it stands elsewhere on '
-            'purpose, --new-base fits its frame, and --new-tool that of another target'
-        )
-    return lines

@@ -42,7 +42,7 @@ MOVED = """\
   --new-base  the measuring device stands elsewhere now
   --new-tool  the target is another one, or mounted anew"""
 LAYOUT = """\
-tables of others (docs/tables.md); what is not given is guessed
+tables of other systems (docs/tables.md); what is not given is guessed
   --preset NAME=  a layout by name, or your own .yaml
   --length UNIT=  of lengths: m, cm, mm, um, in
   --angle UNIT=  unit of angles, joint values included: rad, deg
@@ -56,7 +56,7 @@ tables of others (docs/tables.md); what is not given is guessed
   @columns
   --rotation-vector  rx ry rz are a rotation vector
   --inverse  the poses are those of the device in the target
-  --shift ROWS=0  joint values stand so much below
+  --shift ROWS=0  joint values stand so many rows below their measurement
   --joints FILE  log of the joint values, row by row"""
 COLUMNS = 'q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints'
 REPORT = """\
@@ -109,7 +109,7 @@ what is wanted
   --poses N  how many; 25, or what --accuracy needs
   --accuracy MM  wanted RMS position error at the task poses
   --iso9283  the five test poses of ISO 9283 instead
-  --task FILE  CSV q1..qn; random poses if not given
+  --task FILE  CSV q1..qn of where the arm will work; random poses if not given
   --taken FILE  CSV q1..qn of poses measured already
   --out FILE  CSV q1..qn to write, and its report beside it
   --force  {FORCE}
@@ -130,17 +130,19 @@ what the device sees
 @settings sigma_position sigma_orientation priors model fixed
 {REPORT}
 # fleet fleet._run_fleet
+what to look after
   plant PLANT  plant.yaml: the robots (docs/fleet.md)
   --history! DIR  where results are filed; also a URL
   --out FOLDER  the report: index.html, a page of each robot
   --metrics FILE  for Prometheus' text collector
 who does the work
   --scheduler ADDRESS=  of a dask cluster: tcp://host:8786
-  --workers N=0  processes here; default: one a core
+  --workers N=0  processes here; 0: one a core
   --memory SIZE=2GiB  of each of these, at most
 alarms
   --years N=100.0  between two false alarms of a robot that is measured every night
 # history fleet._run_history
+what to list
   history DIR  folder or URL of a history
   --robot SERIAL  this robot only
 # identify identify._run
@@ -148,7 +150,7 @@ what to read
   measured MEASURED?  a table of measured poses, or a bag: folder, .mcap or .db3
   --csv FILE  the same for a table of any name
   --chain! ROBOT  {CHAIN}
-  --session NAME  session of the table; several joined by commas
+  --session NAME  only rows with this name in the column session; several joined by commas
   --eye-in-hand  the poses are those of a fixed target in a camera on the flange
   --largest-loss SHARE={EXCEPTION}  of the messages of a bag, beyond which the result is not \
 accepted; 1: any
@@ -181,7 +183,7 @@ what to judge
   --calibration! RESULT  {CALIBRATION}
   --commanded FILE  the program before its correction, q1..qn: judge against the poses that it \
 means
-  --session NAME  session of the table
+  --session NAME  only rows with this name in the column session
 {MOVED}
 how to judge
   --tolerance MM  wanted RMS position error; if not given: does the calibration still hold?
@@ -251,7 +253,7 @@ what to convert
   csv TABLE  the table
   bag BAG  folder of the bag to write
   --chain! ROBOT  {CHAIN}
-  --session NAME  session of the table to use
+  --session NAME  only rows with this name in the column session
   --storage {'|'.join(STORAGES)}=mcap  of the bag
 # import convert._convert
 what to convert

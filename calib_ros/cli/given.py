@@ -57,7 +57,10 @@ def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Ca
     refuse_others(path, command, 'chain', 'result')
     if path.is_dir() and not calibration_file(path).exists():
         if (path / 'result.json').exists():
-            raise InputError(f'the result in {path} was not accepted: there is no calibration')
+            raise InputError(
+                f'the result in {path} was not accepted: there is no calibration; '
+                f'{path / "report.html"} says why and what to do'
+            )
         raise InputError(f'{path} holds no calibration.yaml: {WRITTEN}')
     if not path.exists():
         raise InputError(f'there is no calibration at {path}: {WRITTEN}')

@@ -28,10 +28,18 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
 from calib_ros.report import words
-from calib_ros.report.advice import BRINGS
+from calib_ros.report.advice import FAR, GOOD_ARM, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
-from calib_ros.report.reports import NOT_YET, identification_report, reasons_of, within_tolerance
+from calib_ros.report.reports import (
+    BRING,
+    NOT_YET,
+    doubts,
+    identification_report,
+    reasons_of,
+    somewhere,
+    within_tolerance,
+)
 from calib_ros.sampling.problems import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_json
@@ -66,7 +74,8 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         sets, measured = (*problem.sets, *problem.judging), measured or options.measured
         about = given.filing_of(options, problem.chain, sets, measured, options.largest_loss)
         history.file(row_of(found.result, about, found.loaded.warnings))
-    for warning in (*found.loaded.warnings, *words.remarks(found.result)):
+    shown = () if found.result.accepted and not options.json else words.remarks(found.result)
+    for warning in (*found.loaded.warnings, *shown):
         screen.warn(warning)
     if options.json:
         screen.data(_document(found))
@@ -211,31 +220,42 @@ class Identified:
 
 
 def show(found: Identified, screen: Screen) -> None:
-    """Print a result: the verdict, six rows, and each reason or note once."""
+    """Print a result: the verdict, its figures, and each reason or note once."""
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
+    reasons = reasons_of(result)
     if result.accepted:
         within = within_tolerance(result.validation or result.fitted, found.wanted)
-        better = 'the calibration makes the arm better'
-        title = f'accepted: the arm gets better, {within}' if within else f'accepted: {better}'
-        screen.title(title, None if 'not' in within else True)
+        better = f'better{somewhere(result)}'
+        gained = f'the calibration makes the arm {better}'
+        gained = f'the arm gets {better}, {within}' if within else gained
+        screen.title(f'accepted: {gained}', None if 'not' in within or result.remarks else True)
+    elif reasons[0].heading == GOOD_ARM.heading:
+        screen.title('NOT accepted, nothing to correct: the robot stays as it was')
     else:
         screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
     screen.table(_rows(result))
-    for each in reasons_of(result):
-        screen.bullet(f'{each.heading}: {each.refusal}', each.steps or (each.meaning,))
-    if result.accepted:
-        for note in (*words.notes(result), NOT_YET):
-            screen.bullet(note)
-    elif (
-        result.noise.position > 1.0
-        and not result.noise.consistent
-        and {each.rule for each in result.refusals}.isdisjoint(BRINGS)
-    ):
-        screen.bullet(words.scatter_in_words(result.noise))
+    _explain(result, reasons, screen)
     for line in words.cameras_in_words(result):
         screen.bullet(line)
+
+
+def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) -> None:
+    """Print why a result was refused, or what to know about one that is accepted."""
+    if result.accepted:
+        drift = words.drift_in_words(result.noise)
+        for note in (*doubts(result), drift, *words.notes(result), f'{NOT_YET}: {BRING}'):
+            if note:
+                screen.bullet(note)
+        return
+    for each in reasons:
+        if each.steps:
+            screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
+    if not all(each.steps for each in reasons):
+        screen.bullet('What probably follows from it is in the report')
+    elif 1.0 < result.noise.position < FAR and not result.noise.consistent:
+        screen.bullet(words.scatter_in_words(result.noise))
 
 
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
@@ -253,16 +273,16 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
         second = ('orientation error', turn)
     if before.rms_px is not None and after.rms_px is not None:
         second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
-    valid = 'nowhere, because it is not accepted'
+    valid: tuple[tuple[str, str], ...] = ()
     if result.accepted and result.region is not None:
-        valid = result.region.in_words().removeprefix('valid ')
+        valid = (('valid', result.region.in_words().removeprefix('valid ')),)
     return (
         ('robot', f'{result.chain.name}, {fitted}'),
         ('fitted to', measured),
         ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm{proof}'),
         second,
         ('judged by', result.validated_by),
-        ('valid', valid),
+        *valid,
     )
 
 

@@ -18,14 +18,14 @@ import shlex
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 # Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
 from calib_ros.cli.screen import Screen, help_width, wrapped
-from calib_ros.errors import CalibrationError, UnknownNameError, shortened, trouble
+from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 
 GROUPS = {
     'First steps': {
@@ -54,7 +54,7 @@ GROUPS = {
     'Convert files': {
         'bag2csv': 'write the poses of a bag as a table',
         'csv2bag': 'write a table of measured poses as a bag',
-        'import': 'write a table of others as one of ours',
+        'import': 'write a table of another system as one of ours',
     },
 }
 """Commands by the groups of the overview, and what they do."""
@@ -109,6 +109,8 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
         import argcomplete
 
         argcomplete.autocomplete(_parser(completed.split()[1:]))
+    if name == 'help' and given[1:2] and given[1] in TEXTS:
+        name, *given = given[1], given[1], '--help'
     if name in ('-h', '--help', 'help') or not given:
         print(_overview())
         raise SystemExit(0 if given else 2)
@@ -124,7 +126,33 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
         if words is None:
             words = str(UnknownNameError('command', name, TEXTS))
         raise SystemExit(_failed(words, 2))
-    return _parser(given).parse_args(given)
+    parser = _parser(given)
+    options, rest = parser.parse_known_args(given)
+    if rest:
+        options.parser.error(_unknown(rest[0], options.parser))
+    return options
+
+
+def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
+    """Return what is wrong with a word that a command does not know."""
+    if not word.startswith('-'):
+        return f'"{word}" is one too many'
+    option = word.partition('=')[0]
+    hint = near(
+        option, (each for action in parser._actions for each in action.option_strings), 0.7
+    )
+    return f'unknown option "{option}"' + (f': {hint}' if hint else '')
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors end with an example of what is right."""
+
+    example = ''
+
+    def error(self, message: str) -> NoReturn:
+        """Tell what must be given, what is wrong, and what is right."""
+        self.print_usage(sys.stderr)
+        self.exit(2, f'{self.prog}: error: {message}\nexample: {self.example.lstrip()}\n')
 
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
@@ -136,7 +164,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
     )
 
     parser = argparse.ArgumentParser(prog='calib_ros', add_help=False)
-    names = parser.add_subparsers(required=True, metavar='COMMAND')
+    names = parser.add_subparsers(required=True, metavar='COMMAND', parser_class=_Parser)
     for name, text in TEXTS.items():
         if name not in given:
             names.add_parser(name, add_help=False)
@@ -149,7 +177,8 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
             epilog='\n'.join(['examples:', *map(_example, examples_of(name))]),
             formatter_class=_Help,
         )
-        added.set_defaults(home=home)
+        added.example = _example(examples_of(name)[0])
+        added.set_defaults(home=home, parser=added)
         add_options(added, options)
         add_more = added.add_argument_group('on the screen').add_argument
         text = 'only warnings, errors and what is asked for'
@@ -159,8 +188,9 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
 
 
 def _example(words: str) -> str:
-    parts = textwrap.wrap(f'calib_ros {words}', help_width() - 8, break_on_hyphens=False)
-    return '  ' + ' \\\n      '.join(parts)
+    tied = re.sub('(--[a-z-]+) (?!-)', '\\1\xa0', f'calib_ros {words}')  # an option and its value
+    parts = textwrap.wrap(tied, help_width() - 8, break_on_hyphens=False)
+    return ('  ' + ' \\\n      '.join(parts)).replace('\xa0', ' ')
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from calib_ros.apply.verification import Verification, each_in_words, in_words, remarks, verify
+from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import given, options as common
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
@@ -21,6 +21,7 @@ from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.applied import STANDINGS, verification_report
 from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verdicts import each_in_words, in_words, remarks
 from calib_ros.sampling.sample import collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
@@ -38,7 +39,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     """Judge, print what comes out, and fill in the files of --out; return the exit status."""
     history = given.history_of(options)
     nominal = load_chain(options.chain)
-    arm = given.calibration_of(options.calibration, 'verify', nominal)
+    arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance

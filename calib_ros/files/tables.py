@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.errors import InputError, UnknownNameError, unreadable
 from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
@@ -217,7 +217,7 @@ def _of_journal(
                     raise InputError(f'{path}, line {lines + 1} has no end: is it a journal?')
                 told(min(file.tell() / size, 1.0))
     except OSError as err:
-        raise InputError(f'cannot read {path}: {err.strerror or err}') from err
+        raise InputError(unreadable(path, err)) from err
     made = joined(parts) if parts else None
     return made, (_cut_off(path, lines + 1),) if rest else ()
 

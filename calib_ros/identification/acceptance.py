@@ -77,9 +77,11 @@ def _of_the_fit(
     if not result.converged:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
     if untold := result.not_excited:
-        frames = dict.fromkeys(n.owner for n in untold if problem.model.owns_frame(n))
-        known = f' (or {", ".join(frames)}: "fixed: true" in the chain file)' if frames else ''
-        yield Reason(Rule.EXCITATION, f'the poses do not determine {", ".join(untold)}{known}')
+        kinds: dict[str, list[str]] = {}
+        for each in untold:
+            kinds.setdefault(each.owner, []).append(each.kind)
+        named = ', '.join(f'{owner} ({", ".join(of)})' for owner, of in kinds.items())
+        yield Reason(Rule.EXCITATION, f'the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])

@@ -58,8 +58,12 @@ def identify(
     try:
         return _identified(problem, simpler, progress)
     except np.linalg.LinAlgError as err:
-        found = mistakes.explained(problem) or 'check the arm, its joint values and the units'
-        raise InputError(f'the measurements do not fit the arm at all: {found}') from err
+        if found := mistakes.explained(problem):
+            raise InputError(f'the measurements do not fit the arm at all: {found}') from err
+        raise InputError(
+            'the fit found no stable answer: check the arm, its joint values and the units, or '
+            'measure more poses all over the workspace'
+        ) from err
 
 
 def _identified(

@@ -60,8 +60,8 @@ class Explained:
         """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
         return (
-            f'{" -- or ".join(whats)} (typical error, turns included, then {1e3 * self.so:.2f} mm '
-            f'instead of {1e3 * self.given:.4g} mm)'
+            f'{" -- or ".join(whats)} (so the uncorrected arm is typically '
+            f'{1e3 * self.so:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
 
 

@@ -68,6 +68,13 @@ GOOD_ARM = Advice(
     ('To look for smaller errors, measure with a more accurate device.',),
 )
 """In place of `Rule.GAIN`, where the error before is no larger than the noise."""
+GOOD_HERE = replace(
+    GOOD_ARM,
+    meaning='At these poses the error is within the stated noise of the measuring device. '
+    'Elsewhere it may be larger: these poses tell little about the rest of the joint range.',
+    steps=('Add poses all over the workspace, each joint moved through most of its range.',),
+)
+"""The same where the poses do not tell the error elsewhere."""
 
 WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 """Where the description does not fit the arm."""
@@ -77,12 +84,14 @@ WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
     rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
 }
+BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
 """What each cause brings by itself; the first cause that is there counts."""
 
+FAR = 10.0
+"""Ratio of what is left to the noise stated that an arm's own errors rarely reach."""
 COARSE = (
-    'The measurements scatter {:.0f} times as much as stated for the device: before you measure '
-    'more, check that the target sits firmly, that the arm stood still, that clocks agree, and '
-    'the units.'
+    'The measurements scatter {:.0f} times as much as stated (sigma_position): check that target '
+    'and device sit firmly, the arm stood still, and the clocks agree.'
 )
 """What to check first where the measurements are far too coarse."""
 FEW = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
@@ -102,7 +111,7 @@ class Situation:
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on a correction that does not show to help, as is right here."""
-        if self.left >= 10.0:  # an arm's own errors rarely make it so much
+        if self.left >= FAR:
             steps = (each for each in one.steps if 'stood still' not in each)
             return replace(one, steps=(COARSE.format(self.left), *steps))
         if self.poses < ENOUGH:
@@ -129,6 +138,6 @@ def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Ad
         one = replace(rules()[rule], refusal='; '.join(texts))
         told.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
     for cause, texts in following.items():
-        meaning = f'Correct that first: "{rules()[cause].heading}".'
-        told.append(Advice('What probably follows from it', meaning, (), '; '.join(texts)))
+        heading = f'What probably follows from "{rules()[cause].heading}"'
+        told.append(Advice(heading, '', (), '; '.join(texts)))
     return tuple(told)

@@ -10,7 +10,7 @@ from dataclasses import astuple, replace
 import numpy as np
 
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.verification import Verification, remarks
+from calib_ros.apply.verification import Verification
 from calib_ros.apply.workspace import Placements, Sector, Spread, Survey, in_base, regions
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
@@ -20,6 +20,7 @@ from calib_ros.report import figures, sections
 from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer, numbers, unit_of
+from calib_ros.report.verdicts import hints, limits
 
 SOMETHING_MOVED = (
     'Check that the measuring device, the target and the robot stand as they did for the '
@@ -156,13 +157,15 @@ def plan_report(
         if known:
             predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
             verdict = replace(verdict, text=(*verdict.text, predicted))
-        if found.lacking or not known:
-            heading = 'Too little: these poses do not determine all parameters'
-            verdict = replace(verdict, state='open', heading=heading)
         steps = (
             'Drive to each pose, wait until the arm stands still, and measure.',
             'Then identify: calib_ros identify.',
         )
+        if found.lacking or not known:
+            heading = 'Too little: these poses do not determine all parameters'
+            verdict = replace(verdict, state='open', heading=heading)
+            more = 'Plan again with more poses (--poses), or candidates in which all joints move.'
+            steps = (more, *(steps if known else ()))
     return Report(
         kind='Plan of a measurement',
         robot=chain.name,
@@ -216,6 +219,7 @@ def verification_report(
     ]
     if found.tolerance is not None:
         text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
+    text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))
     state, steps = STANDINGS[found.verdict]
     gain = sections.gain(found.comparison, intervals=False)
     title = 'Accuracy before and after the correction'
@@ -227,7 +231,7 @@ def verification_report(
         accuracy=accuracy,
         picture=sections.distribution(poses),
         steps=steps,
-        remarks=(*warnings, *remarks(found)),
+        remarks=(*warnings, *hints(found)),
         identity=sections.identity_of(
             chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)
         ),

@@ -9,7 +9,9 @@ None where they are not installed. All text of others is escaped.
 from __future__ import annotations
 
 import hashlib
+import html
 import logging
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
@@ -22,6 +24,8 @@ from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
+TYPED = re.compile(r'(?<![\w-])--[a-z][a-z0-9-]*|calib_ros [a-z0-9]+(?![\w])')
+"""An option, or a command."""
 MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
@@ -166,12 +170,19 @@ def filled(template: str, **values: Any) -> str | None:
         loader=loader, autoescape=True, undefined=undefined, finalize=_shown, trim_blocks=True
     )
     values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
+    safe = environment.filters['safe']
+    environment.filters['typed'] = lambda text: safe(_typed(text))
     page: str = environment.get_template(template).render(**values)
     return page
 
 
 def _template(name: str) -> str:
     return (resources.files('calib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
+
+
+def _typed(text: str) -> str:
+    """Return a text as HTML, its commands and options as what is typed, unbroken by hyphens."""
+    return TYPED.sub(r'<code>\g<0></code>', html.escape(str(_shown(text))))
 
 
 def _shown(value: object) -> object:
@@ -189,7 +200,9 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     lines += _paragraphs(verdict.gain, *verdict.text)
     for reason in report.advice:
         lines += _section(reason.heading, reason.meaning, f'What was found: {reason.refusal}')
-        lines += _listed(reason.steps)
+        lines += _listed(reason.steps) if reason.steps else []
+    if report.advice:
+        lines += _paragraphs(*report.steps)
     for each in (report.accuracy, *report.sections):
         if each is None:
             continue
@@ -202,7 +215,8 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
     told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
     identity = [f'{name}: {value}' for name, value in told]
-    lists = {'What to do next': report.steps, 'Please note': report.remarks, 'Identity': identity}
+    steps = () if report.advice else report.steps
+    lists = {'What to do next': steps, 'Please note': report.remarks, 'Identity': identity}
     for title, points in lists.items():
         lines += [*_section(title), *_listed(points)] if points else []
     return '\n'.join(lines)

@@ -22,20 +22,26 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import GOOD_ARM, SPREAD_OUT, Advice, Situation, advice
+from calib_ros.report.advice import (
+    GOOD_ARM,
+    GOOD_HERE,
+    SPREAD_OUT,
+    Advice,
+    Situation,
+    advice,
+)
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
 
-NOT_YET = (
-    'The robot itself is not changed yet: calib_ros export (~/export of the node) brings the '
-    'correction to its controller, calib_ros compensate to its programs'
+NOT_YET = 'The robot itself is not changed yet'
+BRING = (
+    "calib_ros export (~/export of the node) brings the correction to the robot's controller, "
+    'calib_ros compensate to its programs'
 )
 UNPROVEN = (
     'These poses were all used to compute the correction: a small error "after" proves nothing.'
 )
-CAUSES = {Rule.MISTAKE, Rule.MOVED, Rule.ENCODER}
-"""What names its cause, so that it is said first."""
 SURVEYED = 20 * SOME_POSES
 """Random poses of the error map: some for each of its cells."""
 
@@ -69,7 +75,7 @@ def identification_report(
         ),
         picture=sections.distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
-        remarks=(*warnings, *(() if result.accepted else words.remarks(result))),
+        remarks=(*warnings, *_notes(result)),
         identity=sections.identity_of(
             result.chain, origin, poses, ('Judged by', result.validated_by), corrected
         ),
@@ -86,12 +92,23 @@ def _verdict(
         return _refused(result, reasons)
     how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
-    doubts = (f'Check before you use it: {each}.' for each in result.remarks)
-    text = (*filter(None, (how, where)), *doubts, 'The robot itself is not changed yet.')
+    text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
-    heading = 'Accepted' + (f', {within}' if within else '')
-    return Verdict('open' if 'not' in within else 'good', heading, text, sections.gain(judged))
+    heading = f'Accepted{somewhere(result)}' + (f', {within}' if within else '')
+    open_yet = 'not' in within or bool(result.remarks)
+    return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
+
+
+def somewhere(result: Identification) -> str:
+    """Return where alone an accepted calibration is valid; empty for everywhere."""
+    whole = result.region is None or result.region.whole
+    return '' if whole else ' near the measured poses'
+
+
+def doubts(result: Identification) -> tuple[str, ...]:
+    """Return what to check before an accepted result is used."""
+    return tuple(f'Check before you use it: {each}.' for each in result.remarks)
 
 
 def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
@@ -119,7 +136,9 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
         lower, _ = sections.limits_of(judged, 0, INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
-            return (replace(GOOD_ARM, refusal='; '.join(result.refusals)),)
+            told = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
+            good = GOOD_ARM if told else GOOD_HERE
+            return (replace(good, refusal='; '.join(result.refusals)),)
     held_out = () if judged is None or judged.repeated is None else (judged,)
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
     poses = sum(map(distinct, numbers))
@@ -133,21 +152,17 @@ def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
     tried = 'No correction was saved or sent to the robot. The figures show what was tried.'
     if reasons[0].heading == GOOD_ARM.heading:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
-        return Verdict('info', heading, (GOOD_ARM.meaning, tried, *_left(result)))
+        return Verdict('info', heading, (tried,))
     whys = '. '.join(each.heading for each in reasons if each.steps)
-    found = [f'What was found: {x}.' for x in result.refusals if x.rule in CAUSES]
-    heading = 'Not accepted: the robot stays as it was'
-    return Verdict('bad', heading, (f'Why: {whys}.', *found, tried, *_left(result)))
+    return Verdict('bad', 'Not accepted: the robot stays as it was', (f'Why: {whys}.', tried))
 
 
-def _left(result: Identification) -> Iterator[str]:
-    rules = {each.rule for each in result.refusals}
-    if result.validation is not None and Rule.GAIN in rules and Rule.MISTAKE not in rules:
-        before, after = result.validation.figures
-        yield (
-            f'On poses not used to compute it, the RMS error is {before.rms_mm:.3f} mm without '
-            f'the correction and {after.rms_mm:.3f} mm with it.'
-        )
+def _notes(result: Identification) -> Iterator[str]:
+    """Yield what to know besides: of an accepted result, doubts stand in the verdict."""
+    if not result.accepted:
+        yield from words.remarks(result)
+    elif drift := words.drift_in_words(result.noise):
+        yield drift
 
 
 def _steps(
@@ -159,8 +174,7 @@ def _steps(
     if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
         return ()
     if not result.accepted:
-        first = 'Follow the steps above, those of the first reason first.'
-        return (*((first,) if len(reasons) > 1 else ()), reasons[0].again)
+        return (reasons[0].again,)
     beyond = tolerance is not None and limits[0] > tolerance
     undecided = tolerance is not None and limits[0] <= tolerance < limits[1]
     found = {
@@ -169,16 +183,17 @@ def _steps(
         'Compare what is left with the accuracy of the measuring device: no calibration gets '
         'below that.': beyond,
         f'Measure more poses to decide about the tolerance, {SPREAD_OUT}.': undecided,
-        f'{NOT_YET}.': True,
+        'To use it beyond the measured poses, measure there as well: calib_ros compensate refuses '
+        'poses where it is not valid.': result.region is not None and not result.region.whole,
+        f'{BRING}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': True,
-        'calib_ros compensate refuses poses where the calibration is not valid. To use it there, '
-        'measure poses there as well.': result.region is not None and not result.region.whole,
     }
     return tuple(step for step, needed in found.items() if needed)
 
 
 def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterator[Section]:
+    drift = result.accepted and words.drift_in_words(result.noise)
     yield section(
         'noise',
         'What is left against the noise of the device',
@@ -187,7 +202,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
-            words.neighbours_in_words(result.noise),
+            *(() if drift else (words.neighbours_in_words(result.noise),)),
             *map(words.chance_in_words, () if result.chance is None else (result.chance,)),
         ),
     )

@@ -21,13 +21,12 @@ from calib_ros.report.page import Origin, Section, section
 from calib_ros.report.poses import Poses
 
 ISO_9283 = (
-    'Errors are position accuracies in the terms of ISO 9283: the distance between the pose '
-    'commanded and the mean of the poses attained. Where a pose was measured once, its '
-    'repeatability is part of the figure.'
+    'The error of a pose is its position accuracy AP of ISO 9283: from the pose commanded to the '
+    'mean of the poses attained. Measured once, its repeatability is part of it.'
 )
 LABELS = (
     *('RMS [mm]', '95 % interval of it', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
-    *('RMS [mrad]', 'RMS [px]'),
+    *('RMS orientation [mrad]', 'RMS [px]'),
 )
 """Rows of the table of accuracy below its head and count."""
 

@@ -56,6 +56,8 @@ def summary(
         text += f' no weight{where}'
     if result.region is not None:
         text += f'; {result.region.in_words()}'
+    if result.unidentifiable:
+        text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
     text = '; '.join((text, *notes(result)))
     if more := (*warnings, *remarks(result)):
         text += f'; note: {"; ".join(more)}'
@@ -80,10 +82,8 @@ def remarks(result: Identification) -> list[str]:
 
 
 def notes(result: Identification) -> list[str]:
-    """Return what there is to know of the parameters, one thing each."""
+    """Return what there is to know of the parameters fitted, one thing each."""
     found = []
-    if result.unidentifiable:
-        found.append(f'not identifiable, kept nominal: {", ".join(result.unidentifiable)}')
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
         found.append(f'with {len(result.chain.effects)} effects ({", ".join(groups)})')
@@ -252,6 +252,11 @@ def scatter_in_words(noise: Noise) -> str:
         return f'{text}: the device is better than stated.'
     text += ': the device is worse than stated, or the arm has errors that this model lacks.'
     return f'{text} The intervals are wider for it.'
+
+
+def drift_in_words(noise: Noise) -> str:
+    """Return what speaks for a drift of the device: errors shared in succession alone."""
+    return neighbours_in_words(noise) if noise.shared == ('successive',) else ''
 
 
 NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other in joint space'}

@@ -114,9 +114,13 @@ def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
     assert out.splitlines()[-4].split()[0] == '10'
 
 
-def test_plan_with_too_few_poses_says_so(run):
-    _, out, _ = run('plan', '--chain', 'ur10e', '--poses', 3)
+def test_plan_with_too_few_poses_says_so(run, tmp_path):
+    few = ('plan', '--chain', 'ur10e', '--poses', 3, '--draw', 200, '--out', 'plan.csv')
+    _, out, _ = run(*few)
     assert 'too few poses to determine all parameters' in out
+    page = (tmp_path / 'plan.report.html').read_text()
+    assert 'Plan again with more poses' in page
+    assert 'Drive to each pose' not in page
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from calib_ros.apply.candidates import Visibility, iso_9283_poses
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.design import Design
-from calib_ros.apply.verification import Attained, in_words, verify
+from calib_ros.apply.verification import Attained, verify
 from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
 from calib_ros.errors import ConfigError, InputError
@@ -23,6 +23,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import Residuals
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert, to_quat
+from calib_ros.report.verdicts import in_words
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)

@@ -17,6 +17,7 @@ def bad_inputs():
     yield 'no input', bag_of, 'either a bag, or a table'
     yield 'two inputs', (*good, 'bag'), 'either a bag, or a table'
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
+    yield 'a table almost of this name', (*csv_of, 'godo.csv'), 'did you mean "good.csv"'
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
     yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'

@@ -119,6 +119,27 @@ def test_the_help_of_a_command(shown, name):
     assert 'default: None' not in text
 
 
+def test_help_of_a_command_is_that_command_with_help(shown):
+    assert shown('help', 'plan') == shown('plan', '--help')
+
+
+@pytest.mark.parametrize(
+    ('given', 'wrong'),
+    [
+        (('plan', '--chain', 'ur5e', '--pose', '9', '--otu', 'x'), 'option "--otu": did you mean'),
+        (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
+        (('robots', 'ur5e'), '"ur5e" is one too many'),
+        (('chain',), 'required: ROBOT'),
+    ],
+)
+def test_wrong_usage_ends_with_an_example_of_that_command(shown, given, wrong):
+    status, text = shown(*given)
+    assert status == 2
+    assert text.startswith(f'usage: calib_ros {given[0]} ')
+    assert wrong in text
+    assert text.endswith(f'example: calib_ros {examples_of(given[0])[0]}\n')
+
+
 @pytest.mark.parametrize('name', TEXTS)
 def test_the_examples_of_a_help_are_right(name):
     for example in examples_of(name):

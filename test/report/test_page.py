@@ -203,7 +203,9 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
     problem = Problem(UR, rows, sigma_position=3e-4, sigma_orientation=6e-4)
     result = identify(problem)
     assert {each.rule for each in result.refusals} == {Rule.GAIN}
-    assert report_of(problem, result).verdict.state == state
+    report = report_of(problem, result)
+    assert report.verdict.state == state
+    assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == (state == 'info')
 
 
 def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
@@ -212,7 +214,7 @@ def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
     told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
     assert [bool(each.steps) for each in told] == [True, True, False]
     assert told[-1].refusal == 'LARGEST_ERROR; GAIN'
-    assert told[0].heading in told[-1].meaning
+    assert told[0].heading in told[-1].heading
 
 
 @pytest.mark.parametrize('cause', [Rule.MOVED, Rule.ENCODER])
@@ -220,9 +222,16 @@ def test_a_bump_explains_why_many_poses_do_not_fit(cause):
     moved, outliers = advice.advice([Reason(cause, 'at pose 36'), Reason(Rule.OUTLIERS, '42 %')])
     assert moved.steps
     assert not outliers.steps
-    assert moved.heading in outliers.meaning
+    assert moved.heading in outliers.heading
     (alone,) = advice.advice([Reason(Rule.OUTLIERS, '42 %')])
     assert alone.steps
+
+
+def test_joints_that_hardly_moved_explain_that_nothing_was_gained():
+    rules = (Rule.EXCITATION, Rule.GAIN)
+    excited, gain = advice.advice([Reason(rule, rule.name) for rule in rules])
+    assert excited.steps
+    assert not gain.steps
 
 
 def test_an_accepted_page_says_that_the_robot_is_not_changed_yet(solved):
@@ -233,10 +242,21 @@ def test_an_accepted_page_says_that_the_robot_is_not_changed_yet(solved):
     assert 'calib_ros compensate' in ' '.join(report.steps)
 
 
+def test_a_calibration_that_is_valid_somewhere_alone_is_accepted_there(solved):
+    problem, result = solved
+    near = replace(result, region=replace(result.region, limit=1e-3, share=0.1))
+    report = report_of(problem, near)
+    assert report.verdict.heading == 'Accepted near the measured poses'
+    assert report.steps[0].startswith('To use it beyond the measured poses')
+    assert report_of(problem, result).verdict.heading == 'Accepted'
+
+
 def test_a_doubt_about_an_accepted_result_stands_in_the_verdict(solved):
     problem, result = solved
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
-    assert any('ur3' in each for each in report_of(problem, doubtful).verdict.text)
+    verdict = report_of(problem, doubtful).verdict
+    assert 'ur3' in verdict.text[1]
+    assert verdict.state == 'open'
 
 
 def test_no_pose_is_called_judged_where_none_was_left_out():
@@ -279,10 +299,22 @@ def test_an_arm_as_good_as_the_device_can_see_is_no_bad_one(sigma):
     assert 'Not accepted' in ' '.join((verdict.heading, *verdict.text))
 
 
-def test_a_mistake_is_named_in_the_verdict():
+def test_a_mistake_is_the_first_reason_and_what_follows_has_no_steps():
     problem = Problem(load_chain('ur10'), measured(chain=UR, count=40))
-    verdict = report_of(problem, identify(problem)).verdict
-    assert '--chain ur5e' in verdict.text[1]
+    report = report_of(problem, identify(problem))
+    first, *others = report.advice
+    assert '--chain ur5e' in first.refusal
+    assert report.verdict.text[0] == f'Why: {first.heading}.'
+    assert [each.steps for each in others] == [()]
+
+
+def test_poses_in_one_spot_do_not_show_a_good_arm():
+    rng = np.random.default_rng(4)
+    joints = np.array([0.3, -1.2, 1.4, -0.8, 1.1, 0.5]) + rng.normal(0.0, 0.01, (40, 6))
+    rows = simulation.measure(UR, joints, rng, 5e-5, 2e-4)
+    problem = Problem(UR, rows, sigma_position=1e-4, sigma_orientation=4e-4)
+    (told,) = report_of(problem, identify(problem)).advice
+    assert told == replace(advice.GOOD_HERE, refusal=told.refusal)
 
 
 def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
@@ -334,7 +366,10 @@ def test_a_verification_has_its_verdict_first(solved):
     found = verify(Calibration.of(result), sets, 1e-3)
     poses = poses_to_verify(result.chain, sets, found.comparison)
     page = page_of(verification_report(result.chain, found, poses, Origin()))
-    assert page.text.index('PASS') < page.text.index('Accuracy before')
+    order = ('PASS', 'not the robot with it', 'Accuracy before')
+    where = [page.text.index(words) for words in order]
+    assert where == sorted(where)
+    assert page.text.count('not the robot with it') == 1
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from calib_ros.apply.simulation import measure
-from calib_ros.apply.verification import in_words, verify
+from calib_ros.apply.verification import verify
 from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.verdicts import in_words
 from calib_ros.report.words import checked, verdict
 
 
@@ -38,4 +39,4 @@ def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     found = verify(Calibration(arm, arm, residual=1e-4), [seen], None)
     row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
     assert (row.verdict, row.accepted) == (verdict, False)
-    assert ('was the tracker' in in_words(found)) == (verdict == 'does not hold')
+    assert ('larger than it was' in in_words(found)) == (verdict == 'does not hold')

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A verification in words."""
+
+from __future__ import annotations
+
+from calib_ros.apply.verification import DECIDING, Verification
+from calib_ros.identification.levels import NEARER
+from calib_ros.identification.records import reused_in_words
+
+
+def in_words(found: Verification) -> str:
+    """Return the verdict with all that it rests on."""
+    before, after = found.comparison.figures
+    share = 100.0 * found.confidence
+    lines = [
+        f'position error [mm] of {after.count} measurements at {found.configurations} poses',
+        '              RMS     mean      max   mean + 3 sigma',
+    ]
+    for label, figures in (('before', before), ('after', after)):
+        turn = '' if figures.rms_mrad is None else f'   (RMS {figures.rms_mrad:.3f} mrad)'
+        lines.append(
+            f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
+            f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
+        )
+    lines += each_in_words(found)
+    verdict = '' if found.tolerance is None else f'{found.verdict}: '
+    wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
+    lines.append(
+        f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
+        f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
+    )
+    return '\n'.join([*lines, *remarks(found)])
+
+
+def each_in_words(found: Verification) -> list[str]:
+    """Return the lines of a table of the poses [mm], of which there may be none."""
+    again = any(pose.repeatability is not None for pose in found.each)
+    lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
+    for k, pose in enumerate(found.each, 1):
+        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
+        lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
+    return lines if found.each else []
+
+
+def limits(found: Verification) -> list[str]:
+    """Return what the verdict does not tell."""
+    lines = [warning] if (warning := reused_in_words(found.reused)) else []
+    if not found.by_program:
+        lines.append(
+            'this judges the calibration, not the robot with it: --commanded, the program before '
+            'its correction, tells whether the correction reaches the arm'
+        )
+    return lines
+
+
+def remarks(found: Verification) -> list[str]:
+    """Return what to know besides the figures, and what to do."""
+    return [*limits(found), *hints(found)]
+
+
+def hints(found: Verification) -> list[str]:
+    """Return what was fitted anew, and where the error may come from."""
+    lines = []
+    if found.fitted:
+        lines.append(f'fitted anew, before and after alike: {" and ".join(found.fitted)}')
+    if found.verdict == 'UNDECIDED':
+        enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
+        lines.append(f'{enough} poses with the same RMS error would decide')
+    if found.verdict == 'does not hold':
+        lines.append('the error is larger than it was when the calibration was made')
+    if found.common < NEARER:
+        lines.append(
+            f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
+            'the error would be left: was the measuring device moved? If it stands elsewhere on '
+            'purpose, --new-base fits its frame, and --new-tool that of another target'
+        )
+    return lines
