@@ -11,6 +11,7 @@ Pictures show a result that is accepted (UR10, session B) and one that is refuse
 
 import argparse
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -91,8 +92,10 @@ def screenshots(folder: Path, data: Path) -> None:
     with tempfile.TemporaryDirectory() as work, browser() as started:
         for name, (robot, *more) in RESULTS.items():
             out = Path(work) / name
-            table, chain = data / robot / 'uniform.csv', data / robot / 'chain.yaml'
-            given = ['--csv', str(table), '--chain', str(chain), '--out', str(out), *more]
+            for file in ('uniform.csv', 'chain.yaml'):
+                shutil.copy(data / robot / file, work)
+            os.chdir(work)  # the page shows the command
+            given = ['uniform.csv', '--chain', 'chain.yaml', '--out', name, *more]
             calib_ros(['identify', *given])
             for ending, (width, height) in SCREENS.items():
                 page = started.new_page()
@@ -132,7 +135,7 @@ def main() -> None:
     elif 'CALIB_ROS_DATA' not in os.environ:
         parser.error('set CALIB_ROS_DATA to the folder of the measured robots')
     else:
-        screenshots(options.screenshots, Path(os.environ['CALIB_ROS_DATA']))
+        screenshots(options.screenshots.resolve(), Path(os.environ['CALIB_ROS_DATA']))
 
 
 if __name__ == '__main__':

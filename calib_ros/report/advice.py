@@ -15,6 +15,7 @@ from functools import cache
 from importlib import resources
 
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.settings import EXCEPTION
 
 AGAIN = (
     'Then identify again. Use the measurements so far with the new ones; if something was loose, '
@@ -87,7 +88,7 @@ BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
 BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
 """What each cause brings by itself; the first cause that is there counts."""
 
-FAR = 10.0
+FAR = 1.0 / EXCEPTION
 """Ratio of what is left to the noise stated that an arm's own errors rarely reach."""
 COARSE = (
     'The measurements scatter {:.0f} times as much as stated (sigma_position): check that target '
