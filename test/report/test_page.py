@@ -189,7 +189,7 @@ def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
     report = replace(report_of(problem, result), origin=origin)
     refused = replace(report, verdict=Verdict('bad', 'no'), steps=('identify again',))
     assert report.of == 'cell'
-    assert 'c &lt;d&gt;' in render(refused)
+    assert '<span>c</span> <span>&lt;d&gt;</span>' in render(refused)
 
 
 @pytest.mark.parametrize(('share', 'count', 'state'), [(0.0, 60, 'info'), (0.5, 8, 'bad')])
