@@ -37,6 +37,7 @@ from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
 
+NOT_RECORDING = 'not recording: call ~/record with true'
 ONE_FRAME = (
     'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
     'its own for each source'
@@ -133,6 +134,8 @@ class CalibrationSession:
 
         With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
         """
+        if not self.recording:
+            return 0, NOT_RECORDING
         count, why = self._collector.capture(socket_place(socket) if socket else '')
         before = len(self.samples)
         self._road.hand_over()
@@ -181,6 +184,8 @@ class CalibrationSession:
     @property
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
+        if not self.recording:  # what the arm does is not looked at
+            return NOT_RECORDING
         track = self._collector.track
         silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
         if silent:
