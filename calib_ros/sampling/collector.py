@@ -17,12 +17,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.hints import Hint, restless, sparse
+from calib_ros.sampling.hints import Hint, apart, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Maker, Numbered
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
+    TOO_LATE,
     Piece,
     Series,
     Slice,
@@ -173,6 +174,23 @@ class Collector:
         found = [] if needed is None else [restless(needed, self.settings.still)]
         return found + sparse(between, measurements, self.settings.max_gap)
 
+    def astray(self, measurements: int) -> list[Hint]:
+        """Tell of a stream whose clock is further from that of the joints than can be looked for.
+
+        Its measurements wait for joint states, or those since the last match have found none; or
+        most of so many measurements have not.
+        """
+        causes = (TOO_LATE, *(f'measurements: {cause}' for cause in CAUSES[1:3]))
+        most = max(measurements // 2, NO_ACCIDENT) < sum(self.dropped[each] for each in causes)
+        found = []
+        for key, last_ns in self.waiting.last_ns.items() if self._newest_ns else ():
+            ahead = last_ns - self.delay_ns - self._newest_ns
+            waiting = self.waiting[key].count if ahead > 0 else 0
+            unmatched = max(waiting, self.waiting.unmatched[key])
+            if abs(ahead) > self._lateness_ns and (most or unmatched >= NO_ACCIDENT):
+                found.append(1e-9 * ahead)
+        return [apart(max(found, key=abs))] if found else []
+
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
         newest = [int(rows.stamps.max()) for rows in self.waiting.values() if rows.count]
@@ -315,6 +333,8 @@ class Collector:
             cause = self.track.causes(stamps)
             self._count_causes(cause)
             known, inside = cause == 0, wanted[numbers]
+            before = self.waiting.unmatched[key]
+            self.waiting.unmatched[key] = 0 if known.any() else before + due
             for k, count in Counter(numbers[known & ~inside].tolist()).items():
                 self.unused[f'measurements: {plan.why[k]}'] += count
             early = known & inside & (stamps < calm[numbers])

@@ -98,22 +98,17 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
     return [Hint(f'joint states are too rare: {rate} are needed', words)]
 
 
-def apart(
-    waiting: int, unmatched: int, measurements: int, ahead: float, lateness: float
-) -> list[Hint]:
-    """Tell that clocks disagree by more than can be looked for, if most measurements say so.
+def apart(ahead: float) -> Hint:
+    """Tell that clocks disagree by more than can be looked for.
 
-    Measurements wait for joint states, or have found none; they are `ahead` of those [s].
+    The last measurement is stamped `ahead` of the last joint state [s].
     """
-    most = unmatched > max(measurements // 2, NO_ACCIDENT)
-    if abs(ahead) <= lateness or not (most or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
-        return []
     words = (
         f'the newest measurement is stamped {abs(ahead):.0f} s '
         f'{"after" if ahead > 0.0 else "before"} the newest joint state: make the clocks of '
         'both agree (NTP, PTP), if both still come'
     )
-    return [Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)]
+    return Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)
 
 
 def disagreement(delay: float, known: float) -> Hint:

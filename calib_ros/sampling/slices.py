@@ -198,6 +198,10 @@ class Waiting(dict[StreamKey, Rows]):
         super().__init__()
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
+        self.last_ns: dict[StreamKey, int] = {}
+        """Stamps of the last measurements to come, by stream."""
+        self.unmatched: Counter[StreamKey] = Counter()
+        """How many have found no joint states since the last that did, by stream."""
 
     @property
     def count(self) -> int:
@@ -215,7 +219,7 @@ class Waiting(dict[StreamKey, Rows]):
         if key not in self and len(self) >= MOST_NAMES:  # forget those without any use
             for each in [each for each, rows in self.items() if not rows.count]:
                 if not self._kept(each):
-                    del self[each]
+                    del self[each], self.last_ns[each], self.unmatched[each]
         if key not in self:
             if len(self) >= MOST_NAMES:
                 self._dropped[TOO_MANY] += len(stamps)
@@ -224,8 +228,10 @@ class Waiting(dict[StreamKey, Rows]):
         rows = self[key]
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
+        self.last_ns[key] = int(stamps[-1])
         if len(due) < len(stamps):
             self._dropped[TOO_LATE] += len(stamps) - len(due)
+            self.unmatched[key] += len(stamps) - len(due)
         if len(taken) < len(due):
             self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])

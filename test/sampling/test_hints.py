@@ -154,6 +154,42 @@ def test_clocks_too_far_apart_for_the_delay_to_be_found_are_told(seconds):
             made.identify()
 
 
+def with_a_step(step, of):
+    """Return a session in whose last 2 s of 40 the clock of something was moved by `step` [s]."""
+    motion = tour(25)
+    times, seen = np.arange(0.0, 40.0, 0.01), np.arange(0.003, 40.0, 0.02)
+    stamped = {'joints': times, 'measurements': seen}
+    stamped[of] = stamped[of] + np.where(stamped[of] > 38.0, step, 0.0)
+    found = measure(TRUE, motion(seen), np.random.default_rng(3), 2e-5, 1e-4)
+    made = CalibrationSession(UR5E)
+    hear(
+        made,
+        (times, stamps(stamped['joints']), motion(times)),
+        (seen, stamps(stamped['measurements']), found.positions, found.rotations),
+    )
+    return made
+
+
+@pytest.mark.parametrize(
+    ('step', 'of', 'words'),
+    [
+        (-5.0, 'measurements', '5 s before'),
+        (5.0, 'joints', '5 s before'),
+        (-5.0, 'joints', '5 s after'),
+        (-1e9, 'measurements', '1000000000 s before'),
+        (-1e9, 'joints', '1000000000 s after'),
+    ],
+)
+def test_a_clock_that_goes_far_astray_is_told_at_once(step, of, words):
+    """However many measurements were matched before it, and by how much it was moved."""
+    (warning,) = told(with_a_step(step, of))
+    assert f'measurement is stamped {words} the newest joint state: make the clocks' in warning
+
+
+def test_a_clock_that_is_not_moved_is_not_told_of():
+    assert told(with_a_step(0.0, 'joints')) == ()
+
+
 @pytest.mark.parametrize(('pause', 'count'), [(2.0, 0), (4.0, 1)])
 def test_of_a_pause_in_the_joint_states_a_tenth_must_have_been_measured(pause, count):
     made = heard(tour(15), 29.5, hole=(10.0, 10.0 + pause))
