@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import Clocks
-from calib_ros.sampling.hints import Hint
+from calib_ros.sampling.hints import Hint, unsettled
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice
 from calib_ros.settings import Settings
@@ -178,12 +178,10 @@ class Road:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, of so many measurements."""
-        collector = self.collector
-        return [
-            *collector.astray(measurements),
-            *self.clocks.hints(),
-            *collector.hints(measurements),
-        ]
+        collector, maker = self.collector, self.collector.maker
+        found = collector.astray(measurements)
+        found += self.clocks.hints() + collector.hints(measurements)
+        return found or unsettled(maker.restless, maker.restless + maker.rested)
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from streams import START, S, hear, stamps, stops, sweep
+from sessions import session
+from streams import POSE, START, TRACKER, S, hear, pose, stamps, stops, sweep, take
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
@@ -188,6 +189,41 @@ def test_a_clock_that_goes_far_astray_is_told_at_once(step, of, words):
 
 def test_a_clock_that_is_not_moved_is_not_told_of():
     assert told(with_a_step(0.0, 'joints')) == ()
+
+
+@pytest.mark.parametrize(('speed', 'stops_taken'), [(0.0, 15), (0.02, 0)])
+def test_stops_at_which_the_target_still_moves_are_told(speed, stops_taken):
+    """A device that smooths, an arm that creeps: the operator stood there for nothing."""
+    motion, rng = tour(15), np.random.default_rng(3)
+    times, seen = np.arange(0.0, 29.5, 0.01), np.arange(0.003, 29.2, 0.02)
+    found = measure(TRUE, motion(seen), rng, 2e-5, 1e-4)
+    positions = found.positions + speed * np.minimum(seen % PERIOD, 1.0)[:, np.newaxis]
+    made = CalibrationSession(UR5E)
+    hear(
+        made,
+        (times, stamps(times), motion(times)),
+        (seen, stamps(seen), positions, found.rotations),
+    )
+    made.finish()
+    assert len(made.samples) == stops_taken
+    warnings = told(made)
+    assert len(warnings) == (stops_taken == 0)
+    for words in warnings:
+        assert re.match(r'1[45] of 1[45] stops are refused: what is measured still moves', words)
+        assert 'set settle' in words
+
+
+@pytest.mark.parametrize(('share', 'count'), [(0.05, 0), (0.2, 1)])
+def test_much_that_is_dropped_is_told_and_why(share, count):
+    """A driver that does not always fill its stamps loses accuracy, and the operator time."""
+    made, rng = session(), np.random.default_rng(4)
+    stamp = np.where(rng.random(500) < share, 0, START + np.arange(500) * S // 50)
+    take(made, *((TRACKER, POSE, pose(each, np.ones(3), np.eye(3))) for each in stamp.tolist()))
+    found = told(made)
+    assert len(found) == count
+    if count:
+        said = r'\d\d% of the measurements were dropped .*: zero stamp \(fill header.stamp'
+        assert re.match(said, found[0])
 
 
 @pytest.mark.parametrize(('pause', 'count'), [(2.0, 0), (4.0, 1)])
