@@ -268,6 +268,7 @@ class CalibrationSession:
         if self.pictures.refused:
             told.append(f'the last image is not used: {self.pictures.refused}')
         estimate = self.estimate
+        told.append(self._live.refused)
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
             told.append(f'pose {number} does not fit the others, was the target moved?')
