@@ -23,8 +23,10 @@ from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
+    POSES,
     TOO_LATE,
     Piece,
+    Rows,
     Series,
     Slice,
     Stamps,
@@ -37,6 +39,8 @@ from calib_ros.settings import Settings
 
 REST_S = 0.5 * Settings.shortest_stop
 """Time [s] during which joints must have stayed where they are to be standing."""
+TWICE = 'same stamp twice'
+CONTRARY = 'other values with the same stamp (of two publishers, or stamps too coarse?)'
 ADVANCE_NS = round(5e9 * REST_S)
 """Time of the newest joint sample between two rounds of taking samples."""
 
@@ -291,13 +295,14 @@ class Collector:
         self.track.release(min(plan.done_ns, self._complete_ns) - margin)
 
     def _sort(self) -> None:
-        twice = self.track.sort()
-        if twice:
-            self.dropped['joints: same stamp twice'] += twice
-        for rows in self.waiting.values():
+        kept: list[tuple[str, Track | Rows]] = [(JOINTS, self.track)]
+        for kind, rows in (*kept, *((POSES, each) for each in self.waiting.values())):
+            before = rows.contrary
             twice = rows.sort()
-            if twice:
-                self.dropped['measurements: same stamp twice'] += twice
+            contrary = rows.contrary - before
+            for cause, count in ((TWICE, twice - contrary), (CONTRARY, contrary)):
+                if count:
+                    self.dropped[f'{kind}: {cause}'] += count
 
     def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
         """Plan a sample of each stop that ends before a stamp, and note which pass unseen."""

@@ -22,12 +22,16 @@ Series: TypeAlias = tuple[Stamps, FloatArray]
 """Stamps (N,), and rows (N, w) or values (N,) at them."""
 
 
+SAME = 1e-6
+"""Difference, relative as well, of values that are the same: they may have been floats."""
+
+
 class Rows:
     """Stamped rows of numbers in one growing block of memory, up to a capacity."""
 
     def __init__(self, width: int, capacity: int) -> None:
         self.width, self.capacity = width, capacity
-        self.count = 0
+        self.count = self.contrary = 0  # rows held; rows let go for another with other values
         self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
         self._values = np.empty((len(self._stamps), width))
 
@@ -81,8 +85,11 @@ class Rows:
         before = self.count
         if before > 1 and not (np.diff(self.stamps) > 0).all():
             order = np.lexsort((*self.values.T[::-1], self.stamps))
-            stamps = self.stamps[order]
-            self.keep(order[np.concatenate([[True], np.diff(stamps) > 0])])
+            stamps, values = self.stamps[order], self.values[order]
+            again = np.diff(stamps) == 0
+            near = np.isclose(values[1:][again], values[:-1][again], SAME, SAME, equal_nan=True)
+            self.contrary += int((~near.all(axis=1)).sum())
+            self.keep(order[np.concatenate([[True], ~again])])
         return before - self.count
 
 

@@ -226,6 +226,36 @@ def test_much_that_is_dropped_is_told_and_why(share, count):
         assert re.match(said, found[0])
 
 
+@pytest.mark.parametrize(
+    ('of', 'other', 'count'),
+    [
+        ('measurements', 1e-3, 1),  # two targets on one topic, or stamps of whole seconds
+        ('measurements', 0.0, 0),  # what a relay repeats
+        ('joints', 1e-3, 1),
+        ('joints', 1e-8, 0),  # and rounds
+    ],
+)
+def test_other_values_with_the_same_stamp_are_told(of, other, count):
+    motion = tour(15)
+    times, seen = np.arange(0.0, 29.5, 0.01), np.arange(0.003, 29.2, 0.02)
+    if of == 'joints':
+        times = np.repeat(times, 2)
+    else:
+        seen = np.repeat(seen, 2)
+    found = measure(TRUE, motion(seen), np.random.default_rng(3), 0.0, 0.0)
+    joints, positions = motion(times), found.positions.copy()
+    (joints if of == 'joints' else positions)[1::2] += other
+    rotations = found.rotations
+    made = CalibrationSession(UR5E)
+    hear(made, (times, stamps(times), joints), (seen, stamps(seen), positions, rotations))
+    made.finish()
+    warnings = told(made)
+    assert len(warnings) == count
+    for words in warnings:
+        said = rf'[45]\d% of the {of} were dropped .*: other values with the same stamp'
+        assert re.match(said, words)
+
+
 @pytest.mark.parametrize(('pause', 'count'), [(2.0, 0), (4.0, 1)])
 def test_of_a_pause_in_the_joint_states_a_tenth_must_have_been_measured(pause, count):
     made = heard(tour(15), 29.5, hole=(10.0, 10.0 + pause))
