@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Told, nobody
-from calib_ros.sampling.hints import Account
+from calib_ros.sampling.hints import LOST, Account, lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
 
 ALLOW = 'take the rest all the same with --largest-loss'
-_LOSS = re.compile(r'stamp|lateness|buffer full|memory')
-_TWICE = re.compile(r'same stamp twice|is there already')
 
 
 @dataclass(frozen=True)
@@ -60,16 +57,13 @@ class Replayed:
             text = f'how much of the bag is lost is not known, {ALLOW} 1'
             return (Reason(Rule.UNKNOWN_LOSS, text),)
         share = _lost(self.recorded, self.read)
-        lost = {'of the messages could not be read': (Rule.UNREADABLE, share)}
+        shares = {'of the messages could not be read': (Rule.UNREADABLE, share)}
         for name, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
-            causes = (each for each in account.dropped if each.startswith(name))
-            causes = (each for each in causes if _LOSS.search(each) and not _TWICE.search(each))
-            cause = f'of the {name} were dropped for their stamps or for want of room'
-            left = count - sum(account.dropped[each] for each in causes)
-            lost[cause] = (Rule.DROPPED, _lost(count, left))
+            share, _ = lost(name, count, account.dropped)
+            shares[f'of the {name} {LOST}'] = (Rule.DROPPED, share)
         return tuple(
             Reason(rule, f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}')
-            for cause, (rule, share) in lost.items()
+            for cause, (rule, share) in shares.items()
             if share > largest_loss
         )
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib_ros.errors import CalibrationError, ColumnsError, InputError, TooFewObservationsError
+from calib_ros.errors import CalibrationError, ColumnsError, TooFewObservationsError
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
@@ -23,7 +23,7 @@ from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.sample import named
-from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
 
@@ -53,7 +53,7 @@ class Loaded:
             result = identify_model(self.problem, model, told)
         except TooFewObservationsError as err:
             if self.read:
-                raise InputError(f'{err} ({self.read})') from err
+                raise too_few(err, '; '.join((self.read, *self.warnings))) from err
             raise
         own = () if self.instead else result.refusals
         return replace(result, refusals=(*own, *self.refusals))

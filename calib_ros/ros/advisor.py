@@ -117,7 +117,10 @@ class Guide:
         if samples == self._advised or all(sample.validation for sample in samples):
             return
         self._advised = samples
-        problem = self._session.problem_of(samples)
+        try:
+            problem = self._session.problem_of(samples)
+        except CalibrationError:  # the status tells
+            return
         self._advising = self._start(self._advise, problem, self._session.estimate)
 
     def show(self, calibration: Calibration) -> None:

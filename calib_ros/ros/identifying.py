@@ -13,7 +13,13 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.errors import LONGEST, CalibrationError, ConfigError, shortened
+from calib_ros.errors import (
+    LONGEST,
+    CalibrationError,
+    ConfigError,
+    TooFewObservationsError,
+    shortened,
+)
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import (
     Filing,
@@ -40,7 +46,7 @@ from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.sample import Sample, named
-from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
 
@@ -102,6 +108,7 @@ class Snapshot(NamedTuple):
     origin: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...]
+    came: str = ''
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the numbers by which the operator knows the samples that are outliers."""
@@ -154,14 +161,19 @@ class Identifying:
         }
         numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
         model, settings = session.settings.model, self._configuration()
-        found = Snapshot(problem, model, samples, numbers, origin, settings, session.warnings)
+        told = session.warnings, session.came
+        found = Snapshot(problem, model, samples, numbers, origin, settings, *told)
         self.progress.begin()
         return found
 
     def run(self, given: Snapshot) -> Answer:
         """Identify; publish only what is accepted."""
-        with self.progress.running():
-            result = identify_model(given.problem, given.model, self.progress)
+        try:
+            with self.progress.running():
+                result = identify_model(given.problem, given.model, self.progress)
+        except TooFewObservationsError as err:
+            self._advice = next(iter(given.warnings), '')
+            raise too_few(err, given.came) from err
         steps = (step for reason in reasons_of(result) for step in reason.steps)
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)

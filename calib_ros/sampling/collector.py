@@ -17,13 +17,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.hints import Hint, restless, sparse
+from calib_ros.sampling.hints import Hint, apart, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Maker, Numbered
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
+    POSES,
+    TOO_LATE,
     Piece,
+    Rows,
     Series,
     Slice,
     Stamps,
@@ -36,6 +39,8 @@ from calib_ros.settings import Settings
 
 REST_S = 0.5 * Settings.shortest_stop
 """Time [s] during which joints must have stayed where they are to be standing."""
+TWICE = 'same stamp twice'
+CONTRARY = 'other values with the same stamp (of two publishers, or stamps too coarse?)'
 ADVANCE_NS = round(5e9 * REST_S)
 """Time of the newest joint sample between two rounds of taking samples."""
 
@@ -173,6 +178,23 @@ class Collector:
         found = [] if needed is None else [restless(needed, self.settings.still)]
         return found + sparse(between, measurements, self.settings.max_gap)
 
+    def astray(self, measurements: int) -> list[Hint]:
+        """Tell of a stream whose clock is further from that of the joints than can be looked for.
+
+        Its measurements wait for joint states, or those since the last match have found none; or
+        most of so many measurements have not.
+        """
+        causes = (TOO_LATE, *(f'measurements: {cause}' for cause in CAUSES[1:3]))
+        most = max(measurements // 2, NO_ACCIDENT) < sum(self.dropped[each] for each in causes)
+        found = []
+        for key, last_ns in self.waiting.last_ns.items() if self._newest_ns else ():
+            ahead = last_ns - self.delay_ns - self._newest_ns
+            waiting = self.waiting[key].count if ahead > 0 else 0
+            unmatched = max(waiting, self.waiting.unmatched[key])
+            if abs(ahead) > self._lateness_ns and (most or unmatched >= NO_ACCIDENT):
+                found.append(1e-9 * ahead)
+        return [apart(max(found, key=abs))] if found else []
+
     def flush(self) -> None:
         """Make samples of everything that has come on both sides, as if nothing came late."""
         newest = [int(rows.stamps.max()) for rows in self.waiting.values() if rows.count]
@@ -273,13 +295,14 @@ class Collector:
         self.track.release(min(plan.done_ns, self._complete_ns) - margin)
 
     def _sort(self) -> None:
-        twice = self.track.sort()
-        if twice:
-            self.dropped['joints: same stamp twice'] += twice
-        for rows in self.waiting.values():
+        kept: list[tuple[str, Track | Rows]] = [(JOINTS, self.track)]
+        for kind, rows in (*kept, *((POSES, each) for each in self.waiting.values())):
+            before = rows.contrary
             twice = rows.sort()
-            if twice:
-                self.dropped['measurements: same stamp twice'] += twice
+            contrary = rows.contrary - before
+            for cause, count in ((TWICE, twice - contrary), (CONTRARY, contrary)):
+                if count:
+                    self.dropped[f'{kind}: {cause}'] += count
 
     def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
         """Plan a sample of each stop that ends before a stamp, and note which pass unseen."""
@@ -315,6 +338,8 @@ class Collector:
             cause = self.track.causes(stamps)
             self._count_causes(cause)
             known, inside = cause == 0, wanted[numbers]
+            before = self.waiting.unmatched[key]
+            self.waiting.unmatched[key] = 0 if known.any() else before + due
             for k, count in Counter(numbers[known & ~inside].tolist()).items():
                 self.unused[f'measurements: {plan.why[k]}'] += count
             early = known & inside & (stamps < calm[numbers])

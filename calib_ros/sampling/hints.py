@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,8 +17,12 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import START, Estimate, barely_moved
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import NO_ACCIDENT
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
 from calib_ros.settings import EXCEPTION, Settings
+
+LOST = 'were dropped for their stamps or for want of room'
+_LOSS = re.compile(r'stamp|lateness|buffer full|memory')
+_TWICE = re.compile(r'same stamp twice|is there already')
 
 
 @dataclass(frozen=True)
@@ -98,22 +103,56 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
     return [Hint(f'joint states are too rare: {rate} are needed', words)]
 
 
-def apart(
-    waiting: int, unmatched: int, measurements: int, ahead: float, lateness: float
-) -> list[Hint]:
-    """Tell that clocks disagree by more than can be looked for, if most measurements say so.
+def apart(ahead: float) -> Hint:
+    """Tell that clocks disagree by more than can be looked for.
 
-    Measurements wait for joint states, or have found none; they are `ahead` of those [s].
+    The last measurement is stamped `ahead` of the last joint state [s].
     """
-    most = unmatched > max(measurements // 2, NO_ACCIDENT)
-    if abs(ahead) <= lateness or not (most or (ahead > 0.0 and waiting >= NO_ACCIDENT)):
-        return []
     words = (
         f'the newest measurement is stamped {abs(ahead):.0f} s '
         f'{"after" if ahead > 0.0 else "before"} the newest joint state: make the clocks of '
         'both agree (NTP, PTP), if both still come'
     )
-    return [Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)]
+    return Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)
+
+
+def unsettled(refused: int, stops: int) -> list[Hint]:
+    """Tell that many of the stops are refused because what is measured moves at them."""
+    if refused < START or refused <= EXCEPTION * stops:
+        return []
+    words = (
+        f'{refused} of {stops} stops are refused: what is measured still moves while the joints '
+        'stand. Stand longer and set settle to the time until it rests, do not let the device '
+        'smooth, and check that the target is firm and that the arm does not creep'
+    )
+    return [Hint(f'{refused} of {stops} stops still move where measured: set settle', words)]
+
+
+def lost(kind: str, came: int, dropped: Mapping[str, int]) -> tuple[float, str]:
+    """Return which share of the messages of a kind was lost, and the main cause in words.
+
+    Lost is what was dropped for its stamp or for want of room; what the device did not see is not,
+    nor what came twice.
+    """
+    causes = {
+        cause: count
+        for cause, count in dropped.items()
+        if cause.startswith(kind) and _LOSS.search(cause) and not _TWICE.search(cause)
+    }
+    most = max(causes, key=causes.__getitem__, default='')
+    return sum(causes.values()) / came if came else 0.0, most.removeprefix(f'{kind}: ')
+
+
+def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:
+    """Tell that much of the messages received is lost, and the main cause."""
+    found = []
+    for kind in (JOINTS, POSES):
+        came = received[kind]
+        share, cause = lost(kind, came, dropped)
+        if share > EXCEPTION and share * came >= NO_ACCIDENT:
+            words = f'{share:.0%} of the {kind} {LOST}: {cause}'
+            found.append(Hint(f'{share:.0%} of the {kind} are dropped: {cause}', words))
+    return found
 
 
 def disagreement(delay: float, known: float) -> Hint:

@@ -110,6 +110,8 @@ class LiveEstimate:
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
         """Samples that lie too far from what the others predict; they are left out here."""
+        self.refused = ''
+        """Why the samples can be no problem, in words; empty if they can."""
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
         """Take what a growing list of samples has beyond that of the last call.
@@ -149,7 +151,11 @@ class LiveEstimate:
         given.
         """
         self.restart()
-        problem = self._problem_of(fitted)
+        try:
+            problem = self._problem_of(fitted)
+        except CalibrationError as err:
+            self.refused = str(err)
+            return False
         model = problem.model
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
         try:

@@ -40,6 +40,7 @@ class Maker:
         self._calm: int | None = None  # how many of them came before a stop that was not at rest
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()
+        self.rested = self.restless = 0  # stops at which measurements were at rest, and were not
 
     def samples(
         self,
@@ -81,7 +82,9 @@ class Maker:
                 self._shaken = min(self._shaken, number)
             if not rests:
                 self.dropped[RESTLESS] += count
+                self.restless += 1
                 continue
+            self.rested += 1
             rows = values[begin : begin + count]
             if left_out:
                 self.dropped[VIBRATING] += left_out

@@ -12,10 +12,9 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import Clocks
-from calib_ros.sampling.hints import Hint, apart
+from calib_ros.sampling.hints import Hint, unsettled
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, TOO_LATE, Piece, Slice
-from calib_ros.sampling.track import CAUSES
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice
 from calib_ros.settings import Settings
 
 STRAY = 'stamp far from those before and after'
@@ -179,13 +178,10 @@ class Road:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, of so many measurements."""
-        ahead = 1e-9 * (self._newest[POSES] - self._newest[JOINTS])
-        collector, lateness = self.collector, self.clocks.settings.lateness
-        causes = (TOO_LATE, *(f'{POSES}: {cause}' for cause in CAUSES[1:3]))
-        unmatched = sum(collector.dropped[cause] for cause in causes)
-        found = apart(collector.waiting.count, unmatched, measurements, ahead, lateness)
-        found = found if all(self._newest.values()) else []
-        return found + self.clocks.hints() + collector.hints(measurements)
+        collector, maker = self.collector, self.collector.maker
+        found = collector.astray(measurements)
+        found += self.clocks.hints() + collector.hints(measurements)
+        return found or unsettled(maker.restless, maker.restless + maker.rested)
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

@@ -21,7 +21,7 @@ from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
-from calib_ros.sampling.hints import Account, Hint, frozen, progress
+from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.problems import (
@@ -37,6 +37,7 @@ from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
 
+NOT_RECORDING = 'not recording: call ~/record with true'
 ONE_FRAME = (
     'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
     'its own for each source'
@@ -133,6 +134,8 @@ class CalibrationSession:
 
         With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
         """
+        if not self.recording:
+            return 0, NOT_RECORDING
         count, why = self._collector.capture(socket_place(socket) if socket else '')
         before = len(self.samples)
         self._road.hand_over()
@@ -181,6 +184,8 @@ class CalibrationSession:
     @property
     def state(self) -> str:
         """Return in words what the arm does, as far as samples are concerned."""
+        if not self.recording:  # what the arm does is not looked at
+            return NOT_RECORDING
         track = self._collector.track
         silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
         if silent:
@@ -201,20 +206,23 @@ class CalibrationSession:
         notes = self._road.notes + collector.notes
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
-        gate = self._road.gate
-        dropped = self._entry.dropped + collector.dropped + self.pictures.dropped + gate.dropped
         return Account(
             self.received[JOINTS],
             self.received[POSES],
-            collector.waiting.count + gate.held(POSES),
+            collector.waiting.count + self._road.gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
             dict(sorted((self._entry.unused + collector.unused).items())),
-            dict(sorted(dropped.items())),
+            dict(sorted(self._dropped.items())),
             dict(sorted(notes.items())),
             self._names.foreign,
         )
+
+    @property
+    def _dropped(self) -> Counter[str]:
+        gate, images = self._road.gate.dropped, self.pictures.dropped
+        return self._entry.dropped + self._collector.dropped + images + gate
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -229,7 +237,8 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        return found + self._road.hints(self.received[POSES])
+        found += self._road.hints(self.received[POSES])
+        return found or losses(self.received, self._dropped)
 
     @property
     def delay(self) -> Delay | None:
@@ -237,7 +246,8 @@ class CalibrationSession:
         return self._clocks.delay
 
     @property
-    def _came(self) -> str:
+    def came(self) -> str:
+        """Return in words what became of the messages, and what looks wrong."""
         return '; '.join((str(self.account()), *self.warnings))
 
     @property
@@ -258,6 +268,7 @@ class CalibrationSession:
         if self.pictures.refused:
             told.append(f'the last image is not used: {self.pictures.refused}')
         estimate = self.estimate
+        told.append(self._live.refused)
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
             told.append(f'pose {number} does not fit the others, was the target moved?')
@@ -280,7 +291,7 @@ class CalibrationSession:
         """Return samples as a problem; with `posed` boards by their poses, not their corners."""
         found = problem_of(self.chain, samples, self.settings, posed)
         if found is None:
-            raise InputError(f'no poses to fit: {self._came}')
+            raise InputError(f'no poses to fit: {self.came}')
         return found
 
     def identify(self) -> Identification:
@@ -289,8 +300,7 @@ class CalibrationSession:
         try:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
-            few, _, advice = str(err).rpartition('; ')
-            raise InputError(f'{few} ({self._came}); {advice}') from err
+            raise too_few(err, self.came) from err
         if result.accepted:
             owners = named(self.samples).owners
             self.adopt(Calibration.of(result, owners=owners, fitted=problem.sets), self.samples)
@@ -363,3 +373,9 @@ class CalibrationSession:
         self._live.restart()
         if sample is not None:
             self.on_removed(sample)
+
+
+def too_few(err: TooFewObservationsError, came: str) -> InputError:
+    """Return an error of too few samples that tells what `came` of the messages, in words."""
+    few, _, advice = str(err).rpartition('; ')
+    return InputError(f'{few} ({came}); {advice}')

@@ -22,12 +22,16 @@ Series: TypeAlias = tuple[Stamps, FloatArray]
 """Stamps (N,), and rows (N, w) or values (N,) at them."""
 
 
+SAME = 1e-6
+"""Difference, relative as well, of values that are the same: they may have been floats."""
+
+
 class Rows:
     """Stamped rows of numbers in one growing block of memory, up to a capacity."""
 
     def __init__(self, width: int, capacity: int) -> None:
         self.width, self.capacity = width, capacity
-        self.count = 0
+        self.count = self.contrary = 0  # rows held; rows let go for another with other values
         self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
         self._values = np.empty((len(self._stamps), width))
 
@@ -81,8 +85,11 @@ class Rows:
         before = self.count
         if before > 1 and not (np.diff(self.stamps) > 0).all():
             order = np.lexsort((*self.values.T[::-1], self.stamps))
-            stamps = self.stamps[order]
-            self.keep(order[np.concatenate([[True], np.diff(stamps) > 0])])
+            stamps, values = self.stamps[order], self.values[order]
+            again = np.diff(stamps) == 0
+            near = np.isclose(values[1:][again], values[:-1][again], SAME, SAME, equal_nan=True)
+            self.contrary += int((~near.all(axis=1)).sum())
+            self.keep(order[np.concatenate([[True], ~again])])
         return before - self.count
 
 
@@ -198,6 +205,10 @@ class Waiting(dict[StreamKey, Rows]):
         super().__init__()
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
+        self.last_ns: dict[StreamKey, int] = {}
+        """Stamps of the last measurements to come, by stream."""
+        self.unmatched: Counter[StreamKey] = Counter()
+        """How many have found no joint states since the last that did, by stream."""
 
     @property
     def count(self) -> int:
@@ -215,7 +226,7 @@ class Waiting(dict[StreamKey, Rows]):
         if key not in self and len(self) >= MOST_NAMES:  # forget those without any use
             for each in [each for each, rows in self.items() if not rows.count]:
                 if not self._kept(each):
-                    del self[each]
+                    del self[each], self.last_ns[each], self.unmatched[each]
         if key not in self:
             if len(self) >= MOST_NAMES:
                 self._dropped[TOO_MANY] += len(stamps)
@@ -224,8 +235,10 @@ class Waiting(dict[StreamKey, Rows]):
         rows = self[key]
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
+        self.last_ns[key] = int(stamps[-1])
         if len(due) < len(stamps):
             self._dropped[TOO_LATE] += len(stamps) - len(due)
+            self.unmatched[key] += len(stamps) - len(due)
         if len(taken) < len(due):
             self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])

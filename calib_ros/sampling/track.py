@@ -103,6 +103,8 @@ class Track:
         self._capacity = capacity
         self._parts: dict[tuple[int, ...], Rows] = {}
         self._came = np.zeros(len(revolute))  # signs of the last moves before the samples held
+        self.contrary = 0
+        """Samples let go for another one of the same stamp with other values."""
         self.horizon_ns = 0
         """Samples before this stamp have been let go."""
 
@@ -151,7 +153,10 @@ class Track:
 
     def sort(self) -> int:
         """Put all samples in order; return how many had the stamp of another one."""
-        return sum(rows.sort() for rows in self._parts.values())
+        before = sum(rows.contrary for rows in self._parts.values())
+        gone = sum(rows.sort() for rows in self._parts.values())
+        self.contrary += sum(rows.contrary for rows in self._parts.values()) - before
+        return gone
 
     def at(self, stamps: Stamps, standing: bool = False) -> Motion:
         """Return the motion at stamps (N,) at which it is known (`causes`), after `sort`.

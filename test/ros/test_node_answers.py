@@ -5,7 +5,9 @@
 import numpy as np
 import pytest
 import yaml
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from ros_cell import STOPS, Cell, pose_messages, topics, values_of
@@ -73,6 +75,25 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
         said, _, name = found.partition(' ... all of it: ')
         assert said.endswith(step)
         assert (tmp_path / folder / name).read_text() == f'{text}\n'
+
+
+def test_what_made_poses_too_few_is_said_with_it(cell, recording):
+    """To measure more alone would be in vain."""
+    poses = pose_messages(recording.poses)
+    for message in poses[16:]:
+        message.header.stamp = Time()
+    cell.play(topics(recording, measured_pose=poses[:16]))
+    for message in poses[16:]:
+        cell.publisher(PoseStamped, 'measured_pose').publish(message)
+    cell.spin_until(lambda: cell.node.session.received['measurements'] == len(poses))
+    answer = cell.call('identify')
+    assert not answer.success
+    said = cell.in_full(answer)
+    assert '4 measured poses are too few, at least 5 are needed' in said
+    assert '1200 joint states and 96 measurements gave 4 poses' in said
+    assert said.endswith('measure more poses or fix parameters')
+    for words in (answer.message, said):
+        assert 'zero stamp (fill header.stamp where it is published)' in words
 
 
 def test_a_refusal_leaves_its_report(unsearched, cell, recording):

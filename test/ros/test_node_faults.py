@@ -21,7 +21,7 @@ from ros_cell import (
     values_of,
 )
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import String
 
 from calib_ros.files.archive import Archive
@@ -239,6 +239,22 @@ def test_broken_messages_are_counted_by_cause(cell, recording):
         'measurements: NaN or infinite position': 1,
         'measurements: quaternion not of length 1 (normalise it where it is published)': 2,
     }
+
+
+def test_poses_that_no_identification_takes_are_told_by_the_status(cell, recording):
+    """The status ended in an internal error, and nobody was told what was wrong."""
+    logged = cell.log()
+    distances = 1e3 * np.linalg.norm(recording.poses.positions, axis=1)
+    wire = pose_messages(recording.poses, Range, distances=distances)
+    cell.play({'joint_states': joint_messages(recording), 'measured_distance': wire})
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.spin_until(lambda: heard and 'are they in metres' in heard[-1].status[0].message)
+    assert heard[-1].status[0].level != DiagnosticStatus.ERROR
+    assert 'the distances vary by' in cell.node.session.status()
+    assert not cell.call('identify').success
+    count = len(heard)
+    cell.spin_until(lambda: len(heard) > count + 1)
+    assert not [each.msg for each in logged if 'internal error' in each.msg]
 
 
 def test_two_nodes_of_one_name_are_told(cell, tmp_path):

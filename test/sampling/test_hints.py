@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from streams import START, S, hear, stamps, stops, sweep
+from sessions import session
+from streams import POSE, START, TRACKER, S, hear, pose, stamps, stops, sweep, take
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
@@ -152,6 +153,107 @@ def test_clocks_too_far_apart_for_the_delay_to_be_found_are_told(seconds):
     if abs(seconds) > 30.0:
         with pytest.raises(InputError, match='make the clocks of both agree'):
             made.identify()
+
+
+def with_a_step(step, of):
+    """Return a session in whose last 2 s of 40 the clock of something was moved by `step` [s]."""
+    motion = tour(25)
+    times, seen = np.arange(0.0, 40.0, 0.01), np.arange(0.003, 40.0, 0.02)
+    stamped = {'joints': times, 'measurements': seen}
+    stamped[of] = stamped[of] + np.where(stamped[of] > 38.0, step, 0.0)
+    found = measure(TRUE, motion(seen), np.random.default_rng(3), 2e-5, 1e-4)
+    made = CalibrationSession(UR5E)
+    hear(
+        made,
+        (times, stamps(stamped['joints']), motion(times)),
+        (seen, stamps(stamped['measurements']), found.positions, found.rotations),
+    )
+    return made
+
+
+@pytest.mark.parametrize(
+    ('step', 'of', 'words'),
+    [
+        (-5.0, 'measurements', '5 s before'),
+        (5.0, 'joints', '5 s before'),
+        (-5.0, 'joints', '5 s after'),
+        (-1e9, 'measurements', '1000000000 s before'),
+        (-1e9, 'joints', '1000000000 s after'),
+    ],
+)
+def test_a_clock_that_goes_far_astray_is_told_at_once(step, of, words):
+    """However many measurements were matched before it, and by how much it was moved."""
+    (warning,) = told(with_a_step(step, of))
+    assert f'measurement is stamped {words} the newest joint state: make the clocks' in warning
+
+
+def test_a_clock_that_is_not_moved_is_not_told_of():
+    assert told(with_a_step(0.0, 'joints')) == ()
+
+
+@pytest.mark.parametrize(('speed', 'stops_taken'), [(0.0, 15), (0.02, 0)])
+def test_stops_at_which_the_target_still_moves_are_told(speed, stops_taken):
+    """A device that smooths, an arm that creeps: the operator stood there for nothing."""
+    motion, rng = tour(15), np.random.default_rng(3)
+    times, seen = np.arange(0.0, 29.5, 0.01), np.arange(0.003, 29.2, 0.02)
+    found = measure(TRUE, motion(seen), rng, 2e-5, 1e-4)
+    positions = found.positions + speed * np.minimum(seen % PERIOD, 1.0)[:, np.newaxis]
+    made = CalibrationSession(UR5E)
+    hear(
+        made,
+        (times, stamps(times), motion(times)),
+        (seen, stamps(seen), positions, found.rotations),
+    )
+    made.finish()
+    assert len(made.samples) == stops_taken
+    warnings = told(made)
+    assert len(warnings) == (stops_taken == 0)
+    for words in warnings:
+        assert re.match(r'1[45] of 1[45] stops are refused: what is measured still moves', words)
+        assert 'set settle' in words
+
+
+@pytest.mark.parametrize(('share', 'count'), [(0.05, 0), (0.2, 1)])
+def test_much_that_is_dropped_is_told_and_why(share, count):
+    """A driver that does not always fill its stamps loses accuracy, and the operator time."""
+    made, rng = session(), np.random.default_rng(4)
+    stamp = np.where(rng.random(500) < share, 0, START + np.arange(500) * S // 50)
+    take(made, *((TRACKER, POSE, pose(each, np.ones(3), np.eye(3))) for each in stamp.tolist()))
+    found = told(made)
+    assert len(found) == count
+    if count:
+        said = r'\d\d% of the measurements were dropped .*: zero stamp \(fill header.stamp'
+        assert re.match(said, found[0])
+
+
+@pytest.mark.parametrize(
+    ('of', 'other', 'count'),
+    [
+        ('measurements', 1e-3, 1),  # two targets on one topic, or stamps of whole seconds
+        ('measurements', 0.0, 0),  # what a relay repeats
+        ('joints', 1e-3, 1),
+        ('joints', 1e-8, 0),  # and rounds
+    ],
+)
+def test_other_values_with_the_same_stamp_are_told(of, other, count):
+    motion = tour(15)
+    times, seen = np.arange(0.0, 29.5, 0.01), np.arange(0.003, 29.2, 0.02)
+    if of == 'joints':
+        times = np.repeat(times, 2)
+    else:
+        seen = np.repeat(seen, 2)
+    found = measure(TRUE, motion(seen), np.random.default_rng(3), 0.0, 0.0)
+    joints, positions = motion(times), found.positions.copy()
+    (joints if of == 'joints' else positions)[1::2] += other
+    rotations = found.rotations
+    made = CalibrationSession(UR5E)
+    hear(made, (times, stamps(times), joints), (seen, stamps(seen), positions, rotations))
+    made.finish()
+    warnings = told(made)
+    assert len(warnings) == count
+    for words in warnings:
+        said = rf'[45]\d% of the {of} were dropped .*: other values with the same stamp'
+        assert re.match(said, words)
 
 
 @pytest.mark.parametrize(('pause', 'count'), [(2.0, 0), (4.0, 1)])

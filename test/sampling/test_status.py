@@ -123,6 +123,18 @@ def test_the_status_tells_why_no_joint_state_is_used(stamp, value, cause):
     assert made.status().startswith(said)
 
 
+def test_the_status_tells_that_nothing_is_recorded():
+    """What the arm did before would stand there for hours, and be captured."""
+    made = CalibrationSession(UR5E, Settings(**SIGMAS, mode='triggered'))
+    drive(made, UR5E.random_joints(1, np.random.default_rng(1)), [tracker()])
+    assert made.status().startswith('the arm stands for')
+    made.recording = False
+    assert made.status().startswith('not recording: call ~/record with true; 0 poses')
+    assert made.capture() == (0, 'not recording: call ~/record with true')
+    made.recording = True
+    assert made.capture()[0] == 1
+
+
 def test_the_status_tells_why_no_measurement_is_used():
     made = session()
     take(made, (TRACKER, POSE, pose(10**18, np.full(3, np.nan), np.eye(3))))
