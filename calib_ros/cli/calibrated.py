@@ -41,7 +41,7 @@ def _compare(options: argparse.Namespace, screen: Screen) -> int:
 def _compensate(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.apply.compensation import Compensator, in_words
     from calib_ros.apply.program import compensate_program
-    from calib_ros.files.programs import read_program
+    from calib_ros.files.programs import program_of
 
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
     common.refuse_existing(options, options.out)
@@ -54,7 +54,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
     limits = {item.name: getattr(options, item.name) for item in fields(Limits)}
     compensator = Compensator(nominal, arm.chain, tuple(options.tool), **limits, region=arm.region)
     with screen.work(f'correcting {options.program.name}') as work:
-        source = read_program(options.program, nominal.joint_names)
+        source = program_of(options.program, nominal)
         corrected, result = compensate_program(compensator, source.program, work)
     if result.refusals:
         screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')

@@ -267,12 +267,19 @@ def _distance(first: FloatArray, second: FloatArray) -> float:
 def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: FloatArray) -> Chain:
     """Return the nominal chain with some kinds of parameters fitted to another one.
 
-    `zero` stands for the joints' offsets. Base and tool are fitted as well.
+    `zero` stands for the joints' offsets. Base and tool are those of the other one, since no row
+    holds what they would take up, and d of nearly parallel axes stays: without beta it would
+    carry a tilt as a common normal metres away.
     """
     base, tool = chain.frame('base'), chain.frame('tool')
     start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
-    chosen = {joint.driven for joint in start.joints} if 'zero' in kinds else set()
-    chosen |= {name for name in start.parameter_names if Parameter(name).kind in kinds}
-    names = [name for name in start.parameter_names if name in chosen or start.owns_frame(name)]
+    if 'zero' in kinds:
+        names = {joint.driven for joint in start.joints}
+    else:
+        plain = tuple(replace(joint, beta=0.0) for joint in start.joints)
+        start = replace(start, joints=plain)
+        names = {name for name in start.parameter_names if Parameter(name).kind in kinds}
+        names -= {Parameter(joint, 'd') for joint in replace(start, parallel=None).parallel or ()}
+    ordered = [name for name in start.parameter_names if name in names]
     joints = joints[:: max(1, len(joints) // SOME_POSES)]  # to be fitted; it is judged on all
-    return likened(start, names, chain, joints, 1e-3)[0]
+    return likened(start, ordered, chain, joints, 1e-3)[0]

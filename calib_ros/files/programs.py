@@ -25,6 +25,7 @@ from calib_ros.files.csv_columns import columns_of, read_columns, with_rows
 from calib_ros.files.layouts import POSITION, QUATERNION, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.inverse import limits
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
@@ -40,6 +41,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     found = read_columns(path, ())
     names = _header_of(found, chain.joint_names)
     values = found.block(names)
+    check_turns(values, chain, lambda k, i: f'{found.where(k, names[i])} ')
     lower, upper = limits(chain)
     beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
     for k, i in np.argwhere(beyond)[:1].tolist():
@@ -48,6 +50,20 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
             f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
         )
     return values
+
+
+def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:
+    """Refuse joint values (N, n) that may be degrees, of revolute joints without limits.
+
+    Those of joints with limits are held against these. `where` names a row and a joint.
+    """
+    free = [j.type == 'revolute' and None in (j.lower, j.upper) for j in chain.joints]
+    for k, i in np.argwhere((np.abs(values) > TWO_TURNS) & free)[:1].tolist():
+        raise InputError(
+            f'{where(k, i)}{values[k, i]:.6g} is more than two turns of {chain.joint_names[i]}, '
+            'which has no limits: joint values must be in radians; if these are, give the joint '
+            'limits (lower, upper) in the chain file'
+        )
 
 
 def _header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
@@ -89,6 +105,17 @@ class ProgramFile:
     program: Program
     places: tuple[str, ...]
     text_with: Callable[[Program], str]
+
+
+def program_of(path: Path, chain: Chain) -> ProgramFile:
+    """Read a program for an arm, as `read_program`; refuse joint values that may be degrees."""
+    found = read_program(path, chain.joint_names)
+    known = found.program.names
+    columns = [known.index(name) for name in chain.joint_names if name in known]
+    if len(columns) == len(chain.joints):  # else it is refused where it is corrected
+        values = found.program.positions[:, columns]
+        check_turns(values, chain, lambda k, _: f'{path}, {found.places[k]}: ')
+    return found
 
 
 def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:

@@ -22,7 +22,12 @@ from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.start import likened, movable
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import calibration_record, dictionary, parse_frames
+from calib_ros.kinematics.chain_file import (
+    calibration_record,
+    dictionary,
+    parse_frames,
+    table_hash,
+)
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.settings import Settings
@@ -31,6 +36,8 @@ from calib_ros.values import parse_number, parse_numbers
 Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, whether a camera on the flange measured, whether it is a socket; device or target."""
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
+ALWAYS = ('table_sha256', 'nominal', 'region')
+"""Keys of every record that calib_ros makes, which follow those that every one begins with."""
 Hashes: TypeAlias = NDArray[np.uint64]
 KEPT = 256
 """Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept.
@@ -122,9 +129,17 @@ class Record:
                 f'{where} is a chain, but no calibration: it does not say where its numbers come '
                 'from (key "calibration"); give the calibration.yaml of calib_ros identify'
             )
+        if not isinstance(record.get('accepted', True), bool):
+            told = record['accepted']
+            raise ConfigError(f'{where}: calibration.accepted must be true or false, not {told!r}')
         if record.get('accepted') is False:
             raise ConfigError(
                 f'{where} was not accepted: identify again, from more or better poses'
+            )
+        if 'software' in record and (missing := [key for key in ALWAYS if key not in record]):
+            raise ConfigError(
+                f'{where} is cut off: its record lacks {", ".join(missing)}, which calib_ros '
+                'always writes; copy the file again'
             )
         rms, frame = record.get('rms_mm_after', 0.0), record.get('world_frame', '')
         number = isinstance(rms, int | float) and not isinstance(rms, bool)
@@ -160,10 +175,26 @@ class Record:
         values = {n: parse_number(x, f'{where}: nominal {n}') for n, x in effects.items()}
         return replace(chain, joints=joints, effects=()).with_effect_values(values)
 
+    def check_table(self, chain: Chain) -> None:
+        """Refuse a table that is not the one that was identified, if that is recorded."""
+        known = self.content.get('table_sha256')
+        converted = self._part('nominal').get('convention', chain.convention) != chain.convention
+        if known is None or converted or known == table_hash(chain):
+            return
+        raise ConfigError(
+            f'{self.where} does not hold the table and effects that were identified '
+            '(calibration.table_sha256): it was edited or damaged, or exported without its '
+            'effects; give the file that calib_ros identify wrote. If the change is meant, write '
+            'a record of your own: calibration: {source: ...}'
+        )
+
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
         """Refuse a calibration that is not one of a nominal chain (`parse_calibration`)."""
+        self.check_table(chain)
         # else there is nothing to compare
         told = self._part('nominal').get('convention') == nominal.convention
+        if told:
+            self._check_effects(nominal)
         for name, row in (self._rows(nominal) if told else {}).items():
             for kind, value in row.items():
                 wanted = nominal.value(f'{name}.{kind}')
@@ -183,6 +214,19 @@ class Record:
                 f'differ from chain "{nominal.name}" by more than largest_length and '
                 'largest_angle allow'
             )
+
+    def _check_effects(self, nominal: Chain) -> None:
+        """Refuse a nominal chain with other effects than those recorded."""
+        where = f'{self.where}: calibration.nominal.effects'
+        known = dictionary(self._part('nominal').get('effects'), where)
+        ours = dict(nominal.effects)
+        for name in {**known, **ours}:
+            value, wanted = parse_number(known.get(name, 0.0), where), ours.get(name, 0.0)
+            if not math.isclose(value, wanted, rel_tol=1e-9, abs_tol=1e-15):
+                raise ConfigError(
+                    f'{self.where} was identified from another nominal chain, with effect {name} '
+                    f'{value:.9g} and not {wanted:.9g}: give that one, or identify again'
+                )
 
     def before(self, nominal: Chain, chain: Chain) -> Chain:
         """Return the nominal chain in its recorded frames, else those closest to the other one."""

@@ -165,12 +165,16 @@ def calibration_record(text: str) -> dict[str, Any]:
 
 
 def table_hash(chain: Chain) -> str:
-    """Return the SHA-256 of the table and effects of a chain, by which its files are known."""
+    """Return the SHA-256 of the table and effects of a chain, by which its files are known.
+
+    In whatever order the effects are: programs that rewrite a file may sort its keys.
+    """
     rows = [
         [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
         for joint in chain.joints
     ]
-    content = [str(chain.convention), rows, [[name, float(x)] for name, x in chain.effects]]
+    effects = [[name, float(value)] for name, value in sorted(chain.effects)]
+    content = [str(chain.convention), rows, effects]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 

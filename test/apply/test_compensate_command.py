@@ -56,6 +56,22 @@ def run(capsys, tmp_path, monkeypatch):
     return run
 
 
+@pytest.mark.parametrize('suffix', ['.csv', '.yaml'])
+def test_degrees_are_refused_also_of_joints_without_limits(run, tmp_path, suffix):
+    """An angle of 30 is 279 degrees further on: the correction would be that of another pose."""
+    free = replace(UR, joints=tuple(replace(j, lower=None, upper=None) for j in UR.joints))
+    (tmp_path / 'free.yaml').write_text(dump_chain(free))
+    q = regular(UR, 3, seed=2)
+    write = joints_csv if suffix == '.csv' else trajectory
+    status, _, _ = run(write(q), suffix=suffix, chain='free.yaml')
+    assert status == 0
+    (tmp_path / f'out{suffix}').unlink()
+    status, _, err = run(write(np.degrees(q)), suffix=suffix, chain='free.yaml')
+    assert status == 1
+    assert 'must be in radians; if these are, give the joint limits' in err
+    assert not (tmp_path / f'out{suffix}').exists()
+
+
 @pytest.mark.parametrize('oriented', [True, False])
 def test_the_whole_way_from_identification_to_program(run, tmp_path, oriented):
     """By positions of a target on the last axis alone the orientation is not known, and told so.

@@ -87,6 +87,45 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
     assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
 
 
+def tilted():
+    """A small arm with axes that are parallel but for a degree, and its calibration."""
+    rows = (
+        Joint('j1', d=0.05, lower=-2.6, upper=2.6),
+        Joint('j2', alpha=np.pi / 2.0, theta=0.1, lower=-2.6, upper=2.6),
+        Joint('j3', a=0.1, lower=-2.6, upper=2.6),
+        Joint('j4', a=0.08, alpha=0.02, theta=-0.3, lower=-2.6, upper=2.6),
+    )
+    nominal = Chain('tilted', 'modified', rows)
+    off = {'j2.alpha': -4e-4, 'j3.alpha': -3e-4, 'j3.beta': -4e-4, 'j4.alpha': 1e-3}
+    return nominal, nominal.with_offsets({**off, 'j4.beta': 1e-3, 'j3.theta': 1e-3})
+
+
+@pytest.mark.parametrize('name', ['ur10e', 'kuka_youbot', 'tilted'])
+@pytest.mark.parametrize('file', ['dh_without_beta.csv', 'joint_offsets.csv'])
+def test_a_table_is_as_near_as_it_says_without_frames_that_it_does_not_hold(name, file):
+    nominal, chain = tilted() if name == 'tilted' else corrected(name)
+    (found,) = (each for each in exports(chain, nominal) if each.name == file)
+    rows = list(csv.DictReader(found.content.splitlines()[1:]))
+    table = np.array([[float(row[kind]) for kind in DH_KINDS] for row in rows])
+    joints = tuple(
+        replace(joint, **dict(zip(DH_KINDS, row.tolist(), strict=True)))
+        for joint, row in zip(nominal.joints, table, strict=True)
+    )
+    loaded = replace(chain, joints=joints)
+    q = export.anywhere(chain)
+    apart = (loaded.forward(q) - chain.forward(q))[:, :3, 3]
+    assert np.linalg.norm(apart, axis=1).max() == pytest.approx(found.error, rel=1e-6)
+    assert np.abs(table - nominal.table).max() < 0.02  # no absurd d of nearly parallel axes
+
+
+def test_a_table_without_beta_has_none_of_the_nominal_table_either():
+    nominal, _ = tilted()
+    nominal = nominal.with_offsets({'j3.beta': 0.01})
+    found = exports(nominal.with_offsets({'j3.beta': 1e-3}), nominal)
+    (text,) = (each.content for each in found if each.name == 'dh_without_beta.csv')
+    assert {float(row['beta']) for row in csv.DictReader(text.splitlines()[1:])} == {0.0}
+
+
 @pytest.mark.parametrize('name', ['scara', 'kinova'])
 def test_a_table_says_what_its_rows_cut_off(name):
     """A flange 0.1 m after the last joint is in no modified table, a base in no standard one."""

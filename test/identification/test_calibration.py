@@ -102,6 +102,54 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
     assert first == pytest.approx(second, rel=0.05)
 
 
+@pytest.mark.parametrize(
+    'line', [f'  {key}:' for key in ('noise_in_sigma', 'nominal', 'region', 'covariance')]
+)
+def test_a_file_that_was_cut_off_is_refused(found, line):
+    """Its region, and the nominal chain that it belongs to, would be lost without a word."""
+    text = found.dump()
+    cut = text[: text.index(f'\n{line}') + 1]
+    if line == '  covariance:':
+        assert parse_calibration(cut, 'c.yaml', UR).region is not None
+        return
+    with pytest.raises(ConfigError, match=r'c\.yaml is cut off: its record lacks .*region'):
+        parse_calibration(cut, 'c.yaml', UR)
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        lambda document: document['joints'][1].update(a=document['joints'][1]['a'] + 1e-3),
+        lambda document: document['joints'][2].pop('beta'),
+        lambda document: document['effects'].update({'elbow_joint.ratio': 1e-3}),
+        lambda document: document.pop('effects'),
+    ],
+    ids=['length', 'beta', 'another effect', 'no effects'],
+)
+def test_a_table_that_was_edited_is_not_the_calibration(document, change):
+    """The region, the covariance and the verdict are those of another table."""
+    document = deepcopy(document)
+    parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
+    change(document)
+    with pytest.raises(ConfigError, match=r'c\.yaml does not hold the table and effects that'):
+        parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
+
+
+def test_a_nominal_chain_with_other_effects_is_another(document):
+    text = yaml.safe_dump(document, sort_keys=False)
+    parse_calibration(text, 'c.yaml', UR.with_effect_values({'elbow_joint.ratio': 0.0}))
+    with pytest.raises(ConfigError, match=r'another nominal.*, with effect elbow_joint\.ratio'):
+        parse_calibration(text, 'c.yaml', UR.with_effect_values({'elbow_joint.ratio': 1e-3}))
+
+
+@pytest.mark.parametrize('told', ['no', 0, None])
+def test_what_is_neither_accepted_nor_refused_is_refused(told):
+    nominal = load_chain('ur10e')
+    text = calibrated_text(nominal, {'nominal': nominal_document(nominal), 'accepted': told})
+    with pytest.raises(ConfigError, match=r'c\.yaml: calibration\.accepted must be true or false'):
+        parse_calibration(text, 'c.yaml', nominal)
+
+
 def calibrated_text(nominal, record):
     """Return the text of a calibration of a nominal chain, with a record of its origin."""
     return dump_chain(nominal.with_offsets({f'{nominal.joint_names[1]}.a': 1e-3}), record)
