@@ -91,7 +91,7 @@ def test_what_made_poses_too_few_is_said_with_it(cell, recording):
     said = cell.in_full(answer)
     assert '4 measured poses are too few, at least 5 are needed' in said
     assert '1200 joint states and 96 measurements gave 4 poses' in said
-    assert said.endswith('measure more poses or fix parameters')
+    assert said.endswith('or hold parameters (fixed)')
     for words in (answer.message, said):
         assert 'zero stamp (fill header.stamp where it is published)' in words
 
