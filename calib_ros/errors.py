@@ -77,8 +77,7 @@ class TooFewObservationsError(InputError):
         self.needed = needed
         super().__init__(
             f'{configurations} measured poses are too few, at least {needed} are '
-            f'needed: {why}; measure more poses (calib_ros plan chooses '
-            'them) or hold parameters (fixed)'
+            f'needed: {why}; measure more poses or hold parameters (fixed)'
         )
 
 
