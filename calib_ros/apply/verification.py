@@ -27,10 +27,9 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from calib_ros.apply.candidates import TILTED
-from calib_ros.apply.compensation import Compensator
+from calib_ros.apply.commanded import meant
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
@@ -175,7 +174,7 @@ def verify(
         Of the share that is done.
     commanded : (M, n), optional
         Joint values [rad or m] of the program before its correction: the nominal arm means there
-        what is wanted. The nearest belongs to a measurement.
+        what is wanted. Each measurement belongs to one of them (`commanded.py`).
 
     Raises
     ------
@@ -221,7 +220,8 @@ def _compared(
         if not np.isfinite(commanded).all():
             raise InputError('the commanded joint values are not all finite numbers')
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
-        wanted = [replace(each, joints=_meant(each.joints, commanded)) for each in sets]
+        arms = arm.before, arm.chain
+        wanted = [replace(s, joints=meant(*arms, s.joints, commanded)) for s in sets]
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
     reached = compare(before, after, wanted).after
     shaped = compare(before, _rebased(after, wanted), wanted).after
@@ -277,18 +277,6 @@ def _check(
                 'images do not tell a new place of base or tool: leave both as they were for the '
                 'calibration, or measure poses'
             )
-
-
-def _meant(joints: FloatArray, commanded: FloatArray) -> FloatArray:
-    """Return the commanded joint values (N, n) that are nearest to those measured (N, n)."""
-    away, nearest = cKDTree(commanded).query(joints, p=np.inf)
-    far = np.flatnonzero(away > Compensator.largest_turn)  # more than is corrected
-    if far.size:
-        raise InputError(
-            f'measurement {far[0] + 1} was taken {away[far[0]]:.3g} rad or m from '
-            'the nearest commanded joint values: is it of that program?'
-        )
-    return np.asarray(commanded[nearest])
 
 
 def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str, ...]) -> Chain:

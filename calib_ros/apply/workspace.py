@@ -21,7 +21,7 @@ from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import AIMS, Aim, Model
+from calib_ros.settings import AIMS, Aim, Limits, Model
 from calib_ros.shown import Shown
 
 
@@ -203,7 +203,8 @@ def place(
     turn 0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, which
     is commanded by a `model`, reaches. The grid has so many `cells` along each axis and `turns`
     about the vertical, and is halved so many times about the best placement. The first pose is
-    solved from so many `starts` out of random joint values `drawn`.
+    solved from so many `starts` out of random joint values `drawn`. An arm with fewer than six
+    freedoms reaches a pose where its position is, and its orientation to 0.02 rad.
     """
     search = _Search(arm, task, aim, model, starts, drawn, told)
     corners = search.reach if region is None else region
@@ -236,6 +237,12 @@ def place(
     return Placements(grid[:, :3], grid[:, 3], errors, joints, int(np.nanargmin(errors)), centre)
 
 
+IN_PART = 1e-3
+"""Metres that a radian counts, of arms that cannot reach every orientation; and what may remain
+of both [m, rad], as `compensate` tolerates it (`Limits`)."""
+LEFT_IN_PART = (Limits.largest_position_error, 0.02)
+
+
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad].
 
@@ -257,6 +264,7 @@ class _Search:
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
         self._starts, self._told, self._solved = starts, told, 0
         self._chain = arm.commanded_by(model)
+        self._complete = inverse.mobility(self._chain) == 6
         self._base = self._chain.frame('base').matrix
         self._known = self._chain.random_joints(drawn, np.random.default_rng(0))
         poses = in_base(self._chain, self._known)
@@ -290,10 +298,14 @@ class _Search:
         for k in range(length):
             placement, branch = np.nonzero(reached)
             wanted = self._base @ poses[placement, k]
-            found = inverse.solve(self._chain, wanted, start[reached])
+            lever = inverse.LEVER if self._complete else IN_PART
+            found = inverse.solve(self._chain, wanted, start[reached], lever=lever)
             joints[placement, branch, k] = found.joints
             start[reached] = found.joints
-            reached[placement, branch] = found.converged
+            near = found.converged
+            if not self._complete:
+                near = (found.position <= LEFT_IN_PART[0]) & (found.orientation <= LEFT_IN_PART[1])
+            reached[placement, branch] = near
             self._solved += len(wanted)
             left = np.count_nonzero(reached) * (length - k - 1) + later * self._starts * length
             self._told(self._solved / max(self._solved + left, 1))

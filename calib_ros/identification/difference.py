@@ -111,6 +111,13 @@ class Difference(Shown):
         return tuple(zip(names, sizes, strict=True))
 
 
+def _rows_in_words(chain: Chain) -> str:
+    """Return what calibrations of one robot have in common."""
+    kinds = {1: '', -1: ', turned'}
+    rows = (f'{joint.name} ({joint.type}{kinds[joint.sign]})' for joint in chain.joints)
+    return f'{", ".join(rows)} ({chain.convention})'
+
+
 def difference(first: Calibration, second: Calibration) -> Difference:
     """Return what is different in the second of two calibrations of one robot.
 
@@ -121,11 +128,9 @@ def difference(first: Calibration, second: Calibration) -> Difference:
 
     """
     arms = first.chain, second.chain
-    if arms[0].joint_names != arms[1].joint_names or arms[0].convention != arms[1].convention:
-        raise InputError(
-            f'the joints {", ".join(arms[0].joint_names)} ({arms[0].convention}) and '
-            f'{", ".join(arms[1].joint_names)} ({arms[1].convention}) are of other robots'
-        )
+    ours, theirs = map(_rows_in_words, arms)
+    if ours != theirs:
+        raise InputError(f'the joints {ours} and {theirs} are of other robots')
     names, chain, change, left = _in_parameters_of(first, second)
     if not names:
         raise InputError('the calibrations have fitted no parameter of the arm')

@@ -71,6 +71,7 @@ def solve(
     tool: str = 'tool',
     part: slice = slice(6),
     iterations: int = ROUNDS,
+    lever: float = LEVER,
 ) -> Inverse:
     """Return the joint values near a start that bring the target to wanted poses.
 
@@ -88,6 +89,8 @@ def solve(
         What counts of the position and the rotation in world axes, six in all.
     iterations : int
         Steps at most.
+    lever : float
+        Metres that a radian counts, where not both can be reached.
 
     """
     aim = Aim(chain, base, tool)
@@ -95,7 +98,7 @@ def solve(
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
     def linearise(q: FloatArray, which: Index) -> Normal:
-        error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], LEVER)
+        error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], lever)
         error, columns = error[part], columns[:, part]
         normal = np.einsum('ikb,jkb->ijb', columns, columns)
         normal[np.diag_indices(len(q))] += ROUNDING
@@ -107,8 +110,8 @@ def solve(
 
     begin = within(np.array(start, dtype=float).T, 0.0)
     q = minimise(linearise, begin, within, enough=SAME**2, rounds=iterations).x
-    error, _ = aim.linearise(q, None, positions, axes, LEVER)
-    apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / LEVER))
+    error, _ = aim.linearise(q, None, positions, axes, lever)
+    apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / lever))
     return Inverse(q.T, apart, turned, np.linalg.norm(error[part], axis=0) <= SAME)
 
 

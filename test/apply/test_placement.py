@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 from surveyed import DOWN, TASK, calibrated, identified
 
-from calib_ros.apply import workspace
-from calib_ros.apply.workspace import place, task_of
+from calib_ros.apply import simulation, workspace
+from calib_ros.apply.workspace import in_base, place, task_of
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.se3 import exp_rotation, transform
 from calib_ros.settings import MODELS
 
@@ -157,3 +161,30 @@ def test_a_box_of_joint_values_is_a_task():
     task = _task(options, calibrated(), np.random.default_rng(0))
     assert task.shape == (30, 4, 4)
     np.testing.assert_allclose(task[:, :3, 3].max(axis=0), -task[:, :3, 3].min(axis=0))
+
+
+@pytest.mark.parametrize('model', MODELS)
+def test_an_arm_with_fewer_freedoms_than_a_pose_can_be_given_a_task(model):
+    """The axes of a calibrated SCARA are not quite vertical: it reaches no pose exactly."""
+    rows = (
+        Joint('j1', a=0.35, d=0.3, lower=-2.6, upper=2.6),
+        Joint('j2', a=0.3, alpha=np.pi, lower=-2.6, upper=2.6),
+        Joint('j3', 'prismatic', d=0.05, lower=0.0, upper=0.25),
+        Joint('j4', d=0.05, lower=-2.6, upper=2.6),
+    )
+    nominal = Chain('scara', 'standard', rows)
+    rng = np.random.default_rng(3)
+    true = simulation.faulty(nominal, simulation.Cell(), rng)
+    seen = simulation.measure(true, nominal.random_joints(40, rng), rng, 5e-5, 2e-4)
+    arm = Calibration.of(identify(Problem(nominal, seen)))
+    chain = arm.commanded_by(model)
+    angles = np.arange(6) * np.pi / 3.0
+    steps = 0.03 * np.stack([np.cos(angles), np.sin(angles), np.zeros(6)], axis=-1)
+    one = in_base(chain, np.array([[0.4, 0.9, 0.1, 0.3]]))[0]
+    task = transform(np.broadcast_to(one[:3, :3], (6, 3, 3)), steps)
+    found = place(arm, task, 'mean', model, cells=5)
+    poses = chain.forward(found.joints[found.best])
+    meant = wanted(chain, found, found.best, task)
+    np.testing.assert_allclose(poses[:, :3, 3], meant[:, :3, 3], rtol=0.0, atol=1e-6)
+    assert np.linalg.norm(poses[:, :3, :3] - meant[:, :3, :3], axis=(1, 2)).max() < 0.03
+    assert np.count_nonzero(~np.isnan(found.errors)) > 5

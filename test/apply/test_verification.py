@@ -111,6 +111,23 @@ def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
     assert before.rms_mm > 10.0 * after.rms_mm
 
 
+@pytest.mark.parametrize('step', [5e-4, 2e-3, 5e-3])
+def test_points_closer_than_their_corrections_keep_their_own(cell, arm, step):
+    """Every tenth point of a path: the corrected arm passes, the uncorrected one does not."""
+    true, result, _ = cell
+    start = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
+    path = start + step * np.arange(200)[:, np.newaxis] * [1.0, 0.8, -0.9, 0.7, -0.6, 1.0]
+    moved = compensate(Compensator(UR, result.chain), path).joints
+    wanted = replace(UR, base=result.chain.base, tool=result.chain.tool).forward(path[::10])
+    for joints, verdict in ((moved, 'PASS'), (path, 'FAIL')):
+        seen = measured(true, joints[::10], 1, (0.0, 0.0))
+        found = verify(arm, [seen], 5e-4, commanded=path)
+        assert found.verdict == verdict
+        missed = np.linalg.norm(seen.positions - wanted[:, :3, 3], axis=1)
+        figures = found.comparison.figures[1]
+        assert figures.rms_mm == pytest.approx(1e3 * np.sqrt(np.mean(missed**2)), rel=1e-6)
+
+
 def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
     """Against what was commanded: corrected commands pass, uncorrected ones do not."""
     true, result, _ = cell

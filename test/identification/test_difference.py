@@ -147,6 +147,10 @@ def test_what_cannot_be_compared_is_refused(nights):
     panda = load_chain('franka_panda')
     with pytest.raises(InputError, match='are of other robots'):
         difference(first, replace(first, chain=panda, before=panda))
+    for change in ({'type': 'prismatic'}, {'sign': -1}):
+        other = replace(UR, joints=(replace(UR.joints[0], **change), *UR.joints[1:]))
+        with pytest.raises(InputError, match='are of other robots'):
+            difference(first, replace(first, chain=other, before=other))
 
 
 def test_the_command_says_it_and_ends_accordingly(nights, tmp_path, capsys):
