@@ -47,7 +47,11 @@ class Limits:
 
     largest_turn: float = _setting(0.1, 'largest correction of a revolute joint [rad]')
     largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]')
-    largest_position_error: float = _setting(1e-6, 'position error that may remain [m]')
+    largest_position_error: float | None = _setting(
+        None,
+        'position error that may remain [m]; if not given 1e-6 in the directions in which the '
+        'joints can move the target, and any in others',
+    )
     largest_orientation_error: float | None = _setting(
         None,
         'orientation error that may remain [rad]; if not given 1e-6, or 0.02 for arms that cannot '
