@@ -32,7 +32,7 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.start import closed_forms, movable
+from calib_ros.identification.start import closed_forms, flange, movable
 from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
@@ -140,12 +140,12 @@ def _of_images(problem: Problem) -> bool:
 
 def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
     """Return the mistakes that explain nearly the most, up to three, if they explain enough."""
-    rough, tried = [], []
+    rough, tried, bare = [], [], _Bare()
     for each in suspects(chain, given.sets, _of_images(problem)):
         few = given.sets
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
-        found = _tried(each.chain or chain, each.undone(few))
+        found = _tried(each.chain or chain, each.undone(few), bare)
         if found is not None and found.share < given.share:
             rough.append((found, each))
     for found, each in sorted(rough, key=lambda one: one[0].share)[:POLISHED]:
@@ -264,17 +264,19 @@ class _Trial:
     """A chain with its frames for some samples, and the spread of the positions [m].
 
     That of the flange or measured, which is less: with metres taken for millimetres, or radians
-    for degrees, every error is small.
+    for degrees, every error is small. `arms` are the poses (N, 4, 4) of the bare arm.
     """
 
     chain: Chain
     sets: Sets
+    arms: tuple[FloatArray, ...]
     spread: float = 1.0
 
     @cached_property
     def error(self) -> float:
         """Return the median of the samples' errors [m]."""
-        sizes = [_errors(self.chain, each) for each in self.sets]
+        pairs = zip(self.sets, self.arms, strict=True)
+        sizes = [_away(self.chain, each, arm) for each, arm in pairs]
         return float(np.median(np.concatenate(sizes)))
 
     @property
@@ -283,22 +285,41 @@ class _Trial:
         return self.error / max(self.spread, 1e-9)
 
 
-def _tried(chain: Chain, sets: Sets) -> _Trial | None:
-    """Return the chain with its frames for some samples in closed form, set by set."""
-    spreads = []
+def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None:
+    """Return the chain with its frames for some samples in closed form, set by set.
+
+    `bare` knows the poses of arms that were tried before.
+    """
+    spreads, arms, bare = [], [], bare or _Bare()
     for each in sets:
         alone = replace(each, base='base', tool='tool')
-        starts = [_Trial(start, (alone,)) for start in closed_forms(chain, alone)]
+        arm = bare.poses(chain, alone)
+        starts = [_Trial(start, (alone,), (arm,)) for start in closed_forms(chain, alone, arm)]
         starts = [start for start in starts if np.isfinite(start.error)]
         if not starts:
             return None
         best = min(starts, key=lambda start: start.error).chain
-        bare = replace(best, base=None, tool=None).forward(each.joints)[:, :3, 3]
-        seen = bare if each.socket else each.positions  # in sockets there is no measured place
-        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (bare, seen)))
+        places = arm[:, :3, 3]
+        seen = places if each.socket else each.positions  # in sockets nothing is measured
+        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
         chain = chain.with_frame(each.base, best.frame('base'))
         chain = chain.with_frame(each.tool, best.frame('tool'))
-    return _Trial(chain, sets, float(np.median(spreads)))
+        arms.append(arm)
+    return _Trial(chain, sets, tuple(arms), float(np.median(spreads)))
+
+
+class _Bare:
+    """Poses of bare arms, which most suspects leave as they are."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
+
+    def poses(self, chain: Chain, each: Observations) -> FloatArray:
+        """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
+        key = id(each.joints), id(chain.joints), chain.convention
+        if key not in self._known:  # what is kept keeps its identity
+            self._known[key] = flange(chain, each), chain, each.joints
+        return self._known[key][0]
 
 
 def _polished(problem: Problem, trial: _Trial) -> _Trial:
@@ -311,12 +332,18 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
     names = [name for name in every if name.is_length or name.owner not in sockets]
     known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
-    return min(trial, _Trial(fitted, sets, trial.spread), key=lambda one: one.error)
+    polished = _Trial(fitted, sets, trial.arms, trial.spread)
+    return min(trial, polished, key=lambda one: one.error)
 
 
 def _errors(chain: Chain, each: Observations) -> FloatArray:
     """Return the errors (N,) [m] of samples."""
-    found = chain.forward(each.joints, base=each.base, tool=each.tool)
+    return _away(chain, each, flange(chain, each))
+
+
+def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
+    """Return the errors (N,) [m] of samples by the poses (N, 4, 4) of the bare arm."""
+    found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
     away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
     if each.oriented.any():
         turns = se3.angles_between(found[:, :3, :3], each.rotations)
