@@ -82,6 +82,12 @@ class Settings:
     sigma_pixel: float = _setting(
         0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
     )
+    sigma_scale: float = _setting(
+        0.0,
+        'standard deviation of the scale of the measuring device [1], if it was checked with a '
+        'known length; 0: it was not',
+        0.0,
+    )
     socket_distance: float = _setting(0.05, 'between the two sockets of a location [m]', 1e-6)
     max_gap: float = _setting(
         0.1, 'longest time between the two joint states that bracket a measurement [s]', 0.0
@@ -160,7 +166,8 @@ class Settings:
         for text in self.priors:
             name, _, sigma = text.partition('=')
             priors[name] = parse_number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
-        names = ['sigma_position', 'sigma_orientation', 'sigma_pixel', 'fixed', 'folds']
+        names = ['sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_scale']
+        names += ['fixed', 'folds']
         names += ['largest_length', 'largest_angle', 'largest_error', 'loss']
         named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
         chosen = {name: getattr(self, name) for name in names}
