@@ -33,7 +33,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.samples import Samples
 from calib_ros.identification.start import closed_forms, flange, movable
-from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
+from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, dead, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.inverse import LEVER
@@ -51,7 +51,10 @@ MOST_AT_ONCE = 4
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What explains the measurements, and their typical errors [m] as given and so."""
+    """What explains the measurements, and their typical errors [m] as given and so.
+
+    The latter is NaN where it is not known.
+    """
 
     suspects: tuple[Suspect, ...]
     given: float
@@ -65,6 +68,8 @@ class Explained:
     def __str__(self) -> str:
         """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
+        if np.isnan(self.so):
+            return whats[0]
         return (
             f'{" -- or ".join(whats)} (typical error, turns included, then {1e3 * self.so:.2f} mm '
             f'instead of {1e3 * self.given:.4g} mm)'
@@ -124,7 +129,8 @@ def explained(problem: Problem) -> Explained | None:
         return None
     given = _polished(problem, given)
     found = (
-        _named(problem, chain, sets, given)
+        _of_a_dead_column(problem, chain, given)
+        or _named(problem, chain, sets, given)
         or _of_a_lost_row(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
         or _several(problem, chain, given)
@@ -136,6 +142,12 @@ def explained(problem: Problem) -> Explained | None:
 
 def _of_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
+
+
+def _of_a_dead_column(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
+    """Return that a coordinate was not measured: no change of what was gives it back."""
+    found = None if _of_images(problem) else dead(chain, given.sets)
+    return None if found is None else Explained((found,), given.error, np.nan)
 
 
 def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
