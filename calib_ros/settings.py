@@ -27,6 +27,8 @@ standard deviations 5 % larger, less than their own uncertainty; more may be a p
 workspace."""
 LEVER = 0.3
 """Length [m] at which a turn counts as much as a shift; a convention."""
+EXACT = 1e-6
+"""Error [m or rad] that may remain of what is reached exactly: no device sees it."""
 GROWTH = 2e-5
 """Growth of a length [m] per root of a year, if nothing else is said."""
 MODES = ('dwell', 'continuous', 'triggered')
@@ -49,7 +51,11 @@ class Limits:
 
     largest_turn: float = _setting(0.1, 'largest correction of a revolute joint [rad]')
     largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]')
-    largest_position_error: float = _setting(1e-6, 'position error that may remain [m]')
+    largest_position_error: float | None = _setting(
+        None,
+        'position error that may remain [m]; if not given 1e-6 in the directions in which the '
+        'joints can move the target, and any in others',
+    )
     largest_orientation_error: float | None = _setting(
         None,
         'orientation error that may remain [rad]; if not given 1e-6, or 0.02 for arms that cannot '
@@ -79,6 +85,12 @@ class Settings:
     )
     sigma_pixel: float = _setting(
         0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
+    )
+    sigma_scale: float = _setting(
+        0.0,
+        'standard deviation of the scale of the measuring device [1], if it was checked with a '
+        'known length; 0: it was not',
+        0.0,
     )
     socket_distance: float = _setting(0.05, 'between the two sockets of a location [m]', 1e-6)
     max_gap: float = _setting(
@@ -158,7 +170,8 @@ class Settings:
         for text in self.priors:
             name, _, sigma = text.partition('=')
             priors[name] = parse_number(sigma, f'the SIGMA of prior "{text}" (NAME=SIGMA)')
-        names = ['sigma_position', 'sigma_orientation', 'sigma_pixel', 'fixed', 'folds']
+        names = ['sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_scale']
+        names += ['fixed', 'folds']
         names += ['largest_length', 'largest_angle', 'largest_error', 'loss']
         named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
         chosen = {name: getattr(self, name) for name in names}

@@ -25,16 +25,11 @@ import numpy as np
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.inverse import LEVER, Follower, Solution
+from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import Limits
+from calib_ros.settings import EXACT, LEVER, Limits
 from calib_ros.shown import Shown
-
-EXACT = Limits.largest_position_error
-"""By so much [rad or m] a command may lie beyond a limit, a correction change at any time, and the
-orientation be wrong of arms that can reach every one."""
-
 
 BESIDE = LEVER / 3.0
 """Distance [m] from the tool at which what a turn does is told: the length of small tools."""
@@ -194,6 +189,12 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m from it '
             f'may be {1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
         )
+    if not compensator.follower.anywhere:
+        across = np.sqrt(result.position[kept] ** 2 - result.reachable[kept] ** 2).max()
+        text += (
+            '; this arm cannot move its target in every direction: of the position '
+            f'{1e3 * across:.3f} mm are left, which no joint can correct'
+        )
     if result.damped[kept].any():
         text += f'; {np.count_nonzero(result.damped[kept])} corrected in part'
     return text
@@ -225,10 +226,12 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     if tolerated is None:
         tolerated = EXACT if follower.complete else 0.02  # as `Limits` promises
     command, correction = result.command, result.correction
+    apart, most = result.position, compensator.largest_position_error
+    if most is None:
+        apart, most = result.reachable, EXACT
     beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
-    remaining = result.position > compensator.largest_position_error
-    remaining |= result.orientation > tolerated
+    remaining = (apart > most) | (result.orientation > tolerated)
     wrong = beyond.any(axis=1) | too_large.any(axis=1) | remaining | ~result.converged
     largest = f'{compensator.largest_turn:g} rad or {compensator.largest_shift:g} m'
     found = []
@@ -252,6 +255,11 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
             i = int(too_large[k].argmax())
             size = f'a correction of {correction[k, i]:.6g}'
             reason = f'{names[i]} would need {size}, more than {largest}'
+        elif result.converged[k] and not follower.complete:
+            reason = (
+                f'this arm cannot reach every pose: {left} remain, more than {1e3 * most:g} mm '
+                f'or {1e3 * tolerated:g} mrad'
+            )
         else:
             how = 'remain' if result.converged[k] else 'remain, without convergence'
             reason = f'{left} {how}: more than is tolerated'

@@ -19,9 +19,10 @@ from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import AIMS, Aim, Limits, Model
+from calib_ros.settings import AIMS, EXACT, LEVER, Aim, Model
 from calib_ros.shown import Shown
 
 
@@ -240,7 +241,7 @@ def place(
 IN_PART = 1e-3
 """Metres that a radian counts, of arms that cannot reach every orientation; and what may remain
 of both [m, rad], as `compensate` tolerates it (`Limits`)."""
-LEFT_IN_PART = (Limits.largest_position_error, 0.02)
+LEFT_IN_PART = (EXACT, 0.02)
 
 
 class _Search:
@@ -264,7 +265,7 @@ class _Search:
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
         self._starts, self._told, self._solved = starts, told, 0
         self._chain = arm.commanded_by(model)
-        self._complete = inverse.mobility(self._chain) == 6
+        self._complete = mobility(self._chain)[0] == 6
         self._base = self._chain.frame('base').matrix
         self._known = self._chain.random_joints(drawn, np.random.default_rng(0))
         poses = in_base(self._chain, self._known)
@@ -298,7 +299,7 @@ class _Search:
         for k in range(length):
             placement, branch = np.nonzero(reached)
             wanted = self._base @ poses[placement, k]
-            lever = inverse.LEVER if self._complete else IN_PART
+            lever = LEVER if self._complete else IN_PART
             found = inverse.solve(self._chain, wanted, start[reached], lever=lever)
             joints[placement, branch, k] = found.joints
             start[reached] = found.joints
@@ -314,7 +315,7 @@ class _Search:
 
 def _features(poses: FloatArray) -> FloatArray:
     """Return (N, 12): what is near in position, and in orientation times LEVER, is near in it."""
-    columns = inverse.LEVER / np.sqrt(2.0) * poses[:, :3, :3].reshape(-1, 9)
+    columns = LEVER / np.sqrt(2.0) * poses[:, :3, :3].reshape(-1, 9)
     return np.concatenate([poses[:, :3, 3], columns], axis=1)
 
 

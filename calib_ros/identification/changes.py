@@ -35,10 +35,10 @@ from calib_ros.identification.levels import CONFIDENT, SCALE, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
 FALSE = 0.005

@@ -40,7 +40,7 @@ from scipy import linalg
 
 from calib_ros.identification.considered import lengths_of, told_of
 from calib_ros.identification.leastsquares import Normal, System
-from calib_ros.identification.levels import SCALE
+from calib_ros.identification.levels import OUT_OF_SCALE, SCALE
 from calib_ros.identification.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -89,6 +89,9 @@ class Posterior(Shown):
     doubted : tuple of (float, (P,), (P, P))
         Mean and covariance of the offsets if the device may have a scale of its own, and if joint
         values that were rounded are off; for sizes that may as well be, each with its weight.
+    rival : (float, float, (P,), (P, P)), optional
+        The same if the device is out of scale: the logarithm of how much more probable the data
+        are then, its scale less one, mean and covariance.
 
     """
 
@@ -101,6 +104,7 @@ class Posterior(Shown):
     priors: Mapping[str, float]
     sizes: Mapping[str, float]
     doubted: tuple[tuple[float, FloatArray, FloatArray], ...]
+    rival: tuple[float, float, FloatArray, FloatArray] | None = None
 
     @cached_property
     def square(self) -> FloatArray:
@@ -129,6 +133,7 @@ class Posterior(Shown):
             shift=np.append(self.shift, 0.0),
             covariance=np.pad(self.covariance, (0, 1)) + more,
             device=np.pad(self.device, ((0, 1), (0, 0))),
+            rival=None,  # nothing has told a scale
             doubted=tuple(
                 (w, np.append(m, 0.0), np.pad(c, (0, 1)) + more) for w, m, c in self.doubted
             ),
@@ -151,6 +156,7 @@ def posterior_of(
     doubts: Mapping[str, float] | None = None,
     at_the_fit: Normal | None = None,
     judging: bool = True,
+    sigma_scale: float = 0.0,
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
@@ -159,11 +165,13 @@ def posterior_of(
     given], `known` are priors [m or rad] that were given. `doubts` are parameters that something
     else than the arm moves as well, with its standard deviation; `at_the_fit` are the last normal
     equations, if they are known. Nothing is `doubted` unless `judging` where it may be used.
+    `sigma_scale` is the standard deviation of the device's scale, 0 if it is not known.
     """
     chain = chain.with_effects([name for name in more if not Parameter(name).of_dh])
     every = (*names, *more)
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
+    unsure = bool(lengths) and scale == SCALE and not sigma_scale
     plain, cross, doubtful = told_of(
         whole, every, system, noise, beside, lengths, bool(more), at_the_fit
     )
@@ -176,8 +184,19 @@ def posterior_of(
     also = ['scale'] if lengths else []
     groups = [*(None if n in known else group_of(chain, n) for n in every), *also]
     given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2
-    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
-    size, slope = evidence.told({group_of(chain, name) for name in more} - {*groups[: len(names)]})
+    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': sigma_scale or scale})
+    beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
+    size, slope = evidence.told(beside_it)
+    rival = None
+    if judging and unsure:
+        odds, precision = evidence.rival('scale', OUT_OF_SCALE, size, beside_it)
+        there, root = solved(matrix, vector, precision)
+        rival = (
+            odds,
+            float(there[-1]),
+            there[: len(every)],
+            (root @ root.T)[: len(every)][:, : len(every)],
+        )
     near = evidence.near(size, slope) if judging else ()
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
@@ -195,7 +214,8 @@ def posterior_of(
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
     shift, sizes = mean - offsets[arm], evidence.named(size)
-    return Posterior(chain, every, offsets[arm], shift, covariance, device, priors, sizes, doubted)
+    told_so = offsets[arm], shift, covariance, device, priors, sizes, doubted, rival
+    return Posterior(chain, every, *told_so)
 
 
 def _device(

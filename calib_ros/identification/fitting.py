@@ -89,9 +89,8 @@ class Fitted:
         """Return what the data of the fit tell, with `more` effects considered."""
         model, given, names = self.problem.model, self.problem.given, self.names
         known = None if more else self.robust.fit.normal
-        found = posterior_of(
-            self.chain, model, names, self.system, noise, given, more, doubts, known, judging
-        )
+        how = doubts, known, judging, self.problem.sigma_scale
+        found = posterior_of(self.chain, model, names, self.system, noise, given, more, *how)
         return found if self.held is None else found.held_at(*self.held)
 
 

@@ -24,7 +24,7 @@ from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
-from calib_ros.settings import EXCEPTION, Limits, Settings
+from calib_ros.settings import EXACT, EXCEPTION, Settings
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[NDArray[np.intp]]
@@ -37,7 +37,7 @@ PATIENCE = 3
 SEPARATION_SIGMA = EXCEPTION * Settings.sigma_position
 """Standard deviation [m] of a known distance between sockets, assumed: nearly exact beside what a
 device measures."""
-SMALL_STEP = math.sqrt(Limits.largest_position_error)
+SMALL_STEP = math.sqrt(EXACT)
 """Step [m or rad] whose second order, half its square, is an error that may remain."""
 
 

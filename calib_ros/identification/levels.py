@@ -50,6 +50,11 @@ KNOWN = 1.0 / HALF_THE_DIGITS
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3
 (assumed)."""
+UNUSUAL = 1.0 - special.ndtr(1.0)
+"""Share of the devices that are out of scale: of a size that is right within a factor, those
+beyond it."""
+OUT_OF_SCALE = 25.0 * SCALE
+"""Standard deviation of the scale of these, half of which are worse (within a factor of ten)."""
 PRINTED = 5e-3
 """The same of a printed board (assumed): 1 mm of 200."""
 

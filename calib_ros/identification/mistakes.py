@@ -33,19 +33,22 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.resection import board_poses
 from calib_ros.identification.result import Identification
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.start import closed_forms, movable
-from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, suspects
+from calib_ros.identification.start import closed_forms, flange, movable
+from calib_ros.identification.suspects import ORIENTATIONS, Sets, Suspect, dead, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.inverse import LEVER
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import LEVER
 
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What explains the measurements, and their typical errors [m] as given and so."""
+    """What explains the measurements, and their typical errors [m] as given and so.
+
+    The latter is NaN where it is not known.
+    """
 
     suspects: tuple[Suspect, ...]
     given: float
@@ -59,6 +62,8 @@ class Explained:
     def __str__(self) -> str:
         """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
+        if np.isnan(self.so):
+            return whats[0]
         return (
             f'{" -- or ".join(whats)} (so the uncorrected arm is typically '
             f'{1e3 * self.so:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
@@ -118,7 +123,8 @@ def explained(problem: Problem) -> Explained | None:
         return None
     given = _polished(problem, given)
     found = (
-        _named(problem, chain, sets, given)
+        _of_a_dead_column(problem, chain, given)
+        or _named(problem, chain, sets, given)
         or _of_a_lost_row(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
         or _several(problem, chain, given)
@@ -132,14 +138,20 @@ def _of_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
 
 
+def _of_a_dead_column(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
+    """Return that a coordinate was not measured: no change of what was gives it back."""
+    found = None if _of_images(problem) else dead(chain, given.sets)
+    return None if found is None else Explained((found,), given.error, np.nan)
+
+
 def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
     """Return the mistakes that explain nearly the most, up to three, if they explain enough."""
-    rough, tried = [], []
+    rough, tried, bare = [], [], _Bare()
     for each in suspects(chain, given.sets, _of_images(problem)):
         few = given.sets
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
-        found = _tried(each.chain or chain, each.undone(few))
+        found = _tried(each.chain or chain, each.undone(few), bare)
         if found is not None and found.share < given.share:
             rough.append((found, each))
     for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
@@ -258,17 +270,19 @@ class _Trial:
     """A chain with its frames for some samples, and the spread of the positions [m].
 
     That of the flange or measured, which is less: with metres taken for millimetres, or radians
-    for degrees, every error is small.
+    for degrees, every error is small. `arms` are the poses (N, 4, 4) of the bare arm.
     """
 
     chain: Chain
     sets: Sets
+    arms: tuple[FloatArray, ...]
     spread: float = 1.0
 
     @cached_property
     def error(self) -> float:
         """Return the median of the samples' errors [m]."""
-        sizes = [_errors(self.chain, each) for each in self.sets]
+        pairs = zip(self.sets, self.arms, strict=True)
+        sizes = [_away(self.chain, each, arm) for each, arm in pairs]
         return float(np.median(np.concatenate(sizes)))
 
     @property
@@ -277,22 +291,41 @@ class _Trial:
         return self.error / max(self.spread, 1e-9)
 
 
-def _tried(chain: Chain, sets: Sets) -> _Trial | None:
-    """Return the chain with its frames for some samples in closed form, set by set."""
-    spreads = []
+def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None:
+    """Return the chain with its frames for some samples in closed form, set by set.
+
+    `bare` knows the poses of arms that were tried before.
+    """
+    spreads, arms, bare = [], [], bare or _Bare()
     for each in sets:
         alone = replace(each, base='base', tool='tool')
-        starts = [_Trial(start, (alone,)) for start in closed_forms(chain, alone)]
+        arm = bare.poses(chain, alone)
+        starts = [_Trial(start, (alone,), (arm,)) for start in closed_forms(chain, alone, arm)]
         starts = [start for start in starts if np.isfinite(start.error)]
         if not starts:
             return None
         best = min(starts, key=lambda start: start.error).chain
-        bare = replace(best, base=None, tool=None).forward(each.joints)[:, :3, 3]
-        seen = bare if each.socket else each.positions  # in sockets there is no measured place
-        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (bare, seen)))
+        places = arm[:, :3, 3]
+        seen = places if each.socket else each.positions  # in sockets nothing is measured
+        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
         chain = chain.with_frame(each.base, best.frame('base'))
         chain = chain.with_frame(each.tool, best.frame('tool'))
-    return _Trial(chain, sets, float(np.median(spreads)))
+        arms.append(arm)
+    return _Trial(chain, sets, tuple(arms), float(np.median(spreads)))
+
+
+class _Bare:
+    """Poses of bare arms, which most suspects leave as they are."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
+
+    def poses(self, chain: Chain, each: Observations) -> FloatArray:
+        """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
+        key = id(each.joints), id(chain.joints), chain.convention
+        if key not in self._known:  # what is kept keeps its identity
+            self._known[key] = flange(chain, each), chain, each.joints
+        return self._known[key][0]
 
 
 def _polished(problem: Problem, trial: _Trial) -> _Trial:
@@ -305,12 +338,18 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
     names = [name for name in every if name.is_length or name.owner not in sockets]
     known = excited(factor_of(chain, names, system), names)
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
-    return min(trial, _Trial(fitted, sets, trial.spread), key=lambda one: one.error)
+    polished = _Trial(fitted, sets, trial.arms, trial.spread)
+    return min(trial, polished, key=lambda one: one.error)
 
 
 def _errors(chain: Chain, each: Observations) -> FloatArray:
     """Return the errors (N,) [m] of samples."""
-    found = chain.forward(each.joints, base=each.base, tool=each.tool)
+    return _away(chain, each, flange(chain, each))
+
+
+def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
+    """Return the errors (N,) [m] of samples by the poses (N, 4, 4) of the bare arm."""
+    found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
     away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
     if each.oriented.any():
         turns = se3.angles_between(found[:, :3, :3], each.rotations)

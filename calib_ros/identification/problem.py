@@ -70,6 +70,9 @@ class Problem(Shown):
     sigma_pixel, sigma_touch : float
         The same [px] of each coordinate of a point of a board in an image, and [m] of heights over
         a plane.
+    sigma_scale : float
+        Standard deviation of the scale of the measuring device [1], once it was checked with a
+        known length; 0 if it was not.
     loss : 'redescending', 'huber' or 'none'
         How gross errors are kept from ruining the fit (`robust.py`).
     priors : mapping of str to float
@@ -112,6 +115,7 @@ class Problem(Shown):
     learned: Learned | None = None
     sigma_pixel: float = Settings.sigma_pixel
     sigma_touch: float = Settings.sigma_position
+    sigma_scale: float = 0.0
     of_messages: bool = False
 
     def __post_init__(self) -> None:
@@ -120,6 +124,8 @@ class Problem(Shown):
         for name, sigma in (self.sigmas | priors).items():
             if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
                 raise ConfigError(f'{name} must be a positive number, not {sigma}')
+        if not isinstance(self.sigma_scale, Real) or not 0.0 <= float(self.sigma_scale) < 1.0:
+            raise ConfigError(f'sigma_scale must be from 0 to 1, not {self.sigma_scale}')
         if not isinstance(self.folds, Integral) or self.folds < 2:
             raise ConfigError(f'folds must be an integer of at least 2, not {self.folds}')
         for name in ('fixed', 'effects'):

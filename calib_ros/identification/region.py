@@ -18,7 +18,7 @@ that holds in each shell.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from scipy import special
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Posterior
-from calib_ros.identification.levels import KNOWN
+from calib_ros.identification.levels import KNOWN, UNUSUAL
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.records import damaged, packed, parse_rows, unpacked
 from calib_ros.identification.samples import BLOCK
@@ -194,6 +194,25 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     limit = np.inf if share == 1.0 else limit
     known = posterior.chain, posterior.names, posterior.square, posterior.device
     return Region(*known, limit, share, *ends)
+
+
+def risk_of_scale(
+    posterior: Posterior, region: Region, sets: Sequence[Observations], freedom: float
+) -> float:
+    """Return how probable it is that the device is out of scale and the arm gets worse by it.
+
+    At the poses measured, or with them all over the region.
+    """
+    if posterior.rival is None:
+        return 0.0
+    more, _, mean, covariance = posterior.rival
+    other = replace(posterior, doubted=((1.0, mean, covariance),))
+    judge = _Judge(other, region.base, region.tool, freedom)
+    drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    own = judge.products(np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets]))
+    inner = own + judge.products(drawn[region.covers(drawn)])
+    out = float(special.expit(special.logit(UNUSUAL) + more))
+    return out * max(judge.risk(own, own), judge.risk(inner, inner))
 
 
 class _Judge:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -113,6 +114,41 @@ class Evidence:
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
         return size, 2.0 * np.maximum(told, 0.0) + width
+
+    def rival(
+        self, group: str, std: float, size: FloatArray, considered: set[str | None]
+    ) -> tuple[float, FloatArray]:
+        """Return how much more probable a group of size `std` is, and the precision (P,) then.
+
+        As the logarithm of the ratio to what was `told`, of sizes (G,); those of the other groups
+        are looked for anew.
+        """
+        own = self._names.index(group)
+        rest = [k for k in range(len(self._names)) if k != own]
+        other = copy.copy(self)
+        other._given = np.where(self._member[own] > 0.0, std**-2, self._given)
+        other._names = [self._names[k] for k in rest]
+        other._member, other._typical = self._member[rest], self._typical[rest]
+        found, _ = other.told(considered - {group})
+        more = other._probable(found) - self._probable(size)
+        other.widen(found)
+        return more, other.precision(found)
+
+    def _probable(self, size: FloatArray) -> float:
+        """Return how probable the data and sizes (G,) are, but for a constant, by Laplace."""
+        mean, root = solved(self._matrix, self._vector, self.precision(size))
+        fit = mean @ self._vector - 0.5 * mean @ self._matrix @ mean
+        known = self._member.any(axis=0)
+        sizes = self._member.T @ size
+        squares = np.where(known, mean * np.exp(-sizes), 0.0) ** 2
+        tails = 0.5 * (TAILS + 1.0) * np.log1p(squares / TAILS)
+        usual = np.where(self._own, tails, 0.5 * squares).sum() + sizes[known].sum()
+        given = self._given > 0.0
+        usual += (
+            0.5 * (self._given * mean**2)[given].sum() - 0.5 * np.log(self._given[given]).sum()
+        )
+        usual += 0.5 * (((size - self._typical) / np.log(SPREAD)) ** 2).sum()
+        return float(fit - usual + np.log(np.abs(np.diag(root))).sum())
 
     def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
         """Return sizes that may as well be, with their weights, by the curvature (G,) there.

@@ -85,7 +85,7 @@ def _start_one(
     subset = observations.spread()
     system = System((Samples(subset, *sigmas),))
     if subset.distances is not None and not subset.plane:
-        start = _trilaterated(chain, _flange(chain, subset), subset)
+        start = _trilaterated(chain, flange(chain, subset), subset)
         lengths = [name for name in names if name.is_length]
         return thorough_fit(start, lengths, system, loss).fit.chain
     spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
@@ -112,7 +112,7 @@ def _start_one(
 
 def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
     """Yield starts to polish, and further ones if none of those is good."""
-    arm = _flange(chain, observations)
+    arm = flange(chain, observations)
     if observations.plane:
         yield _on_plane(chain, arm, observations)
         return
@@ -121,7 +121,7 @@ def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain
     yield (_complete(chain, arm, observations, rotation) for rotation in cube)
 
 
-def _flange(chain: Chain, observations: Observations) -> FloatArray:
+def flange(chain: Chain, observations: Observations) -> FloatArray:
     """Return the poses (N, 4, 4) of the bare arm."""
     arm = replace(chain, base=Frame(), tool=Frame())
     return arm.forward(observations.joints, observations.approach)
@@ -152,9 +152,14 @@ def likened(
     return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
-def closed_forms(chain: Chain, observations: Observations) -> Iterator[Chain]:
-    """Yield the chain with base and tool for poses, positions or a socket, in closed form."""
-    arm = _flange(chain, observations)
+def closed_forms(
+    chain: Chain, observations: Observations, arm: FloatArray | None = None
+) -> Iterator[Chain]:
+    """Yield the chain with base and tool for poses, positions or a socket, in closed form.
+
+    `arm` (N, 4, 4) are the poses of the bare arm, if they are known.
+    """
+    arm = flange(chain, observations) if arm is None else arm
     for rotation in _closed_form(chain, arm, observations):
         yield _complete(chain, arm, observations, rotation)
 

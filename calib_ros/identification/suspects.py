@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.identification.levels import NEARER
+from calib_ros.identification.levels import NEARER, TELLING
 from calib_ros.identification.misread import Turn, misread
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
@@ -100,6 +100,7 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
         change = _of_kind(chain, 'revolute', size)
         yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
     yield from _of_joints(chain)
+    yield from _of_one_unit(chain)
     yield from _of_arms(chain)
     for rows in (1, -1, 2, -2):
         where = 'below' if rows > 0 else 'above'
@@ -247,6 +248,44 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
             yield Suspect(what, remedy, (_joints(coupled),), 2)
+
+
+def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
+    """Yield that the angles of one joint have another unit than those of the others."""
+    turning = [k for k, joint in enumerate(chain.joints) if joint.type == 'revolute']
+    for k in turning if len(turning) > 1 else ():
+        for one, others, size in (
+            ('degrees', 'radians', np.radians(1.0)),
+            ('radians', 'degrees', np.degrees(1.0)),
+        ):
+            what = f'{chain.joint_names[k]} is in {one}, the other joints in {others}'
+            column = f'q{k + 1}'
+            factor = np.ones(len(chain.joints))
+            factor[k] = size
+            changes = (_joints(np.diag(factor)),)
+            yield Suspect(what, f'--columns {column}={column}*{size:.9g}', changes, 2)
+
+
+def dead(chain: Chain, sets: Sets) -> Suspect | None:
+    """Return which coordinates of positions have the same value throughout though the arm moves.
+
+    A device that stands square to a planar arm sees no more.
+    """
+    for each in sets:
+        if each.socket or len(each) < TELLING:
+            continue
+        seen = (each.inverted() if each.inverse else each).positions
+        held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
+        places = replace(chain, base=None, tool=None).forward(each.joints)[:, :3, 3]
+        spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        if len(held) and spreads[2] > NEARER**2 * spreads[0]:
+            columns = ', '.join('xyz'[k] for k in held)
+            return Suspect(
+                f'all positions have the same {columns}, though the arm moves in all directions',
+                f'was the column {columns} recorded, and read from the right place?',
+                published='check the positions where they are published',
+            )
+    return None
 
 
 def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:

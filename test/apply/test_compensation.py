@@ -10,6 +10,7 @@ from commanded import (
     UR,
     UR_TRUE,
     at_limit,
+    bare,
     missed,
     numeric_jacobian,
     only_refusal,
@@ -23,10 +24,15 @@ from calib_ros.apply.compensation import EXACT, Compensator, compensate, in_word
 from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import faulty, random_frame
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.kinematics import effects, inverse
+from calib_ros.kinematics import effects, follower
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.inverse import mobility
+from calib_ros.kinematics.follower import mobility
 
+ENDS = {'lower': -2.5, 'upper': 2.5}
+PLANAR = [
+    Chain('planar', 'standard', tuple(Joint(f'j{k}', a=a, **ENDS) for k, a in enumerate(lengths)))
+    for lengths in ((0.4, 0.3), (0.4, 0.3, 0.2), (0.4, 0.3, 0.2, 0.2))
+]
 SIX = ['puma560', 'staubli_tx90l', 'ur10e']
 REDUNDANT = ['kuka_iiwa14', 'ur10e_on_linear_axis']
 TURNED_SCARA = Chain(
@@ -93,7 +99,7 @@ def best_compromise(compensator, command, weight):
     'nominal', [ROBOTS['kuka_youbot'], ROBOTS['denso_hsr065'], TURNED_SCARA], ids=lambda c: c.name
 )
 def test_arms_of_fewer_joints_meet_the_position_and_then_the_orientation(nominal):
-    assert mobility(nominal) == len(nominal.joints)
+    assert mobility(nominal)[:2] == (len(nominal.joints), 3)
     true = faulty(nominal, CELL, np.random.default_rng(3))
     compensator = Compensator(nominal, true, tool=(0.05, -0.02, 0.1))
     q = regular(nominal, 100)
@@ -108,6 +114,60 @@ def test_arms_of_fewer_joints_meet_the_position_and_then_the_orientation(nominal
     for k in np.flatnonzero(kept)[:3]:
         best = best_compromise(compensator, q[k], 1e-3)
         np.testing.assert_allclose(result.joints[k], best, atol=1e-6)
+
+
+@pytest.mark.parametrize('nominal', PLANAR, ids=lambda chain: len(chain.joints))
+def test_a_planar_arm_is_corrected_in_its_plane_and_the_rest_is_told(nominal):
+    assert mobility(nominal)[1:] == (2, 1)
+    true = faulty(nominal, CELL, np.random.default_rng(3))
+    q = 0.95 * nominal.random_joints(200, np.random.default_rng(0))
+    q = q[np.abs(np.sin(q[:, 1])) > 0.3]  # the first two links are not in one line
+    compensator = Compensator(nominal, true, largest_orientation_error=0.1)
+    result = compensate(compensator, q)
+    assert result.refusals == ()
+    before, after = (pose_errors(compensator, q, each)[0] for each in (q, result.joints))
+    assert np.abs(before[:, :2]).max() > 1e-3
+    assert np.abs(after[:, :2]).max() < EXACT
+    np.testing.assert_allclose(result.position, np.abs(after[:, 2]), atol=1e-9)
+    np.testing.assert_allclose(result.reachable, 0.0, atol=EXACT)
+    turned = pose_errors(compensator, q, result.joints)[1][:, 2]
+    if len(nominal.joints) > 2:
+        assert np.abs(turned).max() < 1e-4
+        moved = numeric_jacobian(true, result.joints)[:, [0, 1, 5]]
+        idle = np.linalg.svd(moved)[2][:, 3:]
+        share = np.einsum('nki,ni->nk', idle, result.correction)
+        assert np.abs(share).max(initial=0.0) < 1e-4
+    told = f'{1e3 * np.abs(after[:, 2]).max():.3f} mm are left, which no joint can correct'
+    assert told in in_words(compensator, result)
+    strict = compensate(replace(compensator, largest_position_error=1e-5), q)
+    assert 'this arm cannot reach every pose' in strict.refusals[0].reason
+    assert 'more than 0.01 mm or 100 mrad' in strict.refusals[0].reason
+
+
+def test_a_planar_arm_stretched_out_is_singular():
+    nominal = PLANAR[0]
+    true = faulty(nominal, CELL, np.random.default_rng(3))
+    result = compensate(Compensator(nominal, true), np.array([[0.3, 1e-4]]))
+    assert 'near a singularity' in only_refusal(result).reason
+
+
+def test_a_scara_on_a_rail_spends_no_idle_motion_on_tilts_of_thousandths():
+    rail = Joint('rail', 'prismatic', alpha=np.pi / 2, lower=0.0, upper=2.0)
+    first = replace(TURNED_SCARA.joints[0], alpha=-np.pi / 2)
+    nominal = Chain('rail', 'modified', (rail, first, *TURNED_SCARA.joints[1:]))
+    assert mobility(nominal) == (4, 3, 1)
+    true = faulty(nominal, CELL, np.random.default_rng(3))
+    q = 0.9 * nominal.random_joints(100, np.random.default_rng(0))
+    compensator = Compensator(nominal, true)
+    result = compensate(compensator, q)
+    kept = ~np.isnan(result.joints).any(axis=1)
+    assert kept.mean() > 0.95
+    q, joints = q[kept], result.joints[kept]
+    position, turn = pose_errors(compensator, q, joints)
+    assert np.abs(position).max() < 1e-8
+    axis = bare(nominal).forward(q)[:, :3, 2]
+    assert np.abs(np.einsum('ni,ni->n', axis, turn)).max() < 2e-5
+    assert np.linalg.norm(turn, axis=1).max() > 1e-3
 
 
 def test_the_weight_of_orientation_is_the_users():
@@ -175,8 +235,14 @@ def test_every_sample_is_reached_within_all_limits_or_refused(drawn):
     assert (np.abs(result.correction[~refused]) <= compensator.largest).all()
     assert (np.abs(result.joints[~refused]) <= 2.0).all()
     position, turn = missed(compensator, q[~refused], result.joints[~refused])
-    assert (position <= 1e-6).all()
-    assert (turn <= (1e-6 if mobility(nominal) == 6 else 0.02)).all()
+    freedoms, places, _ = mobility(bare(nominal))
+    if places == 3:
+        assert (position <= 1e-6).all()
+    else:
+        before, _ = missed(compensator, q[~refused], q[~refused])
+        assert (position <= before + 1e-5).all()
+    assert (result.reachable[~refused] <= 1e-6).all()
+    assert (turn <= (1e-6 if freedoms == 6 else 0.02)).all()
 
 
 # What is refused
@@ -287,7 +353,7 @@ def test_what_is_reached_near_a_singularity_is_never_worse_than_nothing(name):
 
 
 def test_a_sample_that_does_not_converge_is_refused(monkeypatch):
-    monkeypatch.setattr(inverse, 'ROUNDS', 1)
+    monkeypatch.setattr(follower, 'ROUNDS', 1)
     tolerant = Compensator(UR, UR_TRUE, largest_position_error=1.0, largest_orientation_error=1.0)
     result = compensate(tolerant, regular(UR, 3))
     assert not result.converged.any()

@@ -12,7 +12,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification.identification import identify
 from calib_ros.identification.mistakes import explained
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.suspects import QUARTERS
+from calib_ros.identification.suspects import QUARTERS, dead
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
@@ -318,3 +318,44 @@ def test_shuffled_rows_have_not_lost_one(count):
     seen = seen_of(count=count)
     found = explained(Problem(UR, replace(seen, joints=seen.joints[rng.permutation(count)])))
     assert found is None
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('joint', [0, 2, 5])
+def test_one_joint_in_another_unit_than_the_others_is_named(joint, oriented):
+    chain, rng = load_chain('ur10e'), np.random.default_rng(5)
+    seen = measure(
+        faulty(chain, Cell(), rng), chain.random_joints(60, rng), rng, 1e-4, 3e-4, oriented
+    )
+    for factor, words in (
+        (np.degrees(1.0), 'is in degrees, the other joints in radians'),
+        (np.radians(1.0), 'is in radians, the other joints in degrees'),
+    ):
+        mixed = seen.joints.copy()
+        mixed[:, joint] *= factor
+        said = str(explained(Problem(chain, replace(seen, joints=mixed))))
+        assert said.startswith(f'{chain.joint_names[joint]} {words}: --columns q{joint + 1}=')
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize(('columns', 'words'), [([1], 'y'), ([0, 2], 'x, z')])
+def test_columns_that_never_change_are_named(columns, words, oriented):
+    chain, rng = load_chain('ur10e'), np.random.default_rng(5)
+    seen = measure(
+        faulty(chain, Cell(), rng), chain.random_joints(60, rng), rng, 1e-4, 3e-4, oriented
+    )
+    places = seen.positions.copy()
+    places[:, columns] = places[0, columns]
+    result = identify(Problem(chain, replace(seen, positions=places)))
+    assert f'all positions have the same {words}, though' in result.refusals[0]
+    assert f'was the column {words} recorded' in result.refusals[0]
+
+
+def test_a_planar_arm_square_to_the_device_has_no_dead_column():
+    ends = {'lower': -2.5, 'upper': 2.5}
+    chain = Chain('flat', 'standard', tuple(Joint(f'j{k}', a=0.3, **ends) for k in range(3)))
+    rng = np.random.default_rng(0)
+    q = chain.random_joints(40, rng)
+    seen = measure(chain, q, rng, 0.0, 0.0, oriented=False)
+    assert np.ptp(seen.positions[:, 2]) == 0.0
+    assert dead(chain, (seen,)) is None

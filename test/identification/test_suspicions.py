@@ -7,10 +7,12 @@ import pytest
 from fits import rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.errors import ConfigError
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.suspicions import _common, scale_of
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, summary
 
@@ -180,3 +182,38 @@ def test_couplings_that_the_model_lacks_are_uncertainty_elsewhere(unsearched):
     axes = result.confidence_ellipsoid(far)
     along = np.einsum('nki,ni->nk', axes, error) / (axes**2).sum(axis=2)
     assert ((along**2).sum(axis=1) < 1.0).mean() > 0.9
+
+
+ROWS = ({'d': 0.5, 'a': 0.2, 'alpha': -np.pi / 2}, {'a': 0.7}, {'a': 0.6}, {'a': 0.1})
+FOUR = Chain(
+    'four',
+    'standard',
+    tuple(Joint(f'j{k}', lower=-2.5, upper=2.5, **row) for k, row in enumerate(ROWS)),
+)
+
+
+@pytest.mark.parametrize('seed', range(1, 5))
+def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
+    """By positions alone four joints hold so few lengths that no test is certain of the scale."""
+    rng = np.random.default_rng(seed)
+    true = faulty(FOUR, Cell(length_error=3e-4, angle_error=6e-4), rng)
+    seen = measure(true, FOUR.random_joints(60, rng), rng, 5e-5, oriented=False)
+    right = Problem(FOUR, seen, sigma_position=5e-5)
+    assert identify(right).accepted
+    wrong = replace(right, observations=scaled(seen, -3000.0))
+    result = identify(wrong)
+    (refusal,) = result.refusals
+    assert refusal.rule is Rule.SCALE
+    assert 'lengths of the arm shrink alike' in refusal
+    assert 'set sigma_scale' in refusal
+    q = FOUR.random_joints(300, rng)
+    nominal = replace(FOUR, base=true.base, tool=true.tool)
+    assert rms(result.chain, true, q) > rms(nominal, true, q)
+    checked = identify(replace(wrong, sigma_scale=1e-5))
+    assert checked.accepted
+    assert not any('sigma_scale' in each for each in checked.remarks)
+
+
+def test_the_scale_of_a_device_is_a_number():
+    with pytest.raises(ConfigError, match=r'sigma_scale must be from 0 to 1, not -0\.1'):
+        Problem(FOUR, seen_of(arm()), sigma_scale=-0.1)
