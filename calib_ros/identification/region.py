@@ -209,8 +209,9 @@ def risk_of_scale(
     other = replace(posterior, doubted=((1.0, mean, covariance),))
     judge = _Judge(other, region.base, region.tool, freedom)
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    own = judge.products(np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets]))
-    inner = own + judge.products(drawn[region.covers(drawn)])
+    measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
+    own = judge.products(judge.rows(measured))
+    inner = own + judge.products(judge.rows(drawn[region.covers(drawn)]))
     out = float(special.expit(special.logit(UNUSUAL) + more))
     return out * max(judge.risk(own, own), judge.risk(inner, inner))
 

@@ -171,7 +171,7 @@ def test_one_orientation_leaves_the_tool_where_it_was(shape, oriented, jitter):
     result = identify(Problem(nominal, seen))
     assert result.converged
     assert {'tool.x', 'tool.y', 'tool.z'} <= set(result.not_excited)
-    assert any('tool: "fixed: true" in the chain file)' in text for text in result.refusals)
+    assert any('tool (x, y, z' in text for text in result.refusals)
     assert not result.accepted
     for chain in (result.before, result.chain):
         assert np.linalg.norm(chain.frame('tool').matrix[:3, 3]) < 0.01
