@@ -79,7 +79,9 @@ BESIDE_SETTINGS = (
         'called; default: none, a measurement is taken',
         False,
     ),
-    Parameter('marker_scale', 200.0, 'residual vectors are drawn so many times as long', False),
+    Parameter(
+        'marker_scale', 200.0, 'residual vectors are drawn so many times as long', False, 0.0
+    ),
     Parameter(
         'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'
     ),

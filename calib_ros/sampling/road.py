@@ -178,10 +178,13 @@ class Road:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, of so many measurements."""
-        collector, maker = self.collector, self.collector.maker
-        found = collector.astray(measurements)
-        found += self.clocks.hints() + collector.hints(measurements)
-        return found or unsettled(maker.restless, maker.restless + maker.rested)
+        found = self.collector.astray(measurements) + self.clocks.hints()
+        return found + self.collector.hints(measurements)
+
+    def unsettled(self) -> list[Hint]:
+        """Return what looks wrong with the measurements at stops, if no stamps explain it."""
+        maker = self.collector.maker
+        return unsettled(maker.restless, maker.restless + maker.rested)
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

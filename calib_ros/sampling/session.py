@@ -238,7 +238,7 @@ class CalibrationSession:
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
         found += self._road.hints(self.received[POSES])
-        return found or losses(self.received, self._dropped)
+        return found or losses(self.received, self._dropped) or self._road.unsettled()
 
     @property
     def delay(self) -> Delay | None:

@@ -51,6 +51,7 @@ def test_the_parameter_file_holds_every_parameter_with_its_default(idle):
         ('sigma_position', -1.0, 'sigma_position'),
         ('sigma_position', 1, "expected 'Type.DOUBLE'"),
         ('folds', 1, 'folds'),
+        ('marker_scale', float('nan'), 'marker_scale'),  # the markers would be nowhere
         ('longest_stop', 0.1, 'must be shorter than longest_stop (0.1 s)'),
         ('mode', 'continuous', 'read-only'),
         ('joint_names', ['a'], 'read-only'),

@@ -226,6 +226,25 @@ def test_much_that_is_dropped_is_told_and_why(share, count):
         assert re.match(said, found[0])
 
 
+def test_two_publishers_are_told_rather_than_what_comes_of_them():
+    """Zeros with the stamps of the true joint values: some stops seem to move."""
+    motion = tour(25)
+    times, seen = np.repeat(np.arange(0.0, 49.5, 0.01), 2), np.arange(0.003, 49.2, 0.02)
+    found = measure(TRUE, motion(seen), np.random.default_rng(3), 2e-5, 1e-4)
+    joints = motion(times)
+    joints[1::2] = 0.0
+    made = CalibrationSession(UR5E)
+    hear(
+        made,
+        (times, stamps(times), joints),
+        (seen, stamps(seen), found.positions, found.rotations),
+    )
+    made.finish()
+    assert made.account().dropped['measurements: a stop that spreads more than the noise'] > 100
+    (warning,) = told(made)
+    assert 'of two publishers' in warning
+
+
 @pytest.mark.parametrize(
     ('of', 'other', 'count'),
     [
