@@ -8,16 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.identification import identifiability
-from calib_ros.identification.directions import Directions, by_direction, weighed
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.leastsquares import Fit, System
 from calib_ros.identification.levels import SURE
 from calib_ros.identification.robust import SUSPICIOUS
-from calib_ros.identification.shared_errors import Shared, shared_errors
+from calib_ros.identification.shared_errors import shared_errors
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -72,9 +70,9 @@ def noise_of(
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
     position, orientation = np.sqrt(variances).tolist()
     orientation = orientation if known[1] else None
-    together = joint_sums / np.maximum(sums, 1e-300)
-    by, apart = _alike(fit, names, system, factor, together <= SUSPICIOUS)
+    by = shared_errors(fit, names, system)
     noise = Noise(position, orientation, consistent, by.successive, by.near, by.found)
+    together = joint_sums / np.maximum(sums, 1e-300)
     alone = np.maximum(variances, 1.0) if consistent else variances
     sizes = np.where(together > SUSPICIOUS, together, 1.0) * alone
     middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
@@ -85,7 +83,7 @@ def noise_of(
     seen = np.where(together > SUSPICIOUS, joint_counts, counts)
     freedom = np.maximum(seen - taken, 1.0)
     freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
-    if not (estimated.any() or apart):
+    if not estimated.any():
         return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))
 
     def covariances(by_part: Sequence[FloatArray]) -> FloatArray:
@@ -98,36 +96,7 @@ def noise_of(
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
     size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))
-    noise = replace(noise, size=size)
-    for k, found in sorted(apart.items(), reverse=True):
-        parts = [identifiability.covariance(factor, each) for each in found.middles]
-        covariance = np.concatenate([covariance[:k], parts, covariance[k + 1 :]])
-        freedom = np.concatenate([freedom[:k], found.freedom, freedom[k + 1 :]])
-    return noise, Uncertainty(covariance, freedom)
-
-
-def _alike(
-    fit: Fit,
-    names: Sequence[str],
-    system: System,
-    factor: FloatArray,
-    alone: NDArray[np.bool_],
-) -> tuple[Shared, dict[int, Directions]]:
-    """Return what neighbours share, and the noise by direction of parts in which it differs.
-
-    Not of those whose pairs of one configuration are not `alone`, nor of those that neighbours
-    share.
-    """
-    by = shared_errors(fit, names, system)
-    apart = {}
-    for k in np.flatnonzero(alone & fit.normal.parts.any(axis=(1, 2))).tolist():
-        found = by_direction(fit.chain, names, system, factor, k)
-        if found is not None:
-            apart[k] = found
-    if apart and by.middles:
-        left = shared_errors(fit, names, weighed(system, apart))
-        by = by if left.middles else left
-    return by, {k: found for k, found in apart.items() if k not in by.middles}
+    return replace(noise, size=size), Uncertainty(covariance, freedom)
 
 
 def _squares(chain: Chain, system: System) -> FloatArray:
