@@ -170,10 +170,7 @@ def compare(
     sets: Sequence[Observations],
     judged: NDArray[np.bool_] | None = None,
 ) -> Comparison:
-    """Return the residuals of all sets, one after the other, by both chains.
-
-    `judged` (N,) is False for outliers.
-    """
+    """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
     numbers = np.concatenate(numbered(sets))
     first, second = (
         _joined([residuals(chain, each) for each in sets], numbers) for chain in (before, after)
