@@ -34,7 +34,8 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.urdf_tree import to_rpy
 from calib_ros.texts import csv_text, dump_yaml, from_cell, to_cell
 from calib_ros.values import SAME
 
@@ -209,6 +210,9 @@ def walked(
 def xyz_rpy(matrix: FloatArray) -> dict[str, float]:
     """Return a pose (4, 4) as x, y, z [m] and the angles [rad] about fixed axes."""
     angles = Rotation.from_matrix(matrix[:3, :3]).as_euler('xyz')
+    again = Rotation.from_euler('xyz', angles).as_matrix()
+    if np.abs(again - matrix[:3, :3]).max() > ROUNDING:  # a pitch of 90 degrees but for 1e-7
+        angles = to_rpy(matrix[:3, :3], angles)
     numbers = [*matrix[:3, 3].tolist(), *angles.tolist()]
     return dict(zip(('x', 'y', 'z', 'roll', 'pitch', 'yaw'), numbers, strict=True))
 

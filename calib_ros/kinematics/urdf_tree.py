@@ -324,7 +324,7 @@ def _with_origin(tag: str, origin: FloatArray) -> str:
     written, rpy = _placed(element, 'origin')
     change = np.abs(origin - written)
     if change[:3, :3].max() > ROUNDING:
-        tag = _with_attribute(tag, 'rpy', _to_rpy(origin[:3, :3], rpy))
+        tag = _with_attribute(tag, 'rpy', to_rpy(origin[:3, :3], rpy))
     if change[:3, 3].max() > ROUNDING:
         tag = _with_attribute(tag, 'xyz', origin[:3, 3])
     return tag
@@ -338,7 +338,7 @@ def _with_attribute(tag: str, key: str, values: FloatArray) -> str:
     return tag[: found.start(2)] + text + tag[found.end(2) :]
 
 
-def _to_rpy(rotation: FloatArray, near: FloatArray) -> FloatArray:
+def to_rpy(rotation: FloatArray, near: FloatArray) -> FloatArray:
     """Return roll, pitch, yaw (3,) [rad] of a rotation; of the two solutions the nearer one.
 
     The roll is that of the rotation behind yaw and pitch as they were found, so that the three

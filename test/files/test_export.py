@@ -87,6 +87,22 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
     assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
 
 
+@pytest.mark.filterwarnings('ignore:Gimbal lock')
+@pytest.mark.parametrize('digits', [6, 7, 8, 9])
+def test_right_angles_of_a_few_digits_are_exported(digits):
+    """A quarter turn to seven digits is a pitch of 90 degrees but for 1e-7, where Euler angles
+    are hard to tell."""
+    quarter = round(np.pi / 2.0, digits)
+    rows = (
+        Joint('j1', alpha=quarter, d=0.3, theta=0.1),
+        Joint('j2', alpha=quarter, a=0.2, theta=-quarter),
+        Joint('j3', alpha=-quarter, d=0.3, theta=quarter),
+    )
+    nominal = Chain('digits', 'standard', rows)
+    found = exports(nominal.with_offsets({'j1.a': 1e-3}), nominal)
+    assert 'kinematics.yaml' in {each.name for each in found}
+
+
 def tilted():
     """A small arm with axes that are parallel but for a degree, and its calibration."""
     rows = (
