@@ -99,4 +99,6 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
         beyond = f' with what its first line says, {each.beyond}' if each.beyond else ''
         screen.say(f'{options.out / each.name}: {exact}{beyond}')
+    if calibration.region is not None and not calibration.region.whole:
+        screen.warn(f'the calibration is {calibration.region.in_words()}')
     return 0

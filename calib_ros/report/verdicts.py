@@ -7,6 +7,7 @@ from __future__ import annotations
 from calib_ros.apply.verification import DECIDING, Verification
 from calib_ros.identification.levels import NEARER
 from calib_ros.identification.records import reused_in_words
+from calib_ros.settings import Settings
 
 
 def in_words(found: Verification) -> str:
@@ -50,6 +51,13 @@ def limits(found: Verification) -> list[str]:
         lines.append(
             'this judges the calibration, not the robot with it: --commanded, the program before '
             'its correction, tells whether the correction reaches the arm'
+        )
+    turned = found.comparison.figures[1].rms_mrad
+    moved = found.common < NEARER  # which explains it
+    if turned is not None and turned > 1e3 * Settings.largest_angle and not moved:
+        lines.append(
+            f'the orientations are {turned:.0f} mrad off, and only positions are judged: see how '
+            'they are written (order of the quaternion or angles, degrees), and the target'
         )
     return lines
 

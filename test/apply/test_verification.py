@@ -233,6 +233,14 @@ def test_repeats_do_not_count_as_more_configurations(arm):
     assert second.upper == pytest.approx(first.upper, rel=1e-9)
 
 
+def test_orientations_that_are_far_off_are_told(arm):
+    seen = with_errors(arm, np.random.default_rng(0).normal(scale=1e-5, size=(6, 3)))
+    turned = replace(seen, rotations=np.swapaxes(seen.rotations, 1, 2))
+    right, wrong = (in_words(verify(arm, [each], 1e-4)) for each in (seen, turned))
+    assert 'only positions are judged' in wrong
+    assert 'only positions are judged' not in right
+
+
 def test_a_device_that_stands_elsewhere(cell, arm):
     true = cell[0]
     joints = UR.random_joints(30, np.random.default_rng(3))
