@@ -37,6 +37,7 @@ from calib_ros.identification.validation import (
 )
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Told, nobody
+from calib_ros.settings import EXCEPTION
 
 
 def identify(
@@ -75,7 +76,8 @@ def _identified(
     progress(1 / 2)  # of many poses (benchmarks/end_to_end.py)
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > 4 * SOME:
-        start = minimise(start, frames, robust.system.spread(SOME)).chain
+        most = max(SOME, int(EXCEPTION * robust.system.count))
+        start = minimise(start, frames, robust.system.spread(most)).chain
     before = minimise(start, frames, robust.system, tolerance=1e-5)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)

@@ -172,11 +172,11 @@ def compare(
 ) -> Comparison:
     """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
     numbers = np.concatenate(numbered(sets))
-    first, second = (
-        _joined([residuals(chain, each) for each in sets], numbers) for chain in (before, after)
+    last, first = (  # those of the last are known where it has just been fitted
+        _joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)
     )
     every = np.ones(len(numbers), dtype=bool)
-    return Comparison(first, second, every if judged is None else judged)
+    return Comparison(first, last, every if judged is None else judged)
 
 
 def validate(
