@@ -172,46 +172,55 @@ def _weigh(events: Iterator[Any], where: str, error: type[CalibrationError]) -> 
     Of their events scalars have a value, lists and mappings a tag, and aliases only an anchor,
     which ends have not.
     """
-    anchors: dict[str, tuple[int, int]] = {}
+    scales = _Scales(events, where, error)
+    for event in events:
+        if hasattr(event, 'anchor'):
+            scales.node(event, 0)
+        else:
+            scales.anchors.clear()
 
-    def node(event: Any, above: int) -> tuple[int, int]:
-        """Return how many values a node has with its aliases written out, and its levels."""
+
+class _Scales:
+    """What weighs the nodes of documents, each with its aliases written out."""
+
+    def __init__(self, events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
+        self._events, self._where, self._error = events, where, error
+        self.anchors: dict[str, tuple[int, int]] = {}
+
+    def node(self, event: Any, above: int) -> tuple[int, int]:
+        """Return how many values a node has, and its levels."""
         if hasattr(event, 'value'):
             nodes, height = 1 + len(event.value) // 20, 0
         elif hasattr(event, 'tag'):
-            nodes, height = collection(event, above)
-        elif event.anchor in anchors:
-            nodes, height = anchors[event.anchor]
+            nodes, height = self._collection(event, above)
+        elif event.anchor in self.anchors:
+            nodes, height = self.anchors[event.anchor]
         else:
-            raise error(f'{where}: alias "{event.anchor}" stands for nothing before it')
+            raise self._error(
+                f'{self._where}: alias "{event.anchor}" stands for nothing before it'
+            )
         if above + height > DEEPEST:
-            raise error(f'{where} is nested deeper than {DEEPEST} levels')
+            raise self._error(f'{self._where} is nested deeper than {DEEPEST} levels')
         if event.anchor:
-            anchors[event.anchor] = nodes, height
+            self.anchors[event.anchor] = nodes, height
         return nodes, height
 
-    def collection(event: Any, above: int) -> tuple[int, int]:
+    def _collection(self, event: Any, above: int) -> tuple[int, int]:
         nodes, height, keys = 1, 1, set()
         keyed = type(event).__name__ == 'MappingStartEvent'
-        for k, inner in enumerate(events if above < DEEPEST else ()):
+        for k, inner in enumerate(self._events if above < DEEPEST else ()):
             if not hasattr(inner, 'anchor'):
                 break
             key = getattr(inner, 'value', '<<')
             if keyed and k % 2 == 0 and key != '<<':
                 if key in keys:
-                    raise error(f'{where}: key "{key}" comes twice')
+                    raise self._error(f'{self._where}: key "{key}" comes twice')
                 keys.add(key)
-            more, levels = node(inner, above + 1)
+            more, levels = self.node(inner, above + 1)
             nodes, height = nodes + more, max(height, levels + 1)
             if nodes > MOST_NODES:
-                raise error(f'{where} has more than {MOST_NODES} values')
+                raise self._error(f'{self._where} has more than {MOST_NODES} values')
         return nodes, height
-
-    for event in events:
-        if hasattr(event, 'anchor'):
-            node(event, 0)
-        else:
-            anchors.clear()
 
 
 def one_line(text: str) -> str:

@@ -86,6 +86,15 @@ def test_modules_import_only_from_the_folders_before(module):
         assert there == folder or below, f'{module} imports {other}'
 
 
+@pytest.mark.parametrize('module', MODULES)
+def test_modules_and_functions_are_small(module):
+    text = MODULES[module].read_text()
+    assert text.count('\n') <= 400
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            assert node.end_lineno - node.lineno < 60, node.name
+
+
 def test_no_two_modules_import_each_other():
     graph = {
         module: {inner(name) for name in imports(path)} - {None}

@@ -125,19 +125,7 @@ class _Table:
         self, expressions: dict[str, Expression], own: dict[str, str]
     ) -> dict[str, Expression]:
         """Return the expressions with what the header calls by our names, or the chain's."""
-        kept, absent, guessed = {}, [], []
-        for ours, each in expressions.items():
-            missing = [name for name in each.names if self._sheet.number(name) is None]
-            if not missing:
-                kept[ours] = each
-            elif not set(missing) <= self._optional:
-                raise InputError(
-                    f'{self._path} has no column {", ".join(missing)} for {ours}; {self._has()}'
-                )
-            else:
-                absent.append(f'{ours} ({", ".join(missing)})')
-        if 0 < len(absent) <= 5:  # `q*=A*` stands for as many as there are
-            self.notes.append(f'it has no {", ".join(absent)}: left out')
+        kept, guessed = self._there(expressions), []
         lower = [name.lower() for name in self._sheet.header]
         for name, ours in own.items():
             if ours in kept or ours in self._ours or lower.count(name.lower()) != 1:
@@ -160,6 +148,23 @@ class _Table:
                     f'{self._path} has no column for {", ".join(missing)}: name it by --columns '
                     f'{missing[0]}=NAME; {self._has()}'
                 )
+        return kept
+
+    def _there(self, expressions: dict[str, Expression]) -> dict[str, Expression]:
+        """Return the expressions whose columns are there; others must be optional."""
+        kept, absent = {}, []
+        for ours, each in expressions.items():
+            missing = [name for name in each.names if self._sheet.number(name) is None]
+            if not missing:
+                kept[ours] = each
+            elif not set(missing) <= self._optional:
+                raise InputError(
+                    f'{self._path} has no column {", ".join(missing)} for {ours}; {self._has()}'
+                )
+            else:
+                absent.append(f'{ours} ({", ".join(missing)})')
+        if 0 < len(absent) <= 5:  # `q*=A*` stands for as many as there are
+            self.notes.append(f'it has no {", ".join(absent)}: left out')
         return kept
 
     def _has(self) -> str:

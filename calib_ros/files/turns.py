@@ -94,7 +94,13 @@ def _rotations(
             f'{made.path} has {called}: say what they are, --euler XYZ (or ZYX, '
             'zyx, ...) or --rotation-vector'
         )
-    letters = layout.euler
+    return _from_euler(angles, layout.euler, names)
+
+
+def _from_euler(
+    angles: FloatArray, letters: str, names: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """Return rotations, and the axes of angles (N, 3) about axes named by letters."""
     if names == layouts.TURNS:
         if len(set(letters.upper())) < 3:
             raise ConfigError(

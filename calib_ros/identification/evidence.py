@@ -172,9 +172,8 @@ def posterior_of(
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
     unsure = bool(lengths) and scale == SCALE and not sigma_scale
-    plain, cross, doubtful = told_of(
-        whole, every, system, noise, beside, lengths, bool(more), at_the_fit
-    )
+    what = beside, lengths, bool(more), at_the_fit
+    plain, cross, doubtful = told_of(whole, every, system, noise, *what)
     offsets = np.zeros(len(plain) - 1)
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
@@ -187,16 +186,8 @@ def posterior_of(
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': sigma_scale or scale})
     beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
     size, slope = evidence.told(beside_it)
-    rival = None
-    if judging and unsure:
-        odds, precision = evidence.rival('scale', OUT_OF_SCALE, size, beside_it)
-        there, root = solved(matrix, vector, precision)
-        rival = (
-            odds,
-            float(there[-1]),
-            there[: len(every)],
-            (root @ root.T)[: len(every)][:, : len(every)],
-        )
+    sought = evidence, matrix, vector, len(every), size, beside_it
+    rival = _rival(*sought) if judging and unsure else None
     near = evidence.near(size, slope) if judging else ()
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
@@ -206,16 +197,29 @@ def posterior_of(
     precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
     arm = np.s_[: len(every)]
     along = (alone @ offsets + plain[:-1, -1])[arm]
-    mean, covariance = mixed(
-        [solved(alone[arm, arm], along, each[arm]) for each in precisions], weights
-    )
+    each_alone = [solved(alone[arm, arm], along, each[arm]) for each in precisions]
+    mean, covariance = mixed(each_alone, weights)
     device = _device(alone, cross[:-1], doubtful, evidence.precision(size), len(every))
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
-    shift, sizes = mean - offsets[arm], evidence.named(size)
-    told_so = offsets[arm], shift, covariance, device, priors, sizes, doubted, rival
-    return Posterior(chain, every, *told_so)
+    arms_own = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
+    return Posterior(chain, every, *arms_own, doubted, rival)
+
+
+def _rival(
+    evidence: Evidence,
+    matrix: FloatArray,
+    vector: FloatArray,
+    count: int,
+    size: FloatArray,
+    considered: set[str | None],
+) -> tuple[float, float, FloatArray, FloatArray]:
+    """Return what would hold of the first `count` columns (P) by a device out of scale."""
+    odds, precision = evidence.rival('scale', OUT_OF_SCALE, size, considered)
+    mean, root = solved(matrix, vector, precision)
+    arm = np.s_[:count]
+    return odds, float(mean[-1]), mean[arm], (root @ root.T)[arm, arm]
 
 
 def _device(

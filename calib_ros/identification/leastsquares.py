@@ -268,23 +268,17 @@ def minimise(
     It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
     It ends as well, not converged, where ROUNDS iterations bring no progress (a thousandth of the
     cost, or half of the step left to go), where numbers end, or after so many `iterations`; curved
-    valleys need 400.
-    `normal` are the equations at the start, if known.
+    valleys need 400. `normal` are the equations at the start, if known.
     """
     normal = normal or normal_equations(chain, names, system)
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
     damping, growth, patience, promised = 0.0, 2.0, PATIENCE, 0.0
-    stalled, least_cost, least_left = 0, np.inf, np.inf
-    iteration = 0
+    iteration, stalled, least_cost, least_left = 0, 0, np.inf, np.inf
     while iteration < iterations and stalled < ROUNDS:
         iteration += 1
-        step = _solve(normal.matrix, normal.gradient)
-        left = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
-        settled = left < tolerance * max(1.0, normal.rms(system))
-        if damping > 0.0 and not settled:
-            step = _solve(normal.matrix, normal.gradient, damping)
+        step, left, settled = _next(normal, system, tolerance, damping)
         if not np.isfinite(step).all():
             break
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
@@ -316,6 +310,18 @@ def minimise(
             patience = 0
             damping, growth = max(growth * damping, HALF_THE_DIGITS), 2.0 * growth
     return Fit(best_chain, best, iteration, False)
+
+
+def _next(
+    normal: Normal, system: System, tolerance: float, damping: float
+) -> tuple[FloatArray, float, bool]:
+    """Return the next step, how far the undamped one moves the predictions, and if they rest."""
+    step = _solve(normal.matrix, normal.gradient)
+    left = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
+    settled = left < tolerance * max(1.0, normal.rms(system))
+    if damping > 0.0 and not settled:
+        step = _solve(normal.matrix, normal.gradient, damping)
+    return step, left, settled
 
 
 def without_each(

@@ -89,11 +89,9 @@ class Maker:
             if left_out:
                 self.dropped[VIBRATING] += left_out
                 rows = rows[means.used[begin : begin + count]]
+            known = number, key, stamp_ns, rows
             yield from self._made(
-                number,
-                key,
-                stamp_ns,
-                rows,
+                *known,
                 position=means.values[k],
                 rotation=rotations[k] if oriented[k] else None,
                 joints=joints[k],
