@@ -190,7 +190,8 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             f'may be {1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
         )
     if not compensator.follower.anywhere:
-        across = np.sqrt(result.position[kept] ** 2 - result.reachable[kept] ** 2).max()
+        squares = result.position[kept] ** 2 - result.reachable[kept] ** 2
+        across = np.sqrt(max(float(squares.max()), 0.0))  # less than zero is rounding
         text += (
             '; this arm cannot move its target in every direction: of the position '
             f'{1e3 * across:.3f} mm are left, which no joint can correct'
