@@ -28,7 +28,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import EXACT, LEVER, Limits
+from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
 
 BESIDE = LEVER / 3.0
@@ -225,7 +225,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     follower, names = compensator.follower, compensator.nominal.joint_names
     tolerated = compensator.largest_orientation_error
     if tolerated is None:
-        tolerated = EXACT if follower.complete else 0.02  # as `Limits` promises
+        tolerated = EXACT if follower.complete else TURN_IN_PART
     command, correction = result.command, result.correction
     apart, most = result.position, compensator.largest_position_error
     if most is None:
