@@ -27,6 +27,9 @@ standard deviations 5 % larger, less than their own uncertainty; more may be a p
 workspace."""
 LEVER = 0.3
 """Length [m] at which a turn counts as much as a shift; a convention."""
+LEVER_IN_PART, TURN_IN_PART = 1e-3, 0.02
+"""The same of arms that cannot reach every orientation, and the error [rad] that may remain of
+theirs; conventions."""
 EXACT = 1e-6
 """Error [m or rad] that may remain of what is reached exactly: no device sees it."""
 GROWTH = 2e-5
@@ -58,13 +61,13 @@ class Limits:
     )
     largest_orientation_error: float | None = _setting(
         None,
-        'orientation error that may remain [rad]; if not given 1e-6, or 0.02 for arms that cannot '
-        'reach every orientation',
+        f'orientation error that may remain [rad]; if not given 1e-6, or {TURN_IN_PART} for arms '
+        'that cannot reach every orientation',
     )
     orientation_weight: float | None = _setting(
         None,
         'position error that counts as much as one radian, where both cannot vanish [m/rad]; if '
-        f'not given {LEVER}, or 0.001 for arms that cannot reach every orientation',
+        f'not given {LEVER}, or {LEVER_IN_PART} for arms that cannot reach every orientation',
     )
     largest_change: float = _setting(
         0.5, 'largest change of the correction between successive samples, relative to the move'

@@ -28,7 +28,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import EXACT, LEVER, Limits
+from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
 
 BESIDE = LEVER / 3.0
@@ -190,7 +190,8 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             f'may be {1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
         )
     if not compensator.follower.anywhere:
-        across = np.sqrt(result.position[kept] ** 2 - result.reachable[kept] ** 2).max()
+        squares = result.position[kept] ** 2 - result.reachable[kept] ** 2
+        across = np.sqrt(max(float(squares.max()), 0.0))  # less than zero is rounding
         text += (
             '; this arm cannot move its target in every direction: of the position '
             f'{1e3 * across:.3f} mm are left, which no joint can correct'
@@ -224,7 +225,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     follower, names = compensator.follower, compensator.nominal.joint_names
     tolerated = compensator.largest_orientation_error
     if tolerated is None:
-        tolerated = EXACT if follower.complete else 0.02  # as `Limits` promises
+        tolerated = EXACT if follower.complete else TURN_IN_PART
     command, correction = result.command, result.correction
     apart, most = result.position, compensator.largest_position_error
     if most is None:

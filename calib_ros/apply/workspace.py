@@ -22,7 +22,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import AIMS, EXACT, LEVER, Aim, Model
+from calib_ros.settings import AIMS, EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Aim, Model
 from calib_ros.shown import Shown
 
 
@@ -238,12 +238,6 @@ def place(
     return Placements(grid[:, :3], grid[:, 3], errors, joints, int(np.nanargmin(errors)), centre)
 
 
-IN_PART = 1e-3
-"""Metres that a radian counts, of arms that cannot reach every orientation; and what may remain
-of both [m, rad], as `compensate` tolerates it (`Limits`)."""
-LEFT_IN_PART = (EXACT, 0.02)
-
-
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad].
 
@@ -299,13 +293,13 @@ class _Search:
         for k in range(length):
             placement, branch = np.nonzero(reached)
             wanted = self._base @ poses[placement, k]
-            lever = LEVER if self._complete else IN_PART
+            lever = LEVER if self._complete else LEVER_IN_PART
             found = inverse.solve(self._chain, wanted, start[reached], lever=lever)
             joints[placement, branch, k] = found.joints
             start[reached] = found.joints
             near = found.converged
-            if not self._complete:
-                near = (found.position <= LEFT_IN_PART[0]) & (found.orientation <= LEFT_IN_PART[1])
+            if not self._complete:  # as `compensate` tolerates it
+                near = (found.position <= EXACT) & (found.orientation <= TURN_IN_PART)
             reached[placement, branch] = near
             self._solved += len(wanted)
             left = np.count_nonzero(reached) * (length - k - 1) + later * self._starts * length

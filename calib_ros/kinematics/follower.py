@@ -45,7 +45,7 @@ from calib_ros.kinematics.se3 import (
 )
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Told, nobody
-from calib_ros.settings import LEVER
+from calib_ros.settings import LEVER, LEVER_IN_PART
 from calib_ros.shown import Shown
 from calib_ros.values import SAME
 
@@ -128,7 +128,7 @@ class Follower:
         self.lower, self.upper = limits(leader)
         freedoms, *self._ranks = mobility(self._leader)
         self.complete, self.anywhere = freedoms == 6, self._ranks[0] == 3
-        self._weight = weight or (LEVER if self.complete else 1e-3)  # as `Limits` promises
+        self._weight = weight or (LEVER if self.complete else LEVER_IN_PART)
         self._first_weight = LEVER if self.complete else self._weight
         # where more joints than freedoms make J^T J singular, D stands above its rounding
         ridge = ROUNDING if len(unit) > freedoms else HALF_THE_DIGITS**2

@@ -89,7 +89,7 @@ def _verdict(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> Verdict:
     if not result.accepted:
-        return _refused(result, reasons)
+        return _refused(reasons)
     how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
@@ -147,7 +147,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     )
 
 
-def _refused(result: Identification, reasons: Sequence[Advice]) -> Verdict:
+def _refused(reasons: Sequence[Advice]) -> Verdict:
     """Return why nothing is corrected: an arm with no error that the device sees is no bad one."""
     tried = 'No correction was saved or sent to the robot. The figures show what was tried.'
     if reasons[0].heading == GOOD_ARM.heading:

@@ -295,11 +295,12 @@ class Collector:
         self.track.release(min(plan.done_ns, self._complete_ns) - margin)
 
     def _sort(self) -> None:
-        kept: list[tuple[str, Track | Rows]] = [(JOINTS, self.track)]
-        for kind, rows in (*kept, *((POSES, each) for each in self.waiting.values())):
+        kept: list[tuple[str, Track | Rows, bool]] = [(JOINTS, self.track, False)]
+        kept += [(POSES, rows, key.images) for key, rows in self.waiting.items()]
+        for kind, rows, numbered in kept:
             before = rows.contrary
             twice = rows.sort()
-            contrary = rows.contrary - before
+            contrary = 0 if numbered else rows.contrary - before  # no two images have one number
             for cause, count in ((TWICE, twice - contrary), (CONTRARY, contrary)):
                 if count:
                     self.dropped[f'{kind}: {cause}'] += count

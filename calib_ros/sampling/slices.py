@@ -22,7 +22,7 @@ Series: TypeAlias = tuple[Stamps, FloatArray]
 """Stamps (N,), and rows (N, w) or values (N,) at them."""
 
 
-SAME = 1e-6
+AS_FLOATS = 1e-6
 """Difference, relative as well, of values that are the same: they may have been floats."""
 
 
@@ -87,7 +87,9 @@ class Rows:
             order = np.lexsort((*self.values.T[::-1], self.stamps))
             stamps, values = self.stamps[order], self.values[order]
             again = np.diff(stamps) == 0
-            near = np.isclose(values[1:][again], values[:-1][again], SAME, SAME, equal_nan=True)
+            near = np.isclose(
+                values[1:][again], values[:-1][again], AS_FLOATS, AS_FLOATS, equal_nan=True
+            )
             self.contrary += int((~near.all(axis=1)).sum())
             self.keep(order[np.concatenate([[True], ~again])])
         return before - self.count

@@ -144,6 +144,16 @@ def test_a_planar_arm_is_corrected_in_its_plane_and_the_rest_is_told(nominal):
     assert 'more than 0.01 mm or 100 mrad' in strict.refusals[0].reason
 
 
+def test_of_errors_in_the_plane_nothing_is_left_across_it():
+    nominal = PLANAR[1]
+    errors = {f'{joint.name}.{kind}': 1e-3 for joint in nominal.joints for kind in ('a', 'theta')}
+    compensator = Compensator(nominal, nominal.with_offsets(errors))
+    q = 0.95 * nominal.random_joints(200, np.random.default_rng(0))
+    result = compensate(compensator, q[np.abs(np.sin(q[:, 1])) > 0.3])
+    assert 0.0 < result.position.max() < EXACT
+    assert ' 0.000 mm are left, which no joint can correct' in in_words(compensator, result)
+
+
 def test_a_planar_arm_stretched_out_is_singular():
     nominal = PLANAR[0]
     true = faulty(nominal, CELL, np.random.default_rng(3))

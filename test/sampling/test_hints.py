@@ -15,7 +15,7 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.entry import Part
-from calib_ros.sampling.messages import Readings, Source
+from calib_ros.sampling.messages import PICTURES, Readings, Source
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -273,6 +273,22 @@ def test_other_values_with_the_same_stamp_are_told(of, other, count):
     for words in warnings:
         said = rf'[45]\d% of the {of} were dropped .*: other values with the same stamp'
         assert re.match(said, words)
+
+
+def test_images_that_come_twice_are_no_loss():
+    """As of a camera whose images are published raw and compressed: each has its own number."""
+    motion, camera = tour(5), Source('image', PICTURES[0], board='board.yaml')
+    times, seen = np.arange(0.0, 9.5, 0.01), np.repeat(np.arange(0.003, 9.2, 0.05), 2)
+    named = Readings(stamps(times), ('', *UR5E.joint_names), motion(times))
+    images = Readings(stamps(seen), ('camera',), 1.0 + np.arange(float(len(seen)))[:, np.newaxis])
+    places = np.argsort(np.argsort(np.concatenate([times, seen]), kind='stable'))
+    first, second = np.split(places, [len(times)])
+    made = CalibrationSession(UR5E)
+    made.take([Part(first, None, named), Part(second, camera, images)])
+    made.finish()
+    dropped = made.account().dropped
+    assert dropped['measurements: same stamp twice'] == len(seen) // 2
+    assert not any('other values' in cause for cause in dropped)
 
 
 @pytest.mark.parametrize(('pause', 'count'), [(2.0, 0), (4.0, 1)])
