@@ -47,6 +47,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
+from calib_ros.values import SAME
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None: 'no verdict'}
@@ -189,6 +190,8 @@ def verify(
     told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
+    if not moments.any():  # as simulated without noise
+        moments += SAME**2 * np.eye(3)
     in_base, in_tool = 6 // 3, 3 // 3  # freedoms; the turn of a tool does not move the target
     lost = new_base * in_base + new_tool * in_tool
     rms = _rms(moments, lost)

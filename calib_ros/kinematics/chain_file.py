@@ -167,13 +167,14 @@ def calibration_record(text: str) -> dict[str, Any]:
 def table_hash(chain: Chain) -> str:
     """Return the SHA-256 of the table and effects of a chain, by which its files are known.
 
-    In whatever order the effects are: programs that rewrite a file may sort its keys.
+    In whatever order the effects are, and whatever the sign of a zero: programs that rewrite a
+    file may change both.
     """
     rows = [
-        [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
+        [joint.name, joint.type, joint.sign, *(getattr(joint, kind) + 0.0 for kind in DH_KINDS)]
         for joint in chain.joints
     ]
-    effects = [[name, float(value)] for name, value in sorted(chain.effects)]
+    effects = [[name, value + 0.0] for name, value in sorted(chain.effects)]
     content = [str(chain.convention), rows, effects]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 

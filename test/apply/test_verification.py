@@ -233,6 +233,13 @@ def test_repeats_do_not_count_as_more_configurations(arm):
     assert second.upper == pytest.approx(first.upper, rel=1e-9)
 
 
+def test_measurements_without_any_error_pass(arm):
+    exact = with_errors(arm, np.zeros((6, 3)))
+    found = verify(arm, [exact], 1e-4)
+    assert found.verdict == 'PASS'
+    assert found.rms < 1e-8
+
+
 def test_orientations_that_are_far_off_are_told(arm):
     seen = with_errors(arm, np.random.default_rng(0).normal(scale=1e-5, size=(6, 3)))
     turned = replace(seen, rotations=np.swapaxes(seen.rotations, 1, 2))
