@@ -169,13 +169,12 @@ def verify(
         Of the verdict.
     new_base, new_tool : bool
         The measuring device stands elsewhere than for the calibration; another target is on the
-        flange, or the same was mounted anew. Their frames are fitted, and each takes up
-        the errors of as many configurations, of three freedoms each, as it has freedoms.
-    told : Told
-        Of the share that is done.
+        flange, or the same was mounted anew. Their frames are fitted, and each takes up the
+        errors of as many configurations, of three freedoms each, as it has freedoms.
     commanded : (M, n), optional
         Joint values [rad or m] of the program before its correction: the nominal arm means there
         what is wanted. Each measurement belongs to one of them (`commanded.py`).
+    told : Told
 
     Raises
     ------
@@ -190,10 +189,9 @@ def verify(
     told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
-    if not moments.any():  # as simulated without noise
-        moments += SAME**2 * np.eye(3)
-    in_base, in_tool = 6 // 3, 3 // 3  # freedoms; the turn of a tool does not move the target
-    lost = new_base * in_base + new_tool * in_tool
+    moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # as simulated without noise
+    in_base = 6 // 3  # freedoms; the turn of a tool does not move the target
+    lost = new_base * in_base + new_tool
     rms = _rms(moments, lost)
     most = max(len(moments), DECIDING)
     numbers = np.unique(np.geomspace(len(moments), most, 200).round().astype(int))
