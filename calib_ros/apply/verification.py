@@ -175,12 +175,13 @@ def verify(
         Joint values [rad or m] of the program before its correction: the nominal arm means there
         what is wanted. Each measurement belongs to one of them (`commanded.py`).
     told : Told
+        Of the share that is done.
 
     Raises
     ------
     InputError
-        For too few poses, distances, a device or target that the calibration does not
-        know, or measurements far from all that was commanded.
+        For too few poses, distances, a device or target that the calibration does not know, or
+        measurements far from all that was commanded.
 
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
@@ -191,10 +192,9 @@ def verify(
     moments = moments_of(comparison.after.position, group)
     moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # as simulated without noise
     in_base = 6 // 3  # freedoms; the turn of a tool does not move the target
-    lost = new_base * in_base + new_tool
-    rms = _rms(moments, lost)
-    most = max(len(moments), DECIDING)
-    numbers = np.unique(np.geomspace(len(moments), most, 200).round().astype(int))
+    rms = _rms(moments, lost := new_base * in_base + new_tool)
+    ends = len(moments), max(len(moments), DECIDING)
+    numbers = np.unique(np.geomspace(*ends, 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     holds = arm.holds(rms)
