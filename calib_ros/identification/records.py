@@ -183,9 +183,9 @@ class Record:
             return
         raise ConfigError(
             f'{self.where} does not hold the table and effects that were identified '
-            '(calibration.table_sha256): it was edited or damaged, or exported without its '
-            'effects; give the file that calib_ros identify wrote. If the change is meant, write '
-            'a record of your own: calibration: {source: ...}'
+            '(calibration.table_sha256): it was edited or damaged, rewritten with effects in '
+            'another order, or exported without them; give the file that calib_ros identify '
+            'wrote. If the change is meant, write a record of your own: calibration: {source: ...}'
         )
 
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:

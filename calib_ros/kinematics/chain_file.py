@@ -167,15 +167,13 @@ def calibration_record(text: str) -> dict[str, Any]:
 def table_hash(chain: Chain) -> str:
     """Return the SHA-256 of the table and effects of a chain, by which its files are known.
 
-    In whatever order the effects are, and whatever the sign of a zero: programs that rewrite a
-    file may change both.
+    Files of before hold it: what goes into it never changes.
     """
     rows = [
-        [joint.name, joint.type, joint.sign, *(getattr(joint, kind) + 0.0 for kind in DH_KINDS)]
+        [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
         for joint in chain.joints
     ]
-    effects = [[name, value + 0.0] for name, value in sorted(chain.effects)]
-    content = [str(chain.convention), rows, effects]
+    content = [str(chain.convention), rows, [[name, float(x)] for name, x in chain.effects]]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
 

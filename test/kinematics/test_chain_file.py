@@ -16,6 +16,7 @@ from calib_ros.kinematics.chain_file import (
     load_chain,
     parse_chain,
     shipped_robots,
+    table_hash,
 )
 
 GOLDEN = yaml.safe_load(Path(__file__).with_name('golden_fk.yaml').read_text())
@@ -341,3 +342,11 @@ def test_a_path_to_nothing_is_not_taken_for_a_robot(tmp_path):
 def test_a_key_that_comes_twice_is_refused():
     with pytest.raises(ConfigError, match='key "alpha" comes twice'):
         parse_chain(BASE.replace('alpha:', 'alpha: 0.0, alpha:', 1))
+
+
+def test_the_hash_of_a_table_stays_what_older_files_hold():
+    """Else calibrations of before would count as edited, and exports match no report."""
+    joints = (Joint('one', a=0.1, d=0.3, alpha=-0.5), Joint('two', a=0.4, theta=0.2, sign=-1))
+    chain = Chain('arm', 'standard', joints)
+    chain = chain.with_effect_values({'two.sin_2': 1e-4, 'one.ratio': -2e-4})
+    assert table_hash(chain).startswith('a94e4899f2eac75b')
