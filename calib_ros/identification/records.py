@@ -176,16 +176,26 @@ class Record:
         return replace(chain, joints=joints, effects=()).with_effect_values(values)
 
     def check_table(self, chain: Chain) -> None:
-        """Refuse a table that is not the one that was identified, if that is recorded."""
+        """Refuse a table that is not the one that was identified, if that is recorded.
+
+        Programs that rewrite a file may sort its effects; the region lists them in their order.
+        """
         known = self.content.get('table_sha256')
         converted = self._part('nominal').get('convention', chain.convention) != chain.convention
-        if known is None or converted or known == table_hash(chain):
+        names = (self.content.get('region') or {}).get('names', ())
+        order = {name: k for k, name in enumerate(names)}
+        effects = sorted(chain.effects, key=lambda each: order.get(each[0], -1))
+        if (
+            known is None
+            or converted
+            or known == table_hash(replace(chain, effects=tuple(effects)))
+        ):
             return
         raise ConfigError(
             f'{self.where} does not hold the table and effects that were identified '
-            '(calibration.table_sha256): it was edited or damaged, rewritten with effects in '
-            'another order, or exported without them; give the file that calib_ros identify '
-            'wrote. If the change is meant, write a record of your own: calibration: {source: ...}'
+            '(calibration.table_sha256): it was edited or damaged, or exported without its '
+            'effects; give the file that calib_ros identify wrote. If the change is meant, write '
+            'a record of your own: calibration: {source: ...}'
         )
 
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:

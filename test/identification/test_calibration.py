@@ -83,7 +83,7 @@ def test_a_damaged_record_is_refused(document, key, change):
     old = document['calibration'][key]
     document['calibration'][key] = old | change if isinstance(change, dict) else change
     with pytest.raises(ConfigError, match=rf'c\.yaml: (calibration\.{key}|{key})'):
-        parse_calibration(yaml.safe_dump(document), 'c.yaml')
+        parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml')
 
 
 def test_of_a_file_of_before_what_it_tells_is_known(found):
@@ -93,7 +93,7 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
     for key in ('covariance', 'noise_in_sigma', 'frames'):
         del record[key]
     record['nominal'] = {key: record['nominal'][key] for key in ('convention', 'joints')}
-    read = parse_calibration(yaml.safe_dump(document), 'c.yaml')
+    read = parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml')
     q = UR.random_joints(300, np.random.default_rng(1))
     assert (read.names, read.covariance, read.noise, read.owners) == ((), None, None, {})
     assert np.isnan(read.sigma_turned(q)).all()
@@ -133,6 +133,12 @@ def test_a_table_that_was_edited_is_not_the_calibration(document, change):
     change(document)
     with pytest.raises(ConfigError, match=r'c\.yaml does not hold the table and effects that'):
         parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
+
+
+def test_a_file_whose_keys_were_sorted_is_the_same_calibration(found):
+    text = yaml.safe_dump(yaml.safe_load(found.dump()), sort_keys=True)
+    read = parse_calibration(text, 'c.yaml', UR)
+    assert [*read.chain.effects] == sorted(found.chain.effects) != [*found.chain.effects]
 
 
 def test_a_nominal_chain_with_other_effects_is_another(document):
