@@ -192,9 +192,9 @@ def verify(
     moments = moments_of(comparison.after.position, group)
     moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # as simulated without noise
     in_base = 6 // 3  # freedoms; the turn of a tool does not move the target
-    rms = _rms(moments, lost := new_base * in_base + new_tool)
-    ends = len(moments), max(len(moments), DECIDING)
-    numbers = np.unique(np.geomspace(*ends, 200).round().astype(int))
+    lost = new_base * in_base + new_tool
+    rms, count = _rms(moments, lost), len(moments)
+    numbers = np.unique(np.geomspace(count, max(count, DECIDING), 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
     holds = arm.holds(rms)

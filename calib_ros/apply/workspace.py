@@ -156,7 +156,7 @@ def rms_map(
     return first_edges, second_edges, rms
 
 
-NEIGHBOURS = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
+AROUND = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
 """To the neighbours on a grid."""
 
 
@@ -217,7 +217,7 @@ def place(
     axes = [np.linspace(low, high, cells) for low, high in corners.T]
     angles = 2.0 * np.pi * np.arange(turns) / turns
     grid = np.stack(np.meshgrid(*axes, angles, indexing='ij'), axis=-1).reshape(-1, 4)
-    errors, joints = search.errors(grid, refinements * len(NEIGHBOURS))
+    errors, joints = search.errors(grid, refinements * len(AROUND))
     reached = ~np.isnan(errors)
     if not reached.any():
         raise InputError(
@@ -230,9 +230,9 @@ def place(
     for left in reversed(range(refinements)):
         step /= 2.0
         best = grid[np.nanargmin(errors)]
-        near = np.tile(best, (len(NEIGHBOURS), 1))
-        near[:, :3] = np.clip(best[:3] + step * NEIGHBOURS, corners[0], corners[1])
-        more = search.errors(near, left * len(NEIGHBOURS))
+        near = np.tile(best, (len(AROUND), 1))
+        near[:, :3] = np.clip(best[:3] + step * AROUND, corners[0], corners[1])
+        more = search.errors(near, left * len(AROUND))
         both = zip((grid, errors, joints), (near, *more), strict=True)
         grid, errors, joints = map(np.concatenate, both)
     return Placements(grid[:, :3], grid[:, 3], errors, joints, int(np.nanargmin(errors)), centre)

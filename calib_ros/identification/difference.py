@@ -113,8 +113,7 @@ class Difference(Shown):
 
 def _rows_in_words(chain: Chain) -> str:
     """Return what calibrations of one robot have in common."""
-    kinds = {1: '', -1: ', turned'}
-    rows = (f'{joint.name} ({joint.type}{kinds[joint.sign]})' for joint in chain.joints)
+    rows = (f'{j.name} ({j.type}{", turned" * (j.sign < 0)})' for j in chain.joints)
     return f'{", ".join(rows)} ({chain.convention})'
 
 

@@ -203,8 +203,8 @@ def posterior_of(
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
-    arms_own = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
-    return Posterior(chain, every, *arms_own, doubted, rival)
+    told_so = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
+    return Posterior(chain, every, *told_so, doubted, rival)
 
 
 def _rival(

@@ -30,11 +30,7 @@ from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import find_step
-from calib_ros.identification.validation import (
-    ParameterRow,
-    compare,
-    validate,
-)
+from calib_ros.identification.validation import ParameterRow, compare, validate
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Told, nobody
 from calib_ros.settings import EXCEPTION

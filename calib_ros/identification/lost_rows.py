@@ -23,7 +23,7 @@ from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXCEPTION
 
-LOST = (0, 1, -1, 2, -2)
+SLIPS = (0, 1, -1, 2, -2)
 """Rows that may be missing; more at once are no slip (benchmarks/mistakes.py loses one)."""
 FEWEST_ROWS = 3 * IN_A_FRAME
 """Rows of a table: base and tool alone explain nearly all of fewer in a third of it."""
@@ -72,8 +72,8 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
     best: Loss | None = None
     good = EXPLAINED_ROWS * count
     for chain in _frames(seen, framed):
-        tables = {s: _shifted(chain, seen, s, errors) for s in LOST}
-        for before, after in product(LOST, LOST):
+        tables = {s: _shifted(chain, seen, s, errors) for s in SLIPS}
+        for before, after in product(SLIPS, SLIPS):
             if before == after or (before and after):
                 continue
             row = _where(tables[before] <= largest, tables[after] <= largest)
@@ -88,7 +88,7 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
 def _frames(seen: Observations, framed: Framed) -> Iterator[Chain]:
     """Yield the chain in the frames by the first and the last third, for each shift."""
     third = len(seen) // 3
-    for part, shift in product((slice(third), slice(-third, None)), LOST):
+    for part, shift in product((slice(third), slice(-third, None)), SLIPS):
         rows = np.arange(len(seen))[part]
         rows = rows[(rows + shift >= 0) & (rows + shift < len(seen))]
         chain = framed(_paired(seen, rows, shift))
