@@ -85,7 +85,8 @@ def draw_candidates(
         if drawn > tries * count:
             raise InputError(
                 f'the target can be measured at {len(found)} of {drawn} random poses only, '
-                f'{count} candidates are wanted: widen box and cone, or give a file of candidates'
+                f'{count} candidates are wanted: widen what the device sees (--box, --cone), or '
+                'give a file of poses (--candidates)'
             )
         joints = design.chain.random_joints(10 * count, rng)
         drawn += len(joints)

@@ -95,7 +95,8 @@ class _Pick:
         if not free.size:
             raise InputError(
                 f'only {len(self.chosen)} of {len(self._rows)} candidates are {self._apart:g} '
-                'apart from each other: give more candidates, or plan fewer poses'
+                'apart from each other (--apart): give more candidates (--draw, --candidates), or '
+                'plan fewer poses'
             )
         most = worth.at_most(self.information, self._traces)[free]
         few = min(int(np.sqrt(free.size)), free.size - 1)
@@ -319,7 +320,8 @@ def fewest(
     if best > wanted:
         raise InputError(
             f'all {len(candidates)} candidates together predict {1e3 * best:.4f} mm, '
-            f'{1e3 * wanted:g} mm are wanted: give more candidates or a better measurement'
+            f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
+            'more accurate device (--sigma-position), or want less'
         )
     count = len(excited.names)  # poses determine several parameters each
     while True:

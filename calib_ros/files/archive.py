@@ -217,7 +217,13 @@ class Archive:
         if not found:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
         self._path = found[-1]
-        samples, warnings = read_journal(self._path, self._joints)
+        try:
+            samples, warnings = read_journal(self._path, self._joints)
+        except InputError as err:
+            raise InputError(
+                f'{err}. It stays as it is: mend that line, move the file away to go on with the '
+                'one before, or start without resume to begin another'
+            ) from err
         self._journal = Journal(self._path, self._joints)
         return samples, warnings
 

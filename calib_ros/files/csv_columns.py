@@ -238,9 +238,9 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
     for name, mark in (('semicolon', ';'), ('tab', '\t')):
         if any(mark in cell for cell in header):
             raise ColumnsError(
-                f'the cells of {path} are separated by {name}s: give --separator {name} (and, '
-                'where they differ, --decimal comma, --columns, --length, --angle), or convert it '
-                'with calib_ros import'
+                f'the cells of {path} are separated by {name}s: save it with commas between cells '
+                f'and points in numbers. Measurements are read as they are with --separator {name}'
+                ' (and, where they differ, --decimal comma, --columns, --length, --angle)'
             )
 
 

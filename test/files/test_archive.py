@@ -108,6 +108,18 @@ def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
     assert len(list(tmp_path.glob('*.csv'))) == len(list(tmp_path.glob('*.settings.yaml'))) == 2
 
 
+def test_a_damaged_journal_stays_and_how_to_go_on_is_told(tmp_path):
+    archive = open_archive(tmp_path)
+    archive.add(sample(1))
+    archive.close()
+    (journal,) = tmp_path.glob('*.csv')
+    damaged = journal.read_text() + 'no number' + journal.read_text().splitlines()[1] + '\n'
+    journal.write_text(damaged)
+    with pytest.raises(InputError, match=r'line 3.*start without resume'):
+        open_archive(tmp_path).resume()
+    assert journal.read_text() == damaged
+
+
 def test_nothing_to_resume(tmp_path):
     samples, (warning,) = open_archive(tmp_path / 'none').resume()
     assert samples == ()
