@@ -233,7 +233,9 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
     remaining = (apart > most) | (result.orientation > tolerated)
-    wrong = beyond.any(axis=1) | too_large.any(axis=1) | remaining | ~result.converged
+    # a redundant arm may go to and fro among its many ways, and be right all the time
+    astray = ~result.converged & ((result.position > EXACT) | (result.orientation > EXACT))
+    wrong = beyond.any(axis=1) | too_large.any(axis=1) | remaining | astray
     largest = f'{compensator.largest_turn:g} rad or {compensator.largest_shift:g} m'
     found = []
     for k in np.flatnonzero(wrong).tolist():
@@ -247,7 +249,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
         elif result.limited[k].any():
             held = [name for name, at in zip(names, result.limited[k], strict=True) if at]
             reason = f'{", ".join(held)} would go beyond a limit; held there, {left} remain'
-        elif result.damped[k]:
+        elif result.damped[k] and remaining[k]:
             reason = (
                 f'near a singularity, or the calibration of another robot: corrections within '
                 f'{largest} leave {left}'

@@ -235,6 +235,19 @@ def test_what_is_reached_near_a_singularity_is_never_worse_than_nothing(name):
     assert result.converged[near].mean() > 0.9
 
 
+@pytest.mark.parametrize('name', ['franka_panda', 'ur10e_on_linear_axis'])
+def test_what_a_redundant_arm_reaches_within_its_limits_is_not_refused(name):
+    chain, rng = ROBOTS[name], np.random.default_rng(0)
+    compensator = Compensator(chain, faulty(chain, CELL, rng))
+    found = compensate(compensator, chain.random_joints(2000, rng))
+    reached = (found.position < EXACT) & (found.orientation < EXACT)
+    reached &= (np.abs(found.correction) <= compensator.largest).all(axis=1)
+    assert not reached[[each.sample for each in found.refusals]].any()
+    too_far = [each.reason for each in found.refusals if 'would need' in each.reason]
+    assert all('more than 0.1 rad' in each for each in too_far)
+    assert not any('leave 0.0000 mm and 0.0000 mrad' in each.reason for each in found.refusals)
+
+
 def test_a_sample_that_does_not_converge_is_refused(monkeypatch):
     monkeypatch.setattr(follower, 'ROUNDS', 1)
     tolerant = Compensator(UR, UR_TRUE, largest_position_error=1.0, largest_orientation_error=1.0)
