@@ -254,16 +254,17 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
     """Yield that the angles of one joint have another unit than those of the others."""
     turning = [k for k, joint in enumerate(chain.joints) if joint.type == 'revolute']
     for k in turning if len(turning) > 1 else ():
+        name, column = chain.joint_names[k], f'q{k + 1}'
         for one, others, size in (
             ('degrees', 'radians', np.radians(1.0)),
             ('radians', 'degrees', np.degrees(1.0)),
         ):
-            what = f'{chain.joint_names[k]} is in {one}, the other joints in {others}'
-            column = f'q{k + 1}'
+            what = f'{name} is in {one}, the other joints in {others}'
             factor = np.ones(len(chain.joints))
             factor[k] = size
             changes = (_joints(np.diag(factor)),)
-            yield Suspect(what, f'--columns {column}={column}*{size:.9g}', changes, 2)
+            remedy = f'--columns {column}={column}*{size:.9g}'
+            yield Suspect(what, remedy, changes, 2, part=name)
 
 
 def dead(chain: Chain, sets: Sets) -> Suspect | None:

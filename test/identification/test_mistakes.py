@@ -338,6 +338,20 @@ def test_one_joint_in_another_unit_than_the_others_is_named(joint, oriented):
 
 
 @pytest.mark.parametrize('oriented', [True, False])
+def test_two_joints_in_another_unit_than_the_others_are_named(oriented):
+    chain, rng = load_chain('ur10e'), np.random.default_rng(5)
+    seen = measure(
+        faulty(chain, Cell(), rng), chain.random_joints(40, rng), rng, 1e-4, 3e-4, oriented
+    )
+    mixed = seen.joints.copy()
+    mixed[:, [1, 4]] *= np.degrees(1.0)
+    said = str(explained(Problem(chain, replace(seen, joints=mixed))))
+    assert said.startswith('several mistakes at once')
+    for k in (1, 4):
+        assert f'{chain.joint_names[k]} is in degrees, the other joints in radians' in said
+
+
+@pytest.mark.parametrize('oriented', [True, False])
 @pytest.mark.parametrize(('columns', 'words'), [([1], 'y'), ([0, 2], 'x, z')])
 def test_columns_that_never_change_are_named(columns, words, oriented):
     chain, rng = load_chain('ur10e'), np.random.default_rng(5)
