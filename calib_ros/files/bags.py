@@ -56,7 +56,7 @@ class Replayed:
         if self.recorded is None and largest_loss < 1.0:
             text = f'how much of the bag is lost is not known, {ALLOW} 1'
             return (Reason(Rule.UNKNOWN_LOSS, text),)
-        share = _lost(self.recorded, self.read)
+        share = max(0.0, 1.0 - self.read / self.recorded) if self.recorded else 0.0
         shares = {'of the messages could not be read': (Rule.UNREADABLE, share)}
         for name, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
             share, _ = lost(name, count, account.dropped)
@@ -66,10 +66,6 @@ class Replayed:
             for cause, (rule, share) in shares.items()
             if share > largest_loss
         )
-
-
-def _lost(expected: int | None, found: int) -> float:
-    return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
 def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -> Replayed:
