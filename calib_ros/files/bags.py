@@ -31,14 +31,10 @@ ALLOW = 'take the rest all the same with --largest-loss'
 
 @dataclass(frozen=True)
 class Replayed:
-    """What was read of a bag, and warnings about the rest.
+    """What was read of a bag, and warnings about the rest."""
 
-    `recorded` is how many messages it should hold, None where that is not known, and `read` how
-    many of these could be read; a message that cannot be decoded was not read.
-    """
-
-    recorded: int | None
-    read: int
+    recorded: int | None  # messages that it should hold; None where that is not known
+    read: int  # of these; a message that cannot be decoded was not read
     warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:

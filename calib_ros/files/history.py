@@ -47,17 +47,14 @@ FOLDER, ENDING = 'robot=', '.parquet'
 
 @dataclass(frozen=True)
 class Filing:
-    """What is known of a result besides the result: whose it is, when and from what.
-
-    `inputs` and `settings` are hashes; `fingerprint` tells cheaply that the `source` is unchanged.
-    """
+    """What is known of a result besides the result: whose it is, when and from what."""
 
     serial: str
     time: datetime
-    inputs: str
-    settings: str
+    inputs: str  # a hash
+    settings: str  # a hash
     source: str = ''
-    fingerprint: str = ''
+    fingerprint: str = ''  # tells cheaply that the source is unchanged
 
     def __post_init__(self) -> None:
         """Refuse a serial number that cannot name a folder."""

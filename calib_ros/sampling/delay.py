@@ -44,14 +44,11 @@ MOST_TIME = 100.0 * LEAST_MOTION
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later than the joints' the stamps of measurements are, and how sure it is.
-
-    Where the motion repeats itself, `rivals` [s] explain it nearly as well.
-    """
+    """How much later than the joints' the stamps of measurements are, and how sure it is."""
 
     seconds: float
     correlation: float
-    rivals: tuple[float, ...] = ()
+    rivals: tuple[float, ...] = ()  # [s] explain a motion that repeats itself nearly as well
 
 
 def find_delay(

@@ -71,19 +71,17 @@ A convention."""
 class Estimate:
     """What the samples so far tell.
 
-    `sigma` is the RMS standard deviation [m] of positions predicted over the joint range, by the
-    noise that the residuals show, which is `noise` [sigma given]. `excess` is how many times
-    larger the residuals of positions are than what measurements scatter by: the sigma given, or
-    the spread at a stop where that is larger. It is None while too few samples show it; priors,
-    and nothing measured, make up much of the sigma then.
+    `excess` is how many times larger the residuals of positions are than what measurements scatter
+    by: the sigma given, or the spread at a stop where that is larger. It is None while too few
+    samples show it; priors, and nothing measured, make up much of the sigma then.
     """
 
     chain: Chain
     names: tuple[str, ...]
-    covariance: FloatArray
+    covariance: FloatArray  # (P, P)
     samples: int
-    sigma: float
-    noise: float
+    sigma: float  # RMS standard deviation [m] of positions predicted over the joint range
+    noise: float  # that the residuals show, and sigma goes by [sigma given]
     excess: float | None
 
     def more_for(self, wanted: float) -> int:
