@@ -30,7 +30,7 @@ class Advice:
     heading: str
     meaning: str
     steps: tuple[str, ...]  # what to do; none where it follows from another refusal
-    refusal: str = ''  # itself
+    refusal: str = ''  # in the words of its rule
     again: str = AGAIN  # on what to identify next
 
 
