@@ -18,7 +18,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Told, nobody
 from calib_ros.sampling.hints import LOST, Account, lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
-from calib_ros.sampling.messages import BODIES, PICTURES
+from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.topics import Reading, check_joints, choose
@@ -106,8 +106,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -
     if problem is not None and count == 0:
         found = stored.salvage(folder)
         if found is not None:
-            names, messages_on = session.joint_names, _decodable(found.on)
-            check_joints(streams, session.settings, names, messages_on, deserialise)
+            _check_joints(session, streams, found.on, deserialise)
             count, _ = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     warnings = session.warnings
@@ -183,16 +182,27 @@ def _chosen(
 ) -> tuple[dict[str, Stream], Deserialise]:
     """Return what is read of the topics available, and what makes messages of it."""
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
-    deserialise, messages_on = _deserialiser(defined), _decodable(messages_on)
-    streams = choose(available, session.settings, messages_on, deserialise)
+    deserialise = _deserialiser(defined)
+    streams = choose(available, session.settings, _decodable(messages_on), deserialise)
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
             raise InputError(
                 f'the bag does not define {stream.type} of {topic}: record it where that package '
                 'is installed'
             )
-    check_joints(streams, session.settings, session.joint_names, messages_on, deserialise)
+    _check_joints(session, streams, messages_on, deserialise)
     return streams, deserialise
+
+
+def _check_joints(
+    session: CalibrationSession,
+    streams: Mapping[str, Stream],
+    messages_on: Reading,
+    deserialise: Deserialise,
+) -> None:
+    joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
+    if len(joints) > 1 and not session.settings.joint_topics:
+        check_joints(_decodable(messages_on)(joints), session.joint_names, deserialise)
 
 
 def _check_links(streams: Mapping[str, Stream]) -> None:

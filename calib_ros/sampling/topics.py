@@ -115,22 +115,14 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 
 
 def check_joints(
-    streams: Mapping[str, Stream],
-    settings: Settings,
-    joint_names: Sequence[str],
-    messages_on: Reading,
-    deserialise: Deserialise,
+    messages: Iterator[tuple[Stream, bytes]], joint_names: Sequence[str], deserialise: Deserialise
 ) -> None:
     """Refuse joint states of a recording of which several topics name the same joints.
 
-    Those of topics that are named may. The InputError has the topics, and how far their values
-    are apart.
+    The InputError has the topics, and how far their values are apart.
     """
-    joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
-    if len(joints) < 2 or settings.joint_topics:
-        return
     heard: dict[str, dict[str, Series]] = defaultdict(dict)
-    for (topic, name), parts in _joint_values(messages_on(joints), deserialise).items():
+    for (topic, name), parts in _joint_values(messages, deserialise).items():
         if name in joint_names:
             stamps = np.concatenate([each for each, _ in parts])
             values = np.concatenate([each for _, each in parts])
