@@ -37,6 +37,7 @@ import numpy as np
 from scipy import optimize, special
 
 from calib_ros.errors import InputError
+from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0
@@ -69,6 +70,13 @@ def rms_interval(errors: FloatArray, group: Index, confidence: float) -> tuple[f
     freedom = np.array([freedom_of(moments) * len(moments)])
     lower, upper = rms_limits(rms, freedom, confidence)
     return float(lower[0]), float(upper[0])
+
+
+def interval_of(which: Comparison, when: int, confidence: float) -> tuple[float, float]:
+    """Return the limits [m] of the RMS before (0) or after (1), without outliers."""
+    residuals = (which.before, which.after)[when]
+    mask = which.judged & ~np.isnan(residuals.position).any(axis=1)
+    return rms_interval(residuals.position[mask], residuals.configurations[mask], confidence)
 
 
 def freedom_of(moments: FloatArray) -> float:

@@ -48,11 +48,9 @@ RESULT_FILES = (
     *('calibration.yaml', 'result.json', 'report.html', 'report.md', 'residuals.csv'),
     *('before_after.png', 'settings.yaml'),
 )
-DETECTIONS = ('detections', 'board', 'places', 'intrinsics', 'lens')
-"""Options for what a camera saw."""
 OF_TABLES = (
-    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints'),
-    *(*common.LAYOUT, *DETECTIONS),
+    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *common.LAYOUT),
+    *('detections', 'board', 'places', 'intrinsics', 'lens'),
 )
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 

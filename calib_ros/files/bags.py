@@ -31,14 +31,10 @@ ALLOW = 'take the rest all the same with --largest-loss'
 
 @dataclass(frozen=True)
 class Replayed:
-    """What was read of a bag, and warnings about the rest.
+    """What was read of a bag, and warnings about the rest."""
 
-    `recorded` is how many messages it should hold, None where that is not known, and `read` how
-    many of these could be read; a message that cannot be decoded was not read.
-    """
-
-    recorded: int | None
-    read: int
+    recorded: int | None  # messages that it should hold; None where that is not known
+    read: int  # of these; a message that cannot be decoded was not read
     warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
@@ -56,7 +52,7 @@ class Replayed:
         if self.recorded is None and largest_loss < 1.0:
             text = f'how much of the bag is lost is not known, {ALLOW} 1'
             return (Reason(Rule.UNKNOWN_LOSS, text),)
-        share = _lost(self.recorded, self.read)
+        share = max(0.0, 1.0 - self.read / self.recorded) if self.recorded else 0.0
         shares = {'of the messages could not be read': (Rule.UNREADABLE, share)}
         for name, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
             share, _ = lost(name, count, account.dropped)
@@ -66,10 +62,6 @@ class Replayed:
             for cause, (rule, share) in shares.items()
             if share > largest_loss
         )
-
-
-def _lost(expected: int | None, found: int) -> float:
-    return max(0.0, 1.0 - found / expected) if expected else 0.0
 
 
 def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -> Replayed:

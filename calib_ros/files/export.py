@@ -56,15 +56,12 @@ class ExportError(CalibrationError):
 
 @dataclass(frozen=True)
 class Export:
-    """A file, and the largest position error [m] of the arm that it describes.
-
-    `beyond` says in words what its rows cannot hold of the way from base to flange.
-    """
+    """A file of the arm."""
 
     name: str
     content: str
-    error: float
-    beyond: str = ''
+    error: float  # the largest of positions, of the arm that it describes [m]
+    beyond: str = ''  # what its rows cannot hold of the way from base to flange, in words
 
 
 def exports(

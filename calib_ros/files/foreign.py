@@ -42,7 +42,7 @@ UNITS |= {'inches': 'in'} | {unit: unit for unit in LENGTHS}
 
 @dataclass(frozen=True, eq=False)
 class Foreign:
-    """How to read a table of others, and the log of joint values beside it, if that is another.
+    """How to read a table of others.
 
     `chain` gives the number of joints, their names, and which are prismatic. Without it, it is as
     many as there are columns for them, all revolute.
@@ -50,7 +50,7 @@ class Foreign:
 
     layout: Layout
     chain: Chain | None = None
-    log: Path | None = None
+    log: Path | None = None  # of the joint values, if that is another table
     log_layout: Layout = field(default_factory=Layout)
 
     def convert(self, path: Path) -> tuple[MadeColumns, tuple[str, ...]]:

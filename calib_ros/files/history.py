@@ -26,7 +26,7 @@ from urllib.parse import quote, unquote
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.confidence import rms_interval
+from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, InputError
@@ -47,17 +47,14 @@ FOLDER, ENDING = 'robot=', '.parquet'
 
 @dataclass(frozen=True)
 class Filing:
-    """What is known of a result besides the result: whose it is, when and from what.
-
-    `inputs` and `settings` are hashes; `fingerprint` tells cheaply that the `source` is unchanged.
-    """
+    """What is known of a result besides the result: whose it is, when and from what."""
 
     serial: str
     time: datetime
-    inputs: str
-    settings: str
+    inputs: str  # a hash
+    settings: str  # a hash
     source: str = ''
-    fingerprint: str = ''
+    fingerprint: str = ''  # tells cheaply that the source is unchanged
 
     def __post_init__(self) -> None:
         """Refuse a serial number that cannot name a folder."""
@@ -166,8 +163,6 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
     offsets = {str(each.name): each.offset for each in result.parameters}
     names = tuple(map(str, result.names))
     which = result.validation or result.fitted
-    errors = which.after
-    shown = which.judged & ~np.isnan(errors.position).any(axis=1)
     freedom = result.uncertainty.overall
     return _row(
         about,
@@ -175,7 +170,7 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
         result.chain,
         'accepted' if result.accepted else 'refused',
         which.figures,
-        rms_interval(errors.position[shown], errors.configurations[shown], INTERVAL),
+        interval_of(which, 1, INTERVAL),
         reasons=tuple(map(str, result.refusals)),
         remarks=tuple(map(str, (*warnings, *result.remarks))),
         freedom=freedom if np.isfinite(freedom) else None,

@@ -63,15 +63,11 @@ def joint_columns(joints: int, letter: str = 'q') -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Expression:
-    """A sum, difference, product or quotient of columns and numbers.
-
-    `terms` are columns by their names (`#7` is the seventh) and numbers, in the order in which the
-    `tree` has them as `_0`, `_1` and so on.
-    """
+    """A sum, difference, product or quotient of columns and numbers."""
 
     text: str
-    terms: tuple[str | float, ...]
-    tree: ast.expr
+    terms: tuple[str | float, ...]  # columns by their names (`#7` is the seventh) and numbers
+    tree: ast.expr  # that has the terms in their order as `_0`, `_1` and so on
 
     @classmethod
     def parse(cls, text: str) -> Expression:

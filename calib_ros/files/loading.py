@@ -29,23 +29,17 @@ from calib_ros.settings import Settings
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A problem, and what became of the input.
-
-    `samples` are the counts of it, `read` says them in words; `lines` tells that stamps are the
-    lines of a table, `images` the names of images by theirs; `refusals` why a result must not be
-    accepted whatever it is, `instead` that these stand instead of its own; `owners` whose frame
-    each is, of a bag.
-    """
+    """A problem, and what became of the input."""
 
     problem: Problem
-    samples: dict[str, Any]
+    samples: dict[str, Any]  # counts of the input
     warnings: tuple[str, ...] = ()
-    read: str = ''
-    lines: bool = False
-    images: Mapping[int, str] = field(default_factory=dict)
-    refusals: tuple[Reason, ...] = ()
-    instead: bool = False
-    owners: Mapping[str, Owner] = field(default_factory=dict)
+    read: str = ''  # these counts in words
+    lines: bool = False  # stamps are the lines of a table
+    images: Mapping[int, str] = field(default_factory=dict)  # names by line
+    refusals: tuple[Reason, ...] = ()  # why a result must not be accepted, whatever it is
+    instead: bool = False  # the refusals stand instead of those of the result
+    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is, of a bag
 
     def identified(self, model: str, told: Told = nobody) -> Identification:
         """Identify, and refuse the result where too much of the input is lost."""

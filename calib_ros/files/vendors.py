@@ -37,21 +37,15 @@ from calib_ros.values import SAME
 
 @dataclass(frozen=True)
 class Vendor:
-    """How a vendor's description names the joints and lays out their frames.
-
-    `joints` are the ends of names in a chain or URDF, `keys` those in the file; `rolls` of each
-    frame about x of the one before, in quarters of a turn. `end` is the fixed joint behind the
-    last, if the file has one, and `height` [m] where it ends along the last axis. `families` are
-    what names of joints must contain, where their ends are common ones.
-    """
+    """How a vendor's description names the joints and lays out their frames."""
 
     file: str
-    joints: tuple[str, ...]
-    keys: tuple[str, ...]
-    rolls: tuple[int, ...]
-    end: str | None = None
-    height: float = 0.0
-    families: tuple[str, ...] = ('',)
+    joints: tuple[str, ...]  # ends of their names in a chain or URDF
+    keys: tuple[str, ...]  # their names in the file
+    rolls: tuple[int, ...]  # of each frame about x of the one before, in quarters of a turn
+    end: str | None = None  # the fixed joint behind the last, if the file has one
+    height: float = 0.0  # where that ends along the last axis [m]
+    families: tuple[str, ...] = ('',)  # what names must contain, where their ends are common ones
 
     @property
     def all_keys(self) -> tuple[str, ...]:

@@ -40,19 +40,15 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A robot of the plant.
-
-    `tolerance` is the wanted RMS position error [mm], `largest_loss` the share of the messages of
-    a bag that may be lost. What was measured before `since` is not compared with what came later.
-    """
+    """A robot of the plant."""
 
     serial: str
     chain: Chain
     measured: tuple[Measured, ...]
     settings: Settings = field(default_factory=Settings)
-    tolerance: float | None = None
-    largest_loss: float = EXCEPTION
-    since: datetime | None = None
+    tolerance: float | None = None  # wanted RMS position error [mm]
+    largest_loss: float = EXCEPTION  # share of the messages of a bag that may be lost
+    since: datetime | None = None  # what was measured before is not compared with what is now
 
     def compares(self, time: datetime) -> bool:
         """Tell whether what was measured at a time is compared with what came later."""

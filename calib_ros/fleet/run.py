@@ -48,14 +48,11 @@ class LostError(CalibrationError):
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where the work is done: at the `address` of a scheduler, or by `workers` processes here.
+    """Where the work is done."""
 
-    `memory` bounds each of these, as dask has it: "2GiB".
-    """
-
-    address: str = ''
-    workers: int = 0
-    memory: str = '2GiB'
+    address: str = ''  # of a scheduler; without one processes here do it
+    workers: int = 0  # of these; 0: one a core
+    memory: str = '2GiB'  # that each of these may take, as dask has it
 
 
 @dataclass

@@ -50,15 +50,11 @@ after some."""
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """An arm that is another one than before, from the first night at `time` on.
+    """An arm that is another one than before."""
 
-    It was found in the night `seen`. `reasons` are what may have changed, the likeliest first:
-    they cannot be told apart.
-    """
-
-    time: datetime
-    seen: datetime
-    reasons: tuple[Explanation, ...]
+    time: datetime  # of the first night from which on it is
+    seen: datetime  # of the night in which that was found
+    reasons: tuple[Explanation, ...]  # the likeliest first: they cannot be told apart
 
     @property
     def joint(self) -> str:
@@ -128,15 +124,11 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
 
 
 class _Tests(NamedTuple):
-    """Tests of L lags at K nights for J joints.
+    """Tests of L lags at K nights for J joints."""
 
-    `chances` (L, K, J) are 1 where there is no night before; `pull` (L, K, P) and `weight`
-    (L, K, P, P) are u and W.
-    """
-
-    chances: FloatArray
-    pull: FloatArray
-    weight: FloatArray
+    chances: FloatArray  # (L, K, J), 1 where there is no night before
+    pull: FloatArray  # (L, K, P), u
+    weight: FloatArray  # (L, K, P, P), W
 
 
 class _Data(NamedTuple):

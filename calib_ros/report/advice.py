@@ -25,16 +25,13 @@ AGAIN = (
 
 @dataclass(frozen=True)
 class Advice:
-    """A refusal in plain words: heading, meaning, what to do, the refusal itself.
-
-    `again` tells on what to identify next. What follows from another refusal has no steps.
-    """
+    """A refusal in plain words."""
 
     heading: str
     meaning: str
-    steps: tuple[str, ...]
-    refusal: str = ''
-    again: str = AGAIN
+    steps: tuple[str, ...]  # what to do; none where it follows from another refusal
+    refusal: str = ''  # in the words of its rule
+    again: str = AGAIN  # on what to identify next
 
 
 ENOUGH = 25

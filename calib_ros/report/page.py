@@ -76,17 +76,14 @@ class Input:
 
 @dataclass(frozen=True)
 class Origin:
-    """Whence a result comes: what only the one who started it knows; empty where not told.
-
-    With the configuration in `settings` the same is done again, by the `command` if it was one.
-    """
+    """Whence a result comes: what only the one who started it knows; empty where not told."""
 
     inputs: tuple[Input, ...] = ()
     operator: str = ''
     serial: str = ''
     device: str = ''
-    settings: str = ''
-    command: str = ''
+    settings: str = ''  # the configuration with which the same is done again
+    command: str = ''  # that does it, if it was one
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values, without the settings, which have a file of their own."""

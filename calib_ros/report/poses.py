@@ -54,7 +54,6 @@ NAMELESS: Mapping[int, str] = {}
 class Poses:
     """N poses, or corners of a board, in the order of their stamps.
 
-    Stamps are the `lines` of a table, in seconds, or not; there `images` have names.
     Errors of position [m] and orientation [rad] are in the arm's base: (error, 0, 0) of a
     distance, NaN where no orientation was measured.
     """
@@ -73,8 +72,8 @@ class Poses:
     corner: NDArray[np.bool_]  # of a board in an image
     set: NDArray[np.intp]  # of observations, by its number
     tools: FloatArray  # (S, 4, 4) of the sets
-    lines: bool = False
-    images: Mapping[int, str] = field(default_factory=dict)
+    lines: bool = False  # stamps are the lines of a table, in seconds
+    images: Mapping[int, str] = field(default_factory=dict)  # names by line
 
     def __len__(self) -> int:
         """Return the number of poses."""

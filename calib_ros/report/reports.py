@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import distinct
@@ -57,7 +58,7 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
-    limits = sections.limits_of(judged, 1, CONFIDENT)
+    limits = interval_of(judged, 1, CONFIDENT)
     corrected = table_hash(result.chain) if result.accepted else 'none: not accepted'
     return Report(
         kind='Kinematic calibration',
@@ -116,7 +117,7 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
-    lower, upper = sections.limits_of(judged, 1, CONFIDENT)
+    lower, upper = interval_of(judged, 1, CONFIDENT)
     if upper <= tolerance:
         return f'and {wanted}'
     if lower > tolerance:
@@ -134,7 +135,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         return ()
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = sections.limits_of(judged, 0, INTERVAL)
+        lower, _ = interval_of(judged, 0, INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             told = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
             good = GOOD_ARM if told else GOOD_HERE

@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.confidence import rms_interval
+from calib_ros.apply.confidence import interval_of
 from calib_ros.files.history import is_time
 from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.validation import Comparison, ErrorFigures
@@ -35,20 +35,13 @@ def gain(which: Comparison, intervals: bool = True) -> str:
     """Return the errors before and after, with their uncertainty if wanted."""
     parts = []
     for when, found in enumerate(which.figures):
-        between = _between(limits_of(which, when, INTERVAL)) if intervals else ''
+        between = _between(interval_of(which, when, INTERVAL)) if intervals else ''
         parts.append(f'{found.rms_mm:.3f} mm' + (f' ({between})' if between else ''))
     return f'RMS position error: {" → ".join(parts)}'
 
 
 def _between(limits: tuple[float, float]) -> str:
     return f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if np.isfinite(limits[1]) else ''
-
-
-def limits_of(which: Comparison, when: int, confidence: float) -> tuple[float, float]:
-    """Return the limits [m] of the RMS before (0) or after (1), without outliers."""
-    residuals = (which.before, which.after)[when]
-    mask = which.judged & ~np.isnan(residuals.position).any(axis=1)
-    return rms_interval(residuals.position[mask], residuals.configurations[mask], confidence)
 
 
 def accuracy_section(
@@ -61,7 +54,7 @@ def accuracy_section(
 ) -> Section:
     """Return the table of accuracy, before and after; `things` are what is counted."""
     columns = [
-        _column(name, found, limits_of(judged, when, INTERVAL) if intervals else None)
+        _column(name, found, interval_of(judged, when, INTERVAL) if intervals else None)
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
     ]
     if with_outliers is not None:

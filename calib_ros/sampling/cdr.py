@@ -50,17 +50,13 @@ class Item(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where in messages of one kind things are.
-
-    They have the bytes of `text` where `mask` is 255, from the place `begin` on. The `last` of
-    these stand in one piece.
-    """
+    """Where in messages of one kind things are."""
 
     items: tuple[Item, ...]
-    begin: int
-    text: NDArray[np.uint8]
-    mask: NDArray[np.uint8]
-    last: slice
+    begin: int  # the place from which on they are alike
+    text: NDArray[np.uint8]  # the bytes that they have
+    mask: NDArray[np.uint8]  # 255 where they have them
+    last: slice  # of these bytes, in one piece
 
     def among(self, rows: NDArray[np.uint8]) -> Flags:
         """Tell which of some messages (N, ...) have this layout."""

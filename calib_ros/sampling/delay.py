@@ -44,14 +44,11 @@ MOST_TIME = 100.0 * LEAST_MOTION
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later than the joints' the stamps of measurements are, and how sure it is.
-
-    Where the motion repeats itself, `rivals` [s] explain it nearly as well.
-    """
+    """How much later than the joints' the stamps of measurements are, and how sure it is."""
 
     seconds: float
     correlation: float
-    rivals: tuple[float, ...] = ()
+    rivals: tuple[float, ...] = ()  # [s] explain a motion that repeats itself nearly as well
 
 
 def find_delay(
@@ -88,12 +85,13 @@ def find_delay(
     if len(nearest) < TELLING:  # a gap
         return None
     poses = chain.forward(joints[nearest])
-    first = _speed(joint_times[nearest], poses[:, :3, 3], poses[:, :3, :3], rotations is not None)
+    turns = None if rotations is None else poses[:, :3, :3]
+    first = _speed(joint_times[nearest], poses[:, :3, 3], turns)
     by_joints = np.interp(grid, *first)
     moving = heard & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
-    second = _speed(times, positions, rotations, rotations is not None)
+    second = _speed(times, positions, rotations)
     most = round(Settings.lateness / STEP)
     lags = STEP * np.arange(-most, most + 1)
     wide = begin + STEP * np.arange(-most, len(grid) + most)
@@ -139,15 +137,18 @@ def peaks(score: FloatArray, rise: float) -> Index:
 
 
 def _speed(
-    times: FloatArray, positions: FloatArray, rotations: FloatArray | None, angular: bool
+    times: FloatArray, positions: FloatArray, rotations: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times and speeds, over SMOOTHING or from one measurement to the next."""
+    """Return times and speeds, angular ones where rotations (N, 3, 3) are known.
+
+    They are taken over SMOOTHING, or from one measurement to the next.
+    """
     behind = np.searchsorted(times, times + SMOOTHING)
     behind = np.minimum(np.maximum(behind, np.arange(len(times)) + 1), len(times) - 1)
     first = np.flatnonzero(times[behind] > times)
     last = behind[first]
     span = times[last] - times[first]
-    if angular and rotations is not None:
+    if rotations is not None:
         turn = np.swapaxes(rotations[first], 1, 2) @ rotations[last]
         way = np.linalg.norm(se3.log_rotation(turn), axis=1)
     else:

@@ -224,7 +224,7 @@ class Entry:
 class Kept:
     """Samples in the order in which they were taken; in the frame `wanted`, if any is.
 
-    `changed` is called when samples were left out, with one that was taken back.
+    `removed` is called with one that is taken back.
     """
 
     def __init__(
@@ -232,12 +232,11 @@ class Kept:
         frames: FrameNames,
         wanted: str,
         dropped: Counter[str],
-        changed: Callable[[Sample | None], None],
+        removed: Callable[[Sample], None],
     ) -> None:
         self.wanted = wanted
-        self._frames, self._dropped, self._changed = frames, dropped, changed
+        self._frames, self._dropped, self._removed = frames, dropped, removed
         self.samples: list[Sample] = []
-        self._once: set[tuple[str, str]] = set()
 
     def usable(self) -> list[Sample]:
         """Return the samples in the frame of their device, `frame_id` or the usual one.
@@ -250,9 +249,6 @@ class Kept:
             found = [each for each in found if self._frame_of(each) == each.frame_id]
         counts = Counter((each.device, each.target) for each in found if not each.validation)
         once = {key for key, count in counts.items() if count == 1}
-        if once != self._once:  # the list does not only grow
-            self._once = once
-            self._changed(None)
         if not once or len(once) == len(counts):
             return found
         return [each for each in found if (each.device, each.target) not in once]
@@ -267,7 +263,7 @@ class Kept:
         for sample in tuple(self.samples):
             if self.is_strange(sample):
                 self.samples.remove(sample)
-                self._changed(sample)
+                self._removed(sample)
 
     def is_strange(self, sample: Sample) -> bool:
         """Tell whether a sample is one of a few in a frame of their own; count it if so."""

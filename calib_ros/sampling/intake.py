@@ -41,7 +41,7 @@ from calib_ros.sampling.messages import (
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
-from calib_ros.sampling.transforms import STATIC, Linked, Links, Pair
+from calib_ros.sampling.transforms import STATIC, Linked, Links
 from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000
@@ -53,6 +53,8 @@ Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and what came on them, serialised or not, in the order in which it came."""
 Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
 """Place, stamp [ns] and numbers of one message."""
+Found: TypeAlias = 'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
+"""Of messages that name the same: places (N,), names, first and last stamp, what reads them."""
 
 
 @dataclass(frozen=True)
@@ -158,38 +160,34 @@ class Intake:
             size = len(data) if isinstance(data, bytes) else 0
             groups.setdefault((stream.topic, size), []).append(place)
         linked: dict[Links, list[Linked]] = {}
-        single: list[int] = []
-        for (_, size), group in groups.items():
-            stream, places = batch[group[0]][0], np.array(group)
-            left = np.ones(len(places), dtype=bool)
-            known = {} if stream.links is None else stream.links.layouts
-            blobs = [batch[place][1] for place in group]
-            for some in alike(stream.type, blobs, known) if size else ():
-                left[some.which] = False
-                where = places[some.which]
-                if stream.links is None:
-                    self._add(stream.source, stream.type, where, some.of(0))
-                    continue
-                linked.setdefault(stream.links, []).extend(
-                    Linked(
-                        where, stream.still, _pair(item.strings), some.span(k), partial(some.of, k)
-                    )
-                    for k, item in enumerate(some.layout.items)
-                )
-            single += places[left].tolist()
-        for stream, where, found in self._decode(sorted(single)):
+        for stream, where, strings, span, read in self._read(groups):
             if stream.links is None:
-                self._add(stream.source, stream.type, where, found)
-            else:
-                span = int(found.stamps_ns[0]), int(found.stamps_ns[-1])
-                read = partial(Readings, *found)
-                one = Linked(where, stream.still, _pair(found.strings), span, read)
-                linked.setdefault(stream.links, []).append(one)
+                self._add(stream.source, stream.type, where, read())
+                continue
+            link = frame_name(strings[0]), frame_name(strings[1])
+            one = Linked(where, stream.still, link, span, read)
+            linked.setdefault(stream.links, []).append(one)
         for links, come in linked.items():
             measured, causes = links.take(come)
             self.faults[POSES] += causes
-            for source, where, found in measured:
-                self._add(source, TRANSFORM, where, found)
+            for each in measured:
+                self._add(each.source, TRANSFORM, each.places, each.readings)
+
+    def _read(self, groups: Mapping[tuple[str, int], Sequence[int]]) -> Iterator[Found]:
+        """Yield what messages say: at once those of a topic and length that are laid out alike."""
+        single: list[int] = []
+        for (_, size), group in groups.items():
+            stream, places = self._batch[group[0]][0], np.array(group)
+            left = np.ones(len(places), dtype=bool)
+            known = {} if stream.links is None else stream.links.layouts
+            blobs = [self._batch[place][1] for place in group]
+            for some in alike(stream.type, blobs, known) if size else ():
+                left[some.which] = False
+                where = places[some.which]
+                for k, item in enumerate(some.layout.items):
+                    yield stream, where, item.strings, some.span(k), partial(some.of, k)
+            single += places[left].tolist()
+        yield from self._decode(sorted(single))
 
     def _add(self, source: Source | None, kind: str, places: Index, found: Readings) -> None:
         good, causes = usable(kind, found)
@@ -219,7 +217,7 @@ class Intake:
         found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
         self._add(source, stream.type, np.array([place]), found)
 
-    def _decode(self, places: Sequence[int]) -> Iterator[tuple[Stream, Index, Readings]]:
+    def _decode(self, places: Sequence[int]) -> Iterator[Found]:
         """Yield what messages say that are decoded one after the other, alike ones together."""
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
@@ -243,8 +241,5 @@ class Intake:
         for (stream, strings, _), some in alike.items():
             where, stamps, numbers = zip(*some, strict=True)
             stamps_ns = np.array(stamps, dtype=np.int64)
-            yield stream, np.array(where), Readings(stamps_ns, strings, np.array(numbers))
-
-
-def _pair(strings: Sequence[str]) -> Pair:
-    return frame_name(strings[0]), frame_name(strings[1])
+            read = partial(Readings, stamps_ns, strings, np.array(numbers))
+            yield stream, np.array(where), strings, (stamps[0], stamps[-1]), read

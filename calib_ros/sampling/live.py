@@ -71,19 +71,17 @@ A convention."""
 class Estimate:
     """What the samples so far tell.
 
-    `sigma` is the RMS standard deviation [m] of positions predicted over the joint range, by the
-    noise that the residuals show, which is `noise` [sigma given]. `excess` is how many times
-    larger the residuals of positions are than what measurements scatter by: the sigma given, or
-    the spread at a stop where that is larger. It is None while too few samples show it; priors,
-    and nothing measured, make up much of the sigma then.
+    `excess` is how many times larger the residuals of positions are than what measurements scatter
+    by: the sigma given, or the spread at a stop where that is larger. It is None while too few
+    samples show it; priors, and nothing measured, make up much of the sigma then.
     """
 
     chain: Chain
     names: tuple[str, ...]
-    covariance: FloatArray
+    covariance: FloatArray  # (P, P)
     samples: int
-    sigma: float
-    noise: float
+    sigma: float  # RMS standard deviation [m] of positions predicted over the joint range
+    noise: float  # that the residuals show, and sigma goes by [sigma given]
     excess: float | None
 
     def more_for(self, wanted: float) -> int:
@@ -105,7 +103,7 @@ class LiveEstimate:
         self._chain: Chain | None = None
         self._added: list[Sample] = []
         self._begun = 0  # how many samples there were then
-        self._seen = 0
+        self._seen: list[Sample] = []
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
@@ -114,20 +112,23 @@ class LiveEstimate:
         """Why the samples can be no problem, in words; empty if they can."""
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
-        """Take what a growing list of samples has beyond that of the last call.
+        """Take what a list of samples has beyond that of the last call, or all if it is another.
 
         Returns None while there are too few. An update is short, so that it may be called between
         messages: of many samples it takes MOST_AT_ONCE.
         """
-        if self._latest is not None and len(samples) == self._seen and not self._pending:
+        known = len(self._seen)
+        if self._seen != list(samples[:known]):
+            self.restart()
+        elif self._latest is not None and len(samples) == known and not self._pending:
             return self._latest
-        self._pending += [each for each in samples[self._seen :] if not each.validation]
-        self._seen = len(samples)
+        self._pending += [each for each in samples[len(self._seen) :] if not each.validation]
+        self._seen = list(samples)
         fresh = self._pending[:MOST_AT_ONCE]
         count = len(self._added) + len(self.suspicious) + len(fresh)
         outgrown = self._chain is None or GROWN * self._begun < count <= SOME
-        known = set(self._chain.frame_names) if self._chain else set()
-        if outgrown or any(not known.issuperset(self._frames.of(each)) for each in fresh):
+        framed = set(self._chain.frame_names) if self._chain else set()
+        if outgrown or any(not framed.issuperset(self._frames.of(each)) for each in fresh):
             fitted = [sample for sample in samples if not sample.validation]
             first = _spread(fitted)
             joints = np.array([sample.joints for sample in first])
@@ -135,7 +136,7 @@ class LiveEstimate:
                 return None
             chosen = set(first)
             self._begun = len(fitted)
-            self._seen = len(samples)
+            self._seen = list(samples)
             self._pending = [sample for sample in fitted if sample not in chosen]
         elif fresh:
             del self._pending[: len(fresh)]

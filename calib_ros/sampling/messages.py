@@ -193,41 +193,21 @@ DISTANCE = 'distance'
 class Source:
     """One topic of measurements.
 
-    Attributes
-    ----------
-    topic : str
-    type : str
-        Message type, such as geometry_msgs/msg/PoseStamped; empty when any will do.
-    device, target : str
-        What measures, and what is measured. Each device has a base frame of its own, each target
-        a tool frame. A message that names its child frame names the target.
-    eye_in_hand : bool
-        The poses are those of a fixed target in a camera on the flange.
-    validation : bool
-        The measurements judge the result and are never fitted.
-    parent, child : str
-        On a topic of many transforms or bodies, such as /tf: the frames between which it is
-        measured.
-    board : str
-        YAML of the board that images show, which has its type and sizes.
-    info : str
-        Topic of the CameraInfo of images; default: camera_info beside them.
-    lens : str
-        Whether the intrinsics are `given` by it, or `fitted` from there on.
-
+    Each device has a base frame of its own, each target a tool frame; a message that names its
+    child frame names the target.
     """
 
     topic: str
-    type: str = ''
-    device: str = ''
-    target: str = ''
-    eye_in_hand: bool = False
-    validation: bool = False
-    parent: str = ''
+    type: str = ''  # such as geometry_msgs/msg/PoseStamped; empty when any will do
+    device: str = ''  # what measures
+    target: str = ''  # what is measured
+    eye_in_hand: bool = False  # the poses are those of a fixed target in a camera on the flange
+    validation: bool = False  # the measurements judge the result and are never fitted
+    parent: str = ''  # of many transforms or bodies, as on /tf: the frames between which it is
     child: str = ''
-    board: str = ''
-    info: str = ''
-    lens: str = 'given'
+    board: str = ''  # YAML of the board that images show, which has its type and sizes
+    info: str = ''  # topic of the CameraInfo of images, by default camera_info beside them
+    lens: str = 'given'  # by that topic, or `fitted` from there on
 
     def __post_init__(self) -> None:
         """Refuse what no bag or node could use."""

@@ -53,17 +53,13 @@ def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measured(Shown):
-    """The sets to fit and held out, each with frames of its own.
-
-    `pairs` names the frames of the two sockets of each location, `world_frame` is the first frame
-    of the devices, `lenses` are those at the frames of cameras.
-    """
+    """The sets to fit and held out, each with frames of its own."""
 
     fitted: Sequence[Observations]
     held_out: Sequence[Observations] = ()
-    pairs: Sequence[tuple[str, str]] = ()
-    world_frame: str = ''
-    lenses: Mapping[str, Lens] = field(default_factory=dict)
+    pairs: Sequence[tuple[str, str]] = ()  # frames of the two sockets of each location
+    world_frame: str = ''  # the first frame of the devices
+    lenses: Mapping[str, Lens] = field(default_factory=dict)  # at the frames of cameras
 
     def problem(
         self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any

@@ -32,70 +32,33 @@ class View:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sample(Shown):
-    """One measurement with the joint values that belong to it.
+    """One measurement with the joint values (n,) [rad or m] that belong to it.
 
-    Attributes
-    ----------
-    stamp_ns : int
-    joints, approach : (n,)
-        Joint values [rad or m], and the signs of the joints' last moves.
-    position : (3,), optional
-        Of the target in the frame of the device [m].
-    rotation : (3, 3), optional
-        Of the target in the frame of the device.
-    distance : float, optional
-        From the origin of the device to the target [m], where no position was measured.
-    covariance : (6, 6), optional
-        Of x, y, z [m] and the rotation about the device's x, y, z axes [rad].
-    view : View, optional
-        The corners of a board in an image, whose pose is that of the board by itself.
-    images : tuple of int
-        Numbers of the images of a stop of which one is still to be looked at.
-    velocity, acceleration : (n,), optional
-        Of the joints, where the arm was moving.
-    session, device, target : str
-        Each session and device has a base frame of its own, each session and target a tool frame.
-    frame_id : str
-        Frame of the measurement, as its message named it.
-    socket : bool
-        A ball at the target sat in a socket, whose place is not known.
-    plane : bool
-        The target touched a plane, the device; the distance is its height over it.
-    eye_in_hand : bool
-        The pose is that of a fixed target in a camera on the flange.
-    validation : bool
-        The sample judges and is never fitted.
-    delay : float
-        How much earlier than the stamp the joints had these values [s].
-    count : int
-        Measurements that were averaged.
-    spread : float
-        RMS of one coordinate of them about their mean [m].
-
+    Each session and device has a base frame of its own, each session and target a tool frame.
     """
 
     stamp_ns: int
     joints: FloatArray
-    approach: FloatArray | None = None
-    position: FloatArray | None = None
-    rotation: FloatArray | None = None
-    distance: float | None = None
-    covariance: FloatArray | None = None
-    view: View | None = None
-    images: tuple[int, ...] = ()
-    velocity: FloatArray | None = None
+    approach: FloatArray | None = None  # (n,) signs of the joints' last moves
+    position: FloatArray | None = None  # (3,) of the target in the frame of the device [m]
+    rotation: FloatArray | None = None  # (3, 3) of the target in the frame of the device
+    distance: float | None = None  # from the origin of the device [m], without a position
+    covariance: FloatArray | None = None  # (6, 6) of x, y, z [m] and about the device's axes [rad]
+    view: View | None = None  # corners of a board in an image, whose pose is that by itself
+    images: tuple[int, ...] = ()  # numbers of those of a stop of which one will be looked at
+    velocity: FloatArray | None = None  # (n,) of the joints, where the arm was moving
     acceleration: FloatArray | None = None
     session: str = ''
     device: str = ''
     target: str = ''
-    frame_id: str = ''
-    socket: bool = False
-    plane: bool = False
-    eye_in_hand: bool = False
-    validation: bool = False
-    delay: float = 0.0
-    count: int = 1
-    spread: float = 0.0
+    frame_id: str = ''  # of the measurement, as its message named it
+    socket: bool = False  # a ball at the target sat in a socket, whose place is not known
+    plane: bool = False  # the target touched a plane, the device; the distance is its height
+    eye_in_hand: bool = False  # the pose is that of a fixed target in a camera on the flange
+    validation: bool = False  # it judges and is never fitted
+    delay: float = 0.0  # how much earlier than the stamp the joints had these values [s]
+    count: int = 1  # measurements that were averaged
+    spread: float = 0.0  # RMS of one coordinate of them about their mean [m]
 
 
 class Frames:

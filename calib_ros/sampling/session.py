@@ -83,7 +83,12 @@ class CalibrationSession:
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
         self.pictures.clear()
-        self._kept = Kept(self._frames, settings.frame_id, self._entry.dropped, self._removed)
+        self._kept = Kept(
+            self._frames,
+            settings.frame_id,
+            self._entry.dropped,
+            lambda sample: self.on_removed(sample),
+        )
 
     def change(self, settings: Settings) -> None:
         """Go on with other settings; the buffers and samples stay.
@@ -152,7 +157,6 @@ class CalibrationSession:
         sample = self.samples.pop()
         self._entry.unused['measurements: of a pose that was taken back'] += sample.count
         self._collector.forget(sample)
-        self._live.restart()
         self.on_removed(sample)
         return sample
 
@@ -169,7 +173,6 @@ class CalibrationSession:
         self._collector.maker.remember(samples)
         self._kept.samples[:0] = samples
         self._kept.leave_out_strange()
-        self._live.restart()
 
     @property
     def samples(self) -> list[Sample]:
@@ -367,12 +370,6 @@ class CalibrationSession:
         for sample in fresh:
             self.on_sample(sample)
         return len(self.samples)
-
-    def _removed(self, sample: Sample | None) -> None:
-        """Begin the estimate anew, for the samples are others; one may have been taken back."""
-        self._live.restart()
-        if sample is not None:
-            self.on_removed(sample)
 
 
 def too_few(err: TooFewObservationsError, came: str) -> InputError:

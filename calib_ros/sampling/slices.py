@@ -147,17 +147,12 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """Messages in the order in which they came, in pieces by stream, the first to come first.
+    """Messages in the order in which they came; places count from the first one of a batch."""
 
-    Places count from the first message of a batch, `begin` is that of the first one here.
-    `joints` (N,) are the messages that are joint states, `times` (N,) all stamps on the clock of
-    the joints [ns].
-    """
-
-    pieces: tuple[Piece, ...]
-    begin: int
-    joints: Flags
-    times: Stamps
+    pieces: tuple[Piece, ...]  # by stream, the first to come first
+    begin: int  # the place of the first message here
+    joints: Flags  # (N,) messages that are joint states
+    times: Stamps  # (N,) all stamps on the clock of the joints [ns]
 
     @classmethod
     def of(cls, pieces: Sequence[Piece], delay_ns: int = 0) -> Slice:

@@ -33,16 +33,12 @@ SPIKE = 3.0 * MOST_SPREAD
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """The means of what was measured at S stops: `values` (S, 3) or (S, 1) [m].
+    """The means of what was measured at S stops."""
 
-    `used` (N,) are the measurements in them, `spreads` (S,) the RMS of one coordinate about them
-    [m]; where `rests` (S,) is False measurements spread more than their noise.
-    """
-
-    used: Flags
-    rests: Flags
-    values: FloatArray
-    spreads: FloatArray
+    used: Flags  # (N,) measurements in them
+    rests: Flags  # (S,) False where measurements spread more than their noise
+    values: FloatArray  # (S, 3) or (S, 1) [m]
+    spreads: FloatArray  # (S,) RMS of one coordinate about them [m]
 
 
 def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:

@@ -9,8 +9,8 @@ interpolated on its own.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -81,6 +81,10 @@ def intersection(first: Stamps, second: Stamps) -> Stamps:
 APART = 'joint states too far apart'
 CAUSES = ('', 'no joint state before', 'no joint state after', APART)
 """Why there are no joint values at a stamp; the first entry stands for none."""
+
+
+Brackets: TypeAlias = tuple[Index, Index, Index]
+"""Causes (N,), and the samples before and after each stamp."""
 
 
 class Motion(NamedTuple):
@@ -165,9 +169,7 @@ class Track:
         stop would hold a part of the move.
         """
         found = np.zeros((3, len(stamps), len(self._revolute)))
-        for columns, rows in self._by_size():
-            index = list(columns)
-            why, first, last = self._brackets(rows.stamps, stamps)
+        for index, rows, (why, first, last) in self._around(stamps):
             part = interpolated(rows, stamps, first, last, self._revolute[index], standing)
             for whole, each in zip(found, part, strict=True):
                 whole[np.ix_(why == 0, index)] = each[why == 0]
@@ -176,9 +178,7 @@ class Track:
     def approach(self, stamps: Stamps, joints: FloatArray) -> FloatArray:
         """Return the signs (N, n) of the last moves before joint values (N, n) at stamps (N,)."""
         found = np.zeros(joints.shape)
-        for columns, rows in self._by_size():
-            index = list(columns)
-            why, first, _ = self._brackets(rows.stamps, stamps)
+        for index, rows, (why, first, _) in self._around(stamps):
             revolute, came = self._revolute[index], self._came[index]
             signs = last_moves(rows.values, first, joints[:, index], came, revolute)
             found[np.ix_(why == 0, index)] = signs[why == 0]
@@ -187,19 +187,20 @@ class Track:
     def causes(self, stamps: Stamps) -> Index:
         """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
         cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
-        for columns, rows in self._by_size():
-            index = list(columns)
-            why = self._brackets(rows.stamps, stamps)[0]
+        for index, _, (why, *_) in self._around(stamps):
             worse = cause[:, index] != 0
             cause[:, index] = np.where(worse, why[:, np.newaxis], cause[:, index])
         return np.asarray(cause.max(axis=1, initial=0))
 
-    def _by_size(self) -> list[tuple[tuple[int, ...], Rows]]:
-        """Return the parts; a joint that several name is taken from the last that has it."""
-        return sorted(self._parts.items(), key=lambda item: len(item[0]))
+    def _around(self, stamps: Stamps) -> Iterator[tuple[list[int], Rows, Brackets]]:
+        """Yield the joints of each part, its samples, and those around stamps (N,).
 
-    def _brackets(self, known: Stamps, stamps: Stamps) -> tuple[Index, Index, Index]:
-        """Return causes (N,) and the samples before and after each stamp."""
+        A joint that several name is taken from the last that has it.
+        """
+        for columns, rows in sorted(self._parts.items(), key=lambda item: len(item[0])):
+            yield list(columns), rows, self._brackets(rows.stamps, stamps)
+
+    def _brackets(self, known: Stamps, stamps: Stamps) -> Brackets:
         nowhere = np.zeros(len(stamps), dtype=np.intp)
         if len(known) == 0:
             return nowhere + 1, nowhere, nowhere

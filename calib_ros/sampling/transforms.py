@@ -22,6 +22,7 @@ from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import Layout
+from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, Source, short_type, usable
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
@@ -45,10 +46,6 @@ class Linked(NamedTuple):
     link: Pair
     span: tuple[int, int]
     read: Callable[[], Readings]
-
-
-Measured: TypeAlias = tuple[Source, Index, Readings]
-"""What one source measured, and the places of the messages in the batch."""
 
 
 class Route(NamedTuple):
@@ -98,7 +95,7 @@ class Links:
         self._held: deque[tuple[Pair, Readings]] = deque()
         self._let_go: Counter[Pair] = Counter()
 
-    def take(self, come: Sequence[Linked]) -> tuple[list[Measured], Counter[str]]:
+    def take(self, come: Sequence[Linked]) -> tuple[list[Part], Counter[str]]:
         """Return what sources make of transforms, and why some cannot be used.
 
         Frames that are named anywhere among them are known for all of them. Where the frames
@@ -110,10 +107,10 @@ class Links:
         self._update()
         first, faults = min(int(each.places[0]) for each in come), Counter[str]()
         found = [
-            (source, np.full(len(waited.stamps_ns), first), self._reading(source, route, waited))
+            Part(np.full(len(waited.stamps_ns), first), s, self._reading(s, route, waited))
             for link, waited in self._held
-            for source, route in self._of(link)
-            if source in open_before
+            for s, route in self._of(link)
+            if s in open_before
         ]
         for each in come:
             if each.still or not (self._open or each.link in self._wanted):
@@ -123,7 +120,8 @@ class Links:
             read, measured = read.rows(good), self._of(each.link)
             faults += Counter({cause: n * len(measured) for cause, n in causes.items()})
             self._held.append((each.link, read))
-            found += [(s, each.places[good], self._reading(s, r, read)) for s, r in measured]
+            places = each.places[good]
+            found += [Part(places, s, self._reading(s, route, read)) for s, route in measured]
         if not self._open:
             gone = sum(n * len(self._of(link)) for link, n in self._let_go.items())
             faults += Counter({'buffer full before their frames were linked': gone})
