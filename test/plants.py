@@ -52,7 +52,7 @@ def write_plant(folder, serials, nights, poses=30, bumps=None, where='', chain='
     plant = {
         'groups': {'line': {'chain': chain, 'settings': settings, 'tolerance': 0.3}},
         'robots': [
-            {'serial': s, 'group': 'line', 'measured': f'{where}nights/{s}/*.csv'} for s in serials
+            {'serial': s, 'group': 'line', 'measured': f'{where}nights/{s}/*.*'} for s in serials
         ],
     }
     path = folder / 'plant.yaml'

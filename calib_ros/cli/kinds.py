@@ -7,6 +7,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from calib_ros.errors import InputError
+from calib_ros.files.loading import TABLES
 
 BEGINNINGS = (
     *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
@@ -20,7 +21,7 @@ SUFFIXES = {
     **dict.fromkeys(('.yaml', '.yml'), 'chain'),
     **dict.fromkeys(('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp'), 'image'),
     **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
-    **dict.fromkeys(('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat'), 'table'),
+    **dict.fromkeys(TABLES, 'table'),
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
 WORDS = {

@@ -26,6 +26,9 @@ from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
+TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')
+"""Endings of tables, in small letters."""
+
 
 @dataclass(frozen=True, eq=False)
 class Loaded:

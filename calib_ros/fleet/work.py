@@ -23,15 +23,13 @@ from calib_ros.files.history import (
     is_local,
     measured_at,
 )
-from calib_ros.files.loading import of_bag, of_table, replayed, table
+from calib_ros.files.loading import TABLES, of_bag, of_table, replayed, table
 from calib_ros.fleet.plant import Robot
 from calib_ros.report.page import Origin, input_of, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.report.words import configuration_yaml
 
-TABLES = ('.csv', '.txt', '.xlsx')
-"""Endings of tables; anything else is a bag, or a folder that is one."""
 DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
 SUMS = ('ETag', 'etag', 'CRC')
 """What file systems call dates and sums by which a change of content shows."""
@@ -112,7 +110,7 @@ def _outcome(task: Task) -> Outcome:
         if content in task.known and not task.page:
             return Outcome()
         chain, settings = robot.chain, robot.settings
-        if path.suffix in TABLES:
+        if path.suffix.lower() in TABLES:  # anything else is a bag, or a folder that is one
             sessions = (source.session,) if source.session else ()
             loaded = of_table(table(path, chain, settings, sessions), chain, settings)
         else:
@@ -157,7 +155,7 @@ def _file_system(url: str) -> tuple[Any, str]:
 
 def _is_folder(files: Any, path: str) -> bool:
     """Tell whether a path is a folder; a name with an ending of a file is not asked for."""
-    name = PurePosixPath(path).name
+    name = PurePosixPath(path).name.lower()
     return not name.endswith((*TABLES, '.mcap', '.db3', '.zstd')) and bool(files.isdir(path))
 
 

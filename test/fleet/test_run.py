@@ -50,7 +50,7 @@ def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
     nowhere = Cluster('tcp://127.0.0.1:1')  # which is not asked for
     assert run(plant, history, nowhere, out) == running.Run()
 
-    third = tmp_path / 'nights/A/002.csv'
+    third = tmp_path / 'nights/A/002.DAT'  # a table, as for identify
     third.write_text(plants.night(*plants.robot(0), 2))
     touched = tmp_path / 'nights/B/001.csv'
     touched.write_bytes(touched.read_bytes())
