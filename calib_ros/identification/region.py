@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -184,28 +184,30 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     order, limit = np.argsort(far), float(near.max())
     own, inside = judge.products(here), far[order] <= limit
     inner = own + judge.products(there[order[inside]])
-
-    def risk(doubted: Sequence[Mixed]) -> float:
-        return max(judge.risk(own, own, doubted), judge.risk(inner, inner, doubted))
-
-    if not risk(posterior.doubted) < RISK:
+    doubts = judge.of_the_arm(posterior.doubted)
+    if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
         return None
     shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
         added = judge.products(there[shell])
-        if not judge.risk(added, inner + added, posterior.doubted) < RISK:
+        if not judge.risk(added, inner + added, doubts) < RISK:
             break
         inner, limit = inner + added, float(far[shell[-1]])
     by_scale = 0.0
     if posterior.rival is not None:
         more, _, mean, covariance = posterior.rival
         out = float(special.expit(special.logit(UNUSUAL) + more))
-        by_scale = out * risk([(1.0, mean, covariance)])
+        doubts = judge.of_the_arm([(1.0, mean, covariance)])
+        by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
     share = float(np.mean(far <= limit))
     limit = np.inf if share == 1.0 else limit
     known = posterior.chain, posterior.names, posterior.square, posterior.device
     return Region(*known, limit, share, *ends, by_scale)
+
+
+_Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Weights (S,), means (S, A) and covariances (S, A, A) of the arm's A offsets."""
 
 
 class _Judge:
@@ -233,11 +235,13 @@ class _Judge:
         flat = rows[..., self._own].reshape(-1, len(self._own))
         return np.asarray(flat.T @ flat)
 
-    def risk(self, which: FloatArray, around: FloatArray, doubted: Sequence[Mixed]) -> float:
-        """Return it for some poses, in frames fitted to those around; both by their products.
+    def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
+        """Return what may be of all offsets, as in `Posterior.doubted`, for those of the arm."""
+        weights, means, covariances = (np.array(each) for each in zip(*doubted, strict=True))
+        return weights, means[:, self._arm], covariances[:, self._arm][:, :, self._arm]
 
-        By weights, means and covariances of the offsets, as in `Posterior.doubted`.
-        """
+    def risk(self, which: FloatArray, around: FloatArray, doubts: _Doubts) -> float:
+        """Return it for some poses, in frames fitted to those around; both by their products."""
         frames, arm = np.s_[: self._placed], np.s_[self._placed :]
         root = inverse_root(around[frames, frames], np.diag(around)[frames])
         taken = root @ (root.T @ around[frames, arm])
@@ -245,10 +249,9 @@ class _Judge:
         left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
         slope = left @ self._offsets
         gain = float(slope @ self._offsets)
-        weights, means, covariances = zip(*doubted, strict=True)
-        margins = np.array(means)[:, self._arm] @ slope - 0.5 * gain
-        squares = np.array(covariances)[:, self._arm][:, :, self._arm] @ slope @ slope
-        spreads = np.sqrt(np.maximum(squares, 0.0))
+        weights, means, covariances = doubts
+        margins = means @ slope - 0.5 * gain
+        spreads = np.sqrt(np.maximum(covariances @ slope @ slope, 0.0))
         with np.errstate(divide='ignore', invalid='ignore'):
             risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
         return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))
