@@ -189,7 +189,7 @@ def followed(
     flat = rows.reshape(-1, len(every))
     own, wanted = flat[:, : len(names)], flat[:, [every.index(name) for name in others]]
     scale = np.linalg.norm(own, axis=0)
-    scale[scale == 0.0] = 1.0  # what moves nothing
+    scale[scale <= ROUNDING * scale.max(initial=0.0)] = 1.0  # what moves nothing
     found = np.linalg.lstsq(own / scale, wanted, rcond=1e-9)[0] / scale[:, np.newaxis]
     return found, wanted, wanted - own @ found
 
