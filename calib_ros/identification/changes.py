@@ -35,7 +35,6 @@ from calib_ros.identification.levels import CONFIDENT, SCALE, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import LEVER
@@ -266,12 +265,7 @@ def gauged(
     q = chain.random_joints(SOME_POSES, rng)
     frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
     fitted = list(dict.fromkeys([*frames, *names]))
-    columns = list(dict.fromkeys([*fitted, *others]))
-    rows = ErrorModel(chain, columns).jacobian(q, rng.choice([-1.0, 1.0], q.shape))
-    rows[:, 3:] *= LEVER
-    flat = rows.reshape(-1, len(columns))
-    known, wanted = flat[:, : len(fitted)], flat[:, [columns.index(name) for name in others]]
-    taken = followed(known, wanted)
+    approach = rng.choice([-1.0, 1.0], q.shape)
+    taken, wanted, left = followed(chain, fitted, others, q, LEVER, approach=approach)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
-    left = np.linalg.norm(wanted - known @ taken, axis=0) / size
-    return taken[[fitted.index(name) for name in names]], left
+    return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size

@@ -35,7 +35,6 @@ from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import TYPICAL
 from calib_ros.identification.start import likened
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
@@ -228,8 +227,5 @@ def _predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
     """Return V (P, P) [m^2]: d^T V d is the mean squared difference of positions by d."""
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
-    rows = ErrorModel(chain, [*frames, *names]).jacobian(joints)[:, :3]
-    flat = rows.reshape(-1, rows.shape[2])
-    known, wanted = flat[:, : len(frames)], flat[:, len(frames) :]
-    left = wanted - known @ followed(known, wanted)
+    _, _, left = followed(chain, frames, names, joints, 0.0)
     return np.asarray(left.T @ left) / len(joints)

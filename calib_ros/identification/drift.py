@@ -23,7 +23,7 @@ transforms.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,21 +42,9 @@ SHIFTS = 2 * SOME_POSES
 (benchmarks/drift.py)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Columns X of parameters, and what they have in common with each other and the residuals.
-
-    Attributes
-    ----------
-    matrix : (P, P)
-        X^T X, without the slowest part of the columns, with the normal matrix of the priors.
-    products : (P, S)
-        X^T r by shift.
-
-    """
-
-    matrix: FloatArray
-    products: FloatArray
+Columns: TypeAlias = tuple[FloatArray, FloatArray]
+"""X^T X (P, P) of columns X without their slowest part, with the normal matrix of the priors, and
+X^T r (P, S) by shift."""
 
 
 class Shifts:
@@ -94,7 +82,7 @@ class Shifts:
             self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
 
     def columns(self, columns: Iterable[Sequence[FloatArray]], inverse: FloatArray) -> Columns:
-        """Return weighted columns, (P, c, N) for each set, with their products.
+        """Return the products of weighted columns, (P, c, N) for each set.
 
         They may come in several lots; `inverse` (P,) is 1 / sigma of the priors of all of them,
         zero without one.
@@ -116,7 +104,7 @@ class Shifts:
                 parts.append(series.reshape(len(series), -1))
             rows.append(np.concatenate(parts, axis=1))
         every = np.concatenate(rows)
-        return Columns(every @ every.T + np.diag(inverse**2), np.concatenate(products))
+        return every @ every.T + np.diag(inverse**2), np.concatenate(products)
 
     def shares(
         self, columns: Columns, known: Sequence[int], groups: Sequence[Sequence[int]]
@@ -125,13 +113,14 @@ class Shifts:
 
         By shift; each group is taken by itself.
         """
-        matrix = columns.matrix[np.ix_(known, known)]
+        every, moved = columns
+        matrix = every[np.ix_(known, known)]
         root = inverse_root(matrix, np.diag(matrix))
-        gone = root.T @ columns.products[known]
+        gone = root.T @ moved[known]
         which = np.array(groups)
-        cross = columns.matrix[which][:, :, known] @ root  # (G, K, P)
-        products = columns.products[which] - cross @ gone
-        own = columns.matrix[which[:, :, np.newaxis], which[:, np.newaxis]]
+        cross = every[which][:, :, known] @ root  # (G, K, P)
+        products = moved[which] - cross @ gone
+        own = every[which[:, :, np.newaxis], which[:, np.newaxis]]
         size = np.einsum('gkk->gk', own)
         mine = inverse_root(own - cross @ np.swapaxes(cross, 1, 2), size)
         found = ((np.swapaxes(mine, 1, 2) @ products) ** 2).sum(axis=1)

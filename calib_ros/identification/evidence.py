@@ -34,6 +34,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from scipy import linalg
@@ -48,6 +49,9 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
+
+Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
+"""A weight, with mean (P,) and covariance (P, P) of the offsets."""
 
 
 def group_of(chain: Chain, name: str) -> str | None:
@@ -86,7 +90,7 @@ class Posterior(Shown):
         Standard deviation [m or rad] of every parameter that has a prior.
     sizes : mapping of str to float
         Size of the errors by group.
-    doubted : tuple of (float, (P,), (P, P))
+    doubted : tuple of Mixed
         Mean and covariance of the offsets if the device may have a scale of its own, and if joint
         values that were rounded are off; for sizes that may as well be, each with its weight.
     rival : (float, float, (P,), (P, P)), optional
@@ -103,7 +107,7 @@ class Posterior(Shown):
     device: FloatArray
     priors: Mapping[str, float]
     sizes: Mapping[str, float]
-    doubted: tuple[tuple[float, FloatArray, FloatArray], ...]
+    doubted: tuple[Mixed, ...]
     rival: tuple[float, float, FloatArray, FloatArray] | None = None
 
     @cached_property

@@ -164,19 +164,34 @@ def growth(
 
     What is none of them shows in others, by poses or positions between the ends at (N, n).
     """
-    every = tuple(dict.fromkeys((*names, *lengths)))
-    rows = ErrorModel(chain, every, *ends).jacobian(joints)[:, : 6 if oriented else 3]
-    rows = rows.reshape(-1, len(every))
-    seen = rows[:, [every.index(n) for n in lengths]] @ [*lengths.values()]
-    return followed(rows[:, : len(names)], seen[:, np.newaxis])[:, 0]
+    changes, _, _ = followed(chain, names, [*lengths], joints, float(oriented), ends)
+    return np.asarray(changes @ [*lengths.values()])
 
 
-def followed(columns: FloatArray, wanted: FloatArray) -> FloatArray:
-    """Return the changes (P, K) of parameters with columns (R, P) nearest to `wanted` (R, K)."""
-    scale = np.linalg.norm(columns, axis=0)
-    scale[scale == 0.0] = 1.0  # what moves nothing
-    found = np.linalg.lstsq(columns / scale, wanted, rcond=1e-9)[0]
-    return np.asarray(found / scale[:, np.newaxis])
+def followed(
+    chain: Chain,
+    names: Sequence[str],
+    others: Sequence[str],
+    joints: FloatArray,
+    lever: float,
+    ends: tuple[str, str] = ('base', 'tool'),
+    approach: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how P named parameters follow a unit of each of K others.
+
+    Their changes (P, K) are those that move the arm most nearly as the others do, at joint values
+    (N, n), to which it came with signs of `approach` (N, n); a radian counts as `lever` [m]. What
+    the others move (6 N, K) [m], and what is left of that, follow.
+    """
+    every = list(dict.fromkeys([*names, *others]))
+    rows = ErrorModel(chain, every, *ends).jacobian(joints, approach)
+    rows[:, 3:] *= lever
+    flat = rows.reshape(-1, len(every))
+    own, wanted = flat[:, : len(names)], flat[:, [every.index(name) for name in others]]
+    scale = np.linalg.norm(own, axis=0)
+    scale[scale <= ROUNDING * scale.max(initial=0.0)] = 1.0  # what moves nothing
+    found = np.linalg.lstsq(own / scale, wanted, rcond=1e-9)[0] / scale[:, np.newaxis]
+    return found, wanted, wanted - own @ found
 
 
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:

@@ -19,12 +19,13 @@ from scipy import special
 from calib_ros.identification.configurations import STILL, stops
 from calib_ros.identification.drift import chance
 from calib_ros.identification.levels import CERTAIN, FEW, SURE
+from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXCEPTION
 
-LEAST_STOPS = 50
+LEAST_STOPS = SOME_POSES // 4
 """Stops from which on outliers are compared with the values of joints: along a path
 half as many make a false alarm twice as likely, 1.5 instead of 0.7 %."""
 ADVICE = (

@@ -18,8 +18,8 @@ that holds in each shell.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,7 @@ from scipy import special
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.identification.drift import inverse_root
-from calib_ros.identification.evidence import Posterior
+from calib_ros.identification.evidence import Mixed, Posterior
 from calib_ros.identification.levels import KNOWN, UNUSUAL
 from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.identification.records import damaged, packed, parse_rows, unpacked
@@ -53,7 +53,9 @@ class Region(Shown):
     of the errors of its parameters `names` for the device that measured it. Another one adds the
     product of `device` (P, K) with itself. Predicted positions may be off by `limit` [m], which
     is infinite where the whole range of the joints is used; `share` is the share of it in use.
-    `base` and `tool` are the frames between which it was measured.
+    `base` and `tool` are the frames between which it was measured. `by_scale`, of none
+    that was loaded, is how probable it is that the device is out of scale and the arm gets worse
+    by it there.
     """
 
     chain: Chain
@@ -64,6 +66,7 @@ class Region(Shown):
     share: float
     base: str = 'base'
     tool: str = 'tool'
+    by_scale: float = 0.0
 
     def sigma(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
@@ -181,39 +184,30 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     order, limit = np.argsort(far), float(near.max())
     own, inside = judge.products(here), far[order] <= limit
     inner = own + judge.products(there[order[inside]])
-    if not max(judge.risk(own, own), judge.risk(inner, inner)) < RISK:
+    doubts = judge.of_the_arm(posterior.doubted)
+    if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
         return None
     shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
         added = judge.products(there[shell])
-        if not judge.risk(added, inner + added) < RISK:
+        if not judge.risk(added, inner + added, doubts) < RISK:
             break
         inner, limit = inner + added, float(far[shell[-1]])
+    by_scale = 0.0
+    if posterior.rival is not None:
+        more, _, mean, covariance = posterior.rival
+        out = float(special.expit(special.logit(UNUSUAL) + more))
+        doubts = judge.of_the_arm([(1.0, mean, covariance)])
+        by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
     share = float(np.mean(far <= limit))
     limit = np.inf if share == 1.0 else limit
     known = posterior.chain, posterior.names, posterior.square, posterior.device
-    return Region(*known, limit, share, *ends)
+    return Region(*known, limit, share, *ends, by_scale)
 
 
-def risk_of_scale(
-    posterior: Posterior, region: Region, sets: Sequence[Observations], freedom: float
-) -> float:
-    """Return how probable it is that the device is out of scale and the arm gets worse by it.
-
-    At the poses measured, or with them all over the region.
-    """
-    if posterior.rival is None:
-        return 0.0
-    more, _, mean, covariance = posterior.rival
-    other = replace(posterior, doubted=((1.0, mean, covariance),))
-    judge = _Judge(other, region.base, region.tool, freedom)
-    drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
-    own = judge.products(judge.rows(measured))
-    inner = own + judge.products(judge.rows(drawn[region.covers(drawn)]))
-    out = float(special.expit(special.logit(UNUSUAL) + more))
-    return out * max(judge.risk(own, own), judge.risk(inner, inner))
+_Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Weights (S,), means (S, A) and covariances (S, A, A) of the arm's A offsets."""
 
 
 class _Judge:
@@ -221,16 +215,13 @@ class _Judge:
 
     def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
         chain, names = posterior.chain, posterior.names
-        arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        self._arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
         frames = [*parameters_of(base), *parameters_of(tool)[:3]]
         self._placed, self._freedom = len(frames), freedom
         every = list(dict.fromkeys([*names, *frames]))
         self._model = ErrorModel(chain, every, base, tool)
-        self._own = [*map(every.index, frames), *arm]
-        self._offsets = posterior.offsets[arm]
-        weights, means, covariances = zip(*posterior.doubted, strict=True)
-        self._weights, self._means = np.array(weights), np.array(means)[:, arm]
-        self._covariances = np.array(covariances)[:, arm][:, :, arm]
+        self._own = [*map(every.index, frames), *self._arm]
+        self._offsets = posterior.offsets[self._arm]
 
     def rows(self, joints: FloatArray) -> FloatArray:
         """Return the rows (N, 3, P + F) of positions at joint values (N, n).
@@ -244,7 +235,12 @@ class _Judge:
         flat = rows[..., self._own].reshape(-1, len(self._own))
         return np.asarray(flat.T @ flat)
 
-    def risk(self, which: FloatArray, around: FloatArray) -> float:
+    def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
+        """Return what may be of all offsets, as in `Posterior.doubted`, for those of the arm."""
+        weights, means, covariances = (np.array(each) for each in zip(*doubted, strict=True))
+        return weights, means[:, self._arm], covariances[:, self._arm][:, :, self._arm]
+
+    def risk(self, which: FloatArray, around: FloatArray, doubts: _Doubts) -> float:
         """Return it for some poses, in frames fitted to those around; both by their products."""
         frames, arm = np.s_[: self._placed], np.s_[self._placed :]
         root = inverse_root(around[frames, frames], np.diag(around)[frames])
@@ -253,8 +249,9 @@ class _Judge:
         left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
         slope = left @ self._offsets
         gain = float(slope @ self._offsets)
-        margins = self._means @ slope - 0.5 * gain
-        spreads = np.sqrt(np.maximum(self._covariances @ slope @ slope, 0.0))
+        weights, means, covariances = doubts
+        margins = means @ slope - 0.5 * gain
+        spreads = np.sqrt(np.maximum(covariances @ slope @ slope, 0.0))
         with np.errstate(divide='ignore', invalid='ignore'):
             risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
-        return float(self._weights @ np.where(spreads > 0.0, risks, margins <= 0.0))
+        return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

@@ -23,6 +23,11 @@ Sets: TypeAlias = tuple[Observations, ...]
 Change: TypeAlias = Callable[[Observations], Observations]
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
+ANGLES = (
+    ('degrees', 'radians', 'deg', np.radians(1.0)),
+    ('radians', 'degrees', 'rad', np.degrees(1.0)),
+)
+"""The unit that angles are in, the one that was given, its option, and its size in that."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
 
@@ -92,10 +97,7 @@ def _measured(found: Iterator[Suspect]) -> Iterator[Suspect]:
 
 def _of_places(chain: Chain) -> Iterator[Suspect]:
     """Yield what may be wrong about joint values and the arm."""
-    for one, other, unit, size in (
-        ('degrees', 'radians', 'deg', np.radians(1.0)),
-        ('radians', 'degrees', 'rad', np.degrees(1.0)),
-    ):
+    for one, other, unit, size in ANGLES:
         what = f'the joint values are in {one}, not {other}'
         change = _of_kind(chain, 'revolute', size)
         yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
@@ -255,10 +257,7 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
     turning = [k for k, joint in enumerate(chain.joints) if joint.type == 'revolute']
     for k in turning if len(turning) > 1 else ():
         name, column = chain.joint_names[k], f'q{k + 1}'
-        for one, others, size in (
-            ('degrees', 'radians', np.radians(1.0)),
-            ('radians', 'degrees', np.degrees(1.0)),
-        ):
+        for one, others, _, size in ANGLES:
             what = f'{name} is in {one}, the other joints in {others}'
             factor = np.ones(len(chain.joints))
             factor[k] = size

@@ -37,7 +37,6 @@ from calib_ros.identification.leastsquares import stacked
 from calib_ros.identification.levels import CLEARLY, NEARER, SCALE, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.identification.region import risk_of_scale
 from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import SUSPICIOUS
 from calib_ros.identification.sizes import SPREAD, TYPICAL
@@ -118,7 +117,7 @@ def _common(
 
 def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     """Return the suspicion of a common scale in words, and whether it is refused."""
-    if text := _out_of_scale(problem, result):
+    if text := _out_of_scale(result):
         return text, True
     scale, std, freedom = scale_of(problem, result)
     if freedom < 2.0 or abs(scale) < LEAST_SCALE:
@@ -132,13 +131,10 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     return text + ('no arm does' if certain else advice), certain
 
 
-def _out_of_scale(problem: Problem, result: Identification) -> str:
+def _out_of_scale(result: Identification) -> str:
     """Return in words that the scale of the device may make the calibrated arm worse."""
     region, rival = result.region, result.posterior.rival
-    if result.refusals or region is None or rival is None:
-        return ''
-    freedom = result.uncertainty.overall
-    if risk_of_scale(result.posterior, region, problem.sets, freedom) < HARMFUL:
+    if result.refusals or region is None or rival is None or region.by_scale < HARMFUL:
         return ''
     return (
         f'{_grown(rival[1])}, as by a measuring device that is out of scale; '

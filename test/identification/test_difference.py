@@ -140,6 +140,16 @@ def test_what_a_parameter_shares_with_others_is_a_share():
     assert 0.1 < left[3] < 1.0
 
 
+def test_what_moves_nothing_takes_no_share(nights):
+    """A weight at the end of the last link, on its axis, turns no joint but by rounding."""
+    _, first = nights
+    still = Parameter('wrist_3_joint.gravity_wrist_3_joint')
+    chain = first.chain.with_effects([still])
+    others = [Parameter('wrist_1_joint.theta'), Parameter('wrist_1_joint.beta')]
+    taken, _ = gauged(chain, [*map(Parameter, first.names), still], others, free=False)
+    np.testing.assert_allclose(taken[-1], 0.0, atol=1e-9)
+
+
 def test_what_cannot_be_compared_is_refused(nights):
     _, first = nights
     with pytest.raises(InputError, match='calibration 2 does not hold the covariance'):
