@@ -38,15 +38,18 @@ def missed(compensator, command, joints, approach=None):
     return np.linalg.norm(errors, axis=2)
 
 
+def twist(start, end):
+    """Return shifts [m] and turns [rad] (N, 6) from poses to poses (N, 4, 4)."""
+    turn = se3.log_rotation(end[:, :3, :3] @ np.swapaxes(start[:, :3, :3], 1, 2))
+    return np.concatenate([end[:, :3, 3] - start[:, :3, 3], turn], axis=1)
+
+
 def numeric_jacobian(chain, q, weight=1.0, step=1e-6):
     """Return (N, 6, n) by central differences of the forward kinematics."""
     chain, columns = bare(chain), []
     for move in step * np.eye(q.shape[1]):
-        ahead, behind = chain.forward(q + move), chain.forward(q - move)
-        turn = se3.log_rotation(ahead[:, :3, :3] @ np.swapaxes(behind[:, :3, :3], 1, 2))
-        shift = ahead[:, :3, 3] - behind[:, :3, 3]
-        columns.append(np.concatenate([shift, weight * turn], axis=1) / (2 * step))
-    return np.stack(columns, axis=2)
+        columns.append(twist(chain.forward(q - move), chain.forward(q + move)) / (2 * step))
+    return np.stack(columns, axis=2) * np.repeat([1.0, weight], 3)[:, np.newaxis]
 
 
 def regular(chain, count, seed=0, margin=0.05, least=None):

@@ -323,18 +323,15 @@ def test_shuffled_rows_have_not_lost_one(count):
 @pytest.mark.parametrize('oriented', [True, False])
 @pytest.mark.parametrize('joint', [0, 2, 5])
 def test_one_joint_in_another_unit_than_the_others_is_named(joint, oriented):
-    chain, rng = load_chain('ur10e'), np.random.default_rng(5)
-    seen = measure(
-        faulty(chain, Cell(), rng), chain.random_joints(60, rng), rng, 1e-4, 3e-4, oriented
-    )
+    seen = seen_of(seed=5, count=60, oriented=oriented)
     for factor, words in (
         (np.degrees(1.0), 'is in degrees, the other joints in radians'),
         (np.radians(1.0), 'is in radians, the other joints in degrees'),
     ):
         mixed = seen.joints.copy()
         mixed[:, joint] *= factor
-        said = str(explained(Problem(chain, replace(seen, joints=mixed))))
-        assert said.startswith(f'{chain.joint_names[joint]} {words}: --columns q{joint + 1}=')
+        said = str(explained(Problem(UR, replace(seen, joints=mixed))))
+        assert said.startswith(f'{UR.joint_names[joint]} {words}: --columns q{joint + 1}=')
 
 
 @pytest.mark.parametrize('oriented', [True, False])
@@ -354,13 +351,10 @@ def test_two_joints_in_another_unit_than_the_others_are_named(oriented):
 @pytest.mark.parametrize('oriented', [True, False])
 @pytest.mark.parametrize(('columns', 'words'), [([1], 'y'), ([0, 2], 'x, z')])
 def test_columns_that_never_change_are_named(columns, words, oriented):
-    chain, rng = load_chain('ur10e'), np.random.default_rng(5)
-    seen = measure(
-        faulty(chain, Cell(), rng), chain.random_joints(60, rng), rng, 1e-4, 3e-4, oriented
-    )
+    seen = seen_of(seed=5, count=60, oriented=oriented)
     places = seen.positions.copy()
     places[:, columns] = places[0, columns]
-    result = identify(Problem(chain, replace(seen, positions=places)))
+    result = identify(Problem(UR, replace(seen, positions=places)))
     assert f'all positions have the same {words}, though' in result.refusals[0]
     assert f'was the column {words} recorded' in result.refusals[0]
 

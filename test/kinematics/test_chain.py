@@ -20,36 +20,22 @@ def row_of(alphas, convention, types='rrrrrr'):
 
 
 @pytest.mark.parametrize(
-    ('alphas', 'convention', 'parallel'),
+    ('alphas', 'convention', 'types', 'parallel'),
     [
         # A row leads from its axis to the next (standard) or from the one before (modified).
-        ((HALF, 0.0, 0.0, HALF, -HALF, 0.0), 'standard', ('j2', 'j3')),
-        ((0.0, HALF, 0.0, 0.0, HALF, -HALF), 'modified', ('j3', 'j4')),
-        ((0.0, 0.0), 'standard', ('j1',)),
-        ((0.0, 0.0), 'modified', ('j2',)),
-        ((HALF, np.pi, HALF), 'standard', ('j2',)),
-        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', ('j2',)),
+        ((HALF, 0.0, 0.0, HALF, -HALF, 0.0), 'standard', 'rrrrrr', ('j2', 'j3')),
+        ((0.0, HALF, 0.0, 0.0, HALF, -HALF), 'modified', 'rrrrrr', ('j3', 'j4')),
+        ((HALF, np.pi, HALF), 'standard', 'rrr', ('j2',)),
+        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', 'rrrr', ('j2',)),
+        # Axes that are parallel count unless both are prismatic.
+        ((0.0, 0.0, 0.0), 'standard', 'rpr', ('j1', 'j2')),
+        ((0.0, 0.0, 0.0), 'standard', 'rpp', ('j1',)),
+        ((0.0, 0.0, 0.0), 'modified', 'rrp', ('j2', 'j3')),
+        ((0.0, 0.0, 0.0), 'modified', 'rpp', ('j2',)),
     ],
 )
-def test_parallel_by_convention_and_tilt(alphas, convention, parallel):
-    assert row_of(alphas, convention).parallel == parallel
-
-
-@pytest.mark.parametrize(
-    ('types', 'convention', 'parallel'),
-    [
-        ('rrr', 'standard', ('j1', 'j2')),
-        ('rpr', 'standard', ('j1', 'j2')),
-        ('rpp', 'standard', ('j1',)),
-        ('rpr', 'modified', ('j2', 'j3')),
-        ('rrp', 'modified', ('j2', 'j3')),
-        ('rpp', 'modified', ('j2',)),
-    ],
-)
-def test_rows_that_join_parallel_axes_are_found_unless_both_are_prismatic(
-    types, convention, parallel
-):
-    assert row_of((0.0, 0.0, 0.0), convention, types).parallel == parallel
+def test_parallel_by_convention_tilt_and_type(alphas, convention, types, parallel):
+    assert row_of(alphas, convention, types).parallel == parallel
 
 
 def test_a_nominal_beta_tilts_the_axis():
@@ -74,11 +60,6 @@ def test_a_nominal_beta_tilts_the_axis():
 def test_a_joint_ranges_over_its_limits_and_a_whole_stroke_without(kind, lower, upper, expected):
     found = Joint('j', kind, lower=lower, upper=upper).range
     assert found == pytest.approx(expected, abs=1e-12)
-
-
-def test_a_joint_drives_its_angle_or_its_length():
-    assert Joint('j').driven.kind == 'theta'
-    assert Joint('j', 'prismatic').driven.kind == 'd'
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import fitted
+from commanded import twist
+from fits import NOISE, SIGMAS, UR10E, fitted
 
 from calib_ros.apply.simulation import Cell, faulty, random_frame
 from calib_ros.errors import ConfigError, UnknownNameError
@@ -16,8 +17,6 @@ from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 
-NOISE = (5e-5, 2e-4)
-UR10E = load_chain('ur10e')
 GEARED = replace(
     UR10E,
     joints=tuple(
@@ -75,11 +74,10 @@ def test_every_column_is_the_central_difference(chain, rng):
     for k, name in enumerate(names):
         # phi of compliance are N m, up to some 100; values change by 1e-5 rad, as all others do
         step = 1e-6 if name.endswith('compliance') else 1e-5
-        ahead = chain.with_offsets({name: step}).forward(q, approach)
-        behind = chain.with_offsets({name: -step}).forward(q, approach)
-        turn = se3.log_rotation(ahead[:, :3, :3] @ np.swapaxes(behind[:, :3, :3], 1, 2))
-        shift = ahead[:, :3, 3] - behind[:, :3, 3]
-        difference = np.concatenate([shift, turn], axis=1) / (2.0 * step)
+        ahead, behind = (
+            chain.with_offsets({name: size}).forward(q, approach) for size in (step, -step)
+        )
+        difference = twist(behind, ahead) / (2.0 * step)
         size = max(1.0, np.abs(difference).max())
         np.testing.assert_allclose(jacobian[:, :, k] / size, difference / size, atol=1e-7)
 
@@ -204,10 +202,7 @@ def test_a_group_is_recovered_on_poses_that_were_not_fitted(unsearched, group):
         """Return the RMS error [m] on unseen poses of a fit to an arm with given effects."""
         poses = by_hand(true, values, q, came)
         seen = observed(poses, q, came, np.random.default_rng(noise))
-        problem = Problem(
-            fitted, seen, effects=named, sigma_position=NOISE[0], sigma_orientation=NOISE[1]
-        )
-        result = identify(problem)
+        result = identify(Problem(fitted, seen, effects=named, **SIGMAS))
         assert result.converged
         error = result.chain.forward(unseen, comes) - by_hand(true, values, unseen, comes)
         return float(np.sqrt((error[:, :3, 3] ** 2).sum(axis=1).mean()))
@@ -229,8 +224,7 @@ def test_standard_deviations_of_effects_are_honest(group):
         q = nominal.random_joints(80, rng)
         came = rng.choice([-1.0, 1.0], q.shape)
         seen = observed(by_hand(true, values, q, came), q, came, rng)
-        sigmas = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
-        result = fitted(Problem(nominal, seen, effects=(group,), **sigmas))
+        result = fitted(Problem(nominal, seen, effects=(group,), **SIGMAS))
         found = {p.name: p for p in result.parameters}
         # gravity turns no joint about a vertical axis: of its compliance only the prior is known
         scores += [
@@ -335,21 +329,6 @@ def test_a_chain_file_keeps_gravity_and_masses_where_no_effect_is_known_yet(rng)
         rtol=0,
         atol=1e-12,
     )
-
-
-def test_effects_shift_joint_values_and_nothing_else(rng):
-    chain = faulty(UR10E, Cell(), rng)
-    _, values = truth('eccentricity', rng)
-    q = chain.random_joints(30, rng)
-    approach = np.zeros_like(q)
-    np.testing.assert_allclose(
-        chain.with_effect_values(values).forward(q),
-        by_hand(chain, values, q, approach),
-        rtol=0,
-        atol=1e-14,
-    )
-    zero = chain.with_effects(tuple(values))
-    np.testing.assert_array_equal(zero.forward(q), chain.forward(q))
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commanded import numeric_jacobian, twist
 from hypothesis import given, strategies as st
 
 from calib_ros.apply import simulation
@@ -11,7 +12,6 @@ from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
 from calib_ros.kinematics.inverse import limits, solve
 from calib_ros.kinematics.newton import solve_positive
-from calib_ros.kinematics.se3 import log_rotation
 from calib_ros.values import SAME
 
 
@@ -25,11 +25,10 @@ def test_poses_are_reached_from_nearby(robot, rng):
     wanted = chain.forward(q)
     found = solve(chain, wanted, start)
     assert found.converged.mean() > 0.97
-    poses = chain.forward(found.joints)
-    distance = np.linalg.norm(poses[:, :3, 3] - wanted[:, :3, 3], axis=1)
-    turn = log_rotation(poses[:, :3, :3] @ np.swapaxes(wanted[:, :3, :3], 1, 2))
+    away = twist(wanted, chain.forward(found.joints))
+    distance, turn = (np.linalg.norm(each, axis=1) for each in (away[:, :3], away[:, 3:]))
     np.testing.assert_allclose(distance, found.position, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(turn, axis=1), found.orientation, atol=1e-7)
+    np.testing.assert_allclose(turn, found.orientation, atol=1e-7)
     assert distance[found.converged].max() <= SAME
     assert ((lower <= found.joints) & (found.joints <= upper)).all()
     if len(chain.joints) < 7:
@@ -45,14 +44,7 @@ def test_redundant_arms_move_as_little_as_needed(rng):
     found = solve(chain, wanted, q)
     step = found.joints - q
     assert found.converged.all()
-    h = 1e-6
-    jacobian = np.empty((len(q), 6, 7))
-    for i in range(7):
-        there, back = (chain.forward(q + sign * h * np.eye(7)[i]) for sign in (1.0, -1.0))
-        jacobian[:, :3, i] = (there - back)[:, :3, 3] / (2.0 * h)
-        turn = there[:, :3, :3] @ np.swapaxes(back[:, :3, :3], 1, 2)
-        jacobian[:, 3:, i] = log_rotation(turn) / (2.0 * h)
-    free = np.linalg.svd(jacobian)[2][:, -1]
+    free = np.linalg.svd(numeric_jacobian(chain, q))[2][:, -1]
     along = np.abs(np.einsum('ni,ni->n', step, free))
     assert np.median(along / np.linalg.norm(step, axis=1)) < 1e-2
 

@@ -62,12 +62,9 @@ def test_any_serial_arm_moves_as_its_urdf(convention, seed):
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
 @pytest.mark.parametrize('text', [UR10E, PANDA, IIWA, SCARA], ids=['ur', 'panda', 'iiwa', 'scara'])
-def test_known_robots(text, convention, rng):
+def test_tables_of_known_robots_are_complete(text, convention):
     tip = 'panda_hand' if text is PANDA else None
     chain = chain_from_urdf(text, tip_link=tip, convention=convention)
-    q = some_joints(chain, rng, 20)
-    poses = poses_of(text, chain, q, tip=tip)
-    np.testing.assert_allclose(chain.forward(q), poses, rtol=0.0, atol=EXACT)
     revolute = sum(joint.type == 'revolute' for joint in chain.joints)
     free = replace(chain, base=None, tool=None)
     complete = 4 * revolute + 2 * (len(chain.joints) - revolute) + 6
@@ -92,14 +89,6 @@ def test_panda_has_the_table_of_its_maker():
     assert chain.joints == load_chain('franka_panda').joints
     np.testing.assert_array_equal(chain.base.matrix, np.eye(4))
     np.testing.assert_allclose(chain.tool.matrix, np.eye(4), atol=1e-15)
-
-
-def test_iiwa_has_the_dimensions_of_the_shipped_table():
-    chain, shipped = chain_from_urdf(IIWA), load_chain('kuka_iiwa14')
-    np.testing.assert_allclose(chain.table[:, 2], shipped.table[:, 2], atol=EXACT)
-    np.testing.assert_allclose(np.abs(chain.table[:, 1]), np.abs(shipped.table[:, 1]), atol=EXACT)
-    offsets = np.array([0.00043624, 0, 0.00043624, 0, 0, 0, 0])  # of the URDF; the arm has none
-    np.testing.assert_allclose(np.abs(chain.table[:, 0]), offsets, atol=EXACT)
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
@@ -207,13 +196,6 @@ SIDE_BRANCH = with_masses(
         'l6': (1.0, (0.03, 0.02, 0.01)),
     },
 )
-
-
-def test_gravity_turns_with_the_first_frame():
-    chain = chain_from_urdf(SIDE_BRANCH, 'l0', 'l6')
-    assert not np.allclose(chain.gravity, [0.0, 0.0, -9.81], atol=1.0)
-    down = chain.base.matrix[:3, :3] @ chain.gravity
-    np.testing.assert_allclose(down, [0.0, 0.0, -9.81], atol=EXACT)
 
 
 # ---- links, and what is refused

@@ -50,15 +50,6 @@ def test_standing_is_what_its_definition_says(seed):
     assert made.standing(5e-4, 0.1).tolist() == expected
 
 
-def test_a_stop_begins_when_the_joints_do_not_move_any_longer():
-    ramp = [(ms, (1e-3 * max(0, 300 - ms), 0.0)) for ms in range(0, 300, 2)]
-    stand = [(ms, (0.0, 0.0)) for ms in range(300, 800, 2)]
-    leave = [(ms, (0.0, 1e-3 * (ms - 800))) for ms in range(800, 1000, 2)]
-    ((begin, end),) = filled([*ramp, *stand, *leave]).standing(5e-4, 0.1).tolist()
-    assert abs(begin - 300 * MS) <= 4 * MS
-    assert abs(end - 800 * MS) <= 4 * MS
-
-
 def test_all_publishers_must_stand():
     made = filled([(ms, (max(0.0, 0.3 - 1e-3 * ms),)) for ms in range(0, 1000, 10)], (0,))
     fill(made, [(ms, (max(0.0, 1e-3 * ms - 0.7),)) for ms in range(0, 1000, 10)], (1,))

@@ -14,10 +14,6 @@ from calib_ros.sampling.messages import (
 )
 
 
-def test_a_topic_alone_is_a_source():
-    assert parse_source('/tracker/pose') == Source('/tracker/pose')
-
-
 def test_keys_in_any_order():
     source = parse_source(
         '/cam  target=board eye_in_hand=true type=PoseStamped device=left validation=true'
