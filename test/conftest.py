@@ -34,6 +34,14 @@ def unsearched(monkeypatch):
 
 
 @pytest.fixture
+def table(tmp_path):
+    """Return the path of a table of what was measured of a UR5e."""
+    from measured import measured, rows_of, write_csv
+
+    return write_csv(tmp_path / 'cell.csv', rows_of(measured()))
+
+
+@pytest.fixture
 def run(capsys, tmp_path, monkeypatch):
     """Return a function that runs a command in `tmp_path`: status, output and errors."""
     from calib_ros.cli.main import main

@@ -95,22 +95,33 @@ def text_message(text='hello'):
     return TYPES['std_msgs/msg/String'](text)
 
 
+def write(path, types, content, storage='mcap', mode='none'):
+    """Write (topic, log time, bytes) in the order given, of topics with their types."""
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if mode != 'none':
+        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
+    with writer:
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
+            for topic, kind in types.items()
+        }
+        for topic, time, data in content:
+            writer.write(connections[topic], time, data)
+    return path
+
+
+def serialised(message):
+    return bytes(TYPESTORE.serialize_cdr(message, message.__msgtype__))
+
+
 def record(path, events, storage='mcap', silent=(), behind=b''):
     """Write (topic, message) in the order given; `silent` topics (topic, type) get none.
 
     Some bytes may stand behind each message.
     """
-    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
-            for topic, kind in dict(
-                [*silent, *((topic, message.__msgtype__) for topic, message in events)]
-            ).items()
-        }
-        for k, (topic, message) in enumerate(events):
-            data = TYPESTORE.serialize_cdr(message, message.__msgtype__)
-            writer.write(connections[topic], k + 1, bytes(data) + behind)
-    return path
+    types = dict([*silent, *((topic, message.__msgtype__) for topic, message in events)])
+    content = [(topic, k, serialised(m) + behind) for k, (topic, m) in enumerate(events, 1)]
+    return write(path, types, content, storage)
 
 
 def standing(messages, topic='/pose'):
@@ -157,24 +168,16 @@ def assert_equal(found, expected):
 def record_in_chunks(path, storage, mode='none', log_time=lambda k, rng: k):
     """Write 300 messages in some chunks of 1 MB, filled with long texts that nobody wants."""
     rng = np.random.default_rng(7)
-    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
-    if mode != 'none':
-        writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
     types = {each.topic: each.type for each in STREAMS.values()} | {'/x': 'std_msgs/msg/String'}
-    with writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
-            for topic, kind in types.items()
-        }
-        for k in range(300):
-            topic, message = '/joint_states', joint_state((k + 1) * 10 * MS, rng.normal(size=3))
-            if k % 3 == 1:
-                topic, message = '/pose', pose_stamped((k + 1) * 10 * MS, rng.normal(size=3))
-            elif k % 10 == 0:
-                topic, message = '/x', text_message(rng.bytes(200_000).hex())
-            data = TYPESTORE.serialize_cdr(message, types[topic])
-            writer.write(connections[topic], 10 + int(log_time(k, rng)), data)
-    return path
+    content = []
+    for k in range(300):
+        topic, message = '/joint_states', joint_state((k + 1) * 10 * MS, rng.normal(size=3))
+        if k % 3 == 1:
+            topic, message = '/pose', pose_stamped((k + 1) * 10 * MS, rng.normal(size=3))
+        elif k % 10 == 0:
+            topic, message = '/x', text_message(rng.bytes(200_000).hex())
+        content.append((topic, 10 + int(log_time(k, rng)), serialised(message)))
+    return write(path, types, content, storage, mode)
 
 
 def damage(path, share=None, metadata=True):

@@ -140,6 +140,18 @@ class Cell:
         self.spin_until(future.done)
         return future.result()
 
+    def done(self, *call, **more):
+        """Call a service that does what it is asked for; return its answer."""
+        answer = self.call(*call, **more)
+        assert answer.success, answer.message
+        return answer
+
+    def refused(self, *call, **more):
+        """Call a service that does not do what it is asked for; return its answer."""
+        answer = self.call(*call, **more)
+        assert not answer.success, answer.message
+        return answer
+
     def in_full(self, answer):
         """Return an answer of ~/identify in full: what stands beside the journal if it was cut."""
         _, cut, name = answer.message.partition(' ... all of it: ')

@@ -227,13 +227,12 @@ def test_a_covariance_that_is_none_is_refused_everywhere(tmp_path, bad):
 
 
 def test_a_covariance_of_the_position_alone_is_identified(rng):
-    arm = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
-    q = arm.random_joints(30, rng)
-    plain = measure(arm.with_offsets({'b.a': 1e-3}), q, rng, 1e-5, 1e-4)
+    q = ARM.random_joints(30, rng)
+    plain = measure(ARM.with_offsets({'b.a': 1e-3}), q, rng, 1e-5, 1e-4)
     found = []
     for rotation in (0.0, 1e-8):
         covariance = np.tile(np.diag([1e-10] * 3 + [rotation] * 3), (30, 1, 1))
-        problem = Problem(arm, replace(plain, covariance=covariance), sigma_orientation=1e-4)
+        problem = Problem(ARM, replace(plain, covariance=covariance), sigma_orientation=1e-4)
         found.append(identify(problem).chain.value('b.a'))
     assert found[0] == pytest.approx(found[1], abs=1e-12)
 

@@ -8,16 +8,13 @@ import re
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
-from dataclasses import fields
 from pathlib import Path
 
-import pytest
 import yaml
 from test_architecture import MODULES, imports
 
 import calib_ros
-from calib_ros.ros.arguments import BESIDE_SETTINGS, PARAMETERS
-from calib_ros.settings import Settings
+from calib_ros.ros.arguments import PARAMETERS
 
 ROOT = Path(__file__).parents[1]
 JAZZY = {
@@ -105,29 +102,17 @@ def test_the_oldest_versions_are_those_that_pip_may_install():
     assert [name for name, _, marker in pins if marker == '>='] == ['matplotlib']
 
 
-def test_the_parameter_file_states_the_defaults():
-    content = yaml.safe_load((ROOT / 'config/calibration_node.yaml').read_text())
-    stated = content['/**']['ros__parameters']
-    for each in BESIDE_SETTINGS:
-        assert stated[each.name] == (each.default if each.default != () else [''])
-    for item in fields(Settings):
-        if isinstance(item.default, tuple):
-            assert stated[item.name] == ['']
-        elif isinstance(item.default, str):
-            assert stated[item.name] == item.default
-        else:
-            assert stated[item.name] == pytest.approx(item.default, rel=1e-5)
+ROOMS = ('node', 'identifying', 'advisor', 'outputs')
+NODE = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in ROOMS)
 
 
 def test_foxglove_shows_what_the_node_has():
     layout = json.loads((ROOT / 'config/foxglove_layout.json').read_text())
-    rooms = ('node', 'identifying', 'advisor', 'outputs')
-    node = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in rooms)
     panels = layout['configById']
     names = {*re.findall('/calibration_node/([a-z_]+)', json.dumps(panels))}
     assert {'identify', 'residuals', 'status'} <= names
     for name in names:
-        assert f"'~/{name}'" in node
+        assert f"'~/{name}'" in NODE
     assert {*re.findall(r'"([A-Za-z0-9]+![a-z]+)"', json.dumps(layout['layout']))} == {*panels}
 
 
@@ -135,10 +120,8 @@ def test_rviz_shows_what_the_node_publishes():
     content = yaml.safe_load((ROOT / 'config/calibration.rviz').read_text())
     manager = content['Visualization Manager']
     topics = {d['Class']: d['Topic'] for d in manager['Displays'] if 'Topic' in d}
-    rooms = ('node', 'identifying', 'advisor', 'outputs')
-    node = ''.join((ROOT / f'calib_ros/ros/{name}.py').read_text() for name in rooms)
     for topic in topics.values():
-        assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in node
+        assert f"'{topic['Value'].replace('/calibration_node', '~')}'" in NODE
     # These are published once: a display that comes later must ask for the last ones.
     for kind in ('MarkerArray', 'PointCloud2'):
         latched = topics[f'rviz_default_plugins/{kind}']

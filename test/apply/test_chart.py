@@ -18,10 +18,6 @@ def test_the_average_run_length_is_that_of_the_tables(slope, height, nights):
     assert run_length(slope, height) == pytest.approx(nights, rel=0.03)
 
 
-def test_more_steps_change_nothing():
-    assert run_length(0.5, 5.0, 600) == pytest.approx(run_length(0.5, 5.0), rel=0.01)
-
-
 def test_false_alarms_are_as_rare_as_said():
     """Of 300 robots with 200 nights each, one false alarm a year: 164 in all, give or take."""
     rng = np.random.default_rng(1)

@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from designs import design_of
 from scipy import stats
 
 from calib_ros.apply import simulation, verification
 from calib_ros.apply.candidates import Visibility, iso_9283_poses
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.confidence import rms_interval, rms_limits
-from calib_ros.apply.design import Design
 from calib_ros.apply.verification import Attained, verify
 from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
@@ -48,12 +48,6 @@ def arm(cell):
 def program():
     """Return the joint values of the five test poses."""
     return iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints
-
-
-def design_of(chain, oriented=True):
-    rng = np.random.default_rng(0)
-    imagined = simulation.measure(chain, np.zeros((1, len(chain.joints))), rng, oriented=oriented)
-    return Design.of(Problem(chain, imagined))
 
 
 def measured(true, joints, repeats=3, noise=NOISE, seed=1):
@@ -431,18 +425,17 @@ def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, capsy
     assert 'this judges the calibration' not in capsys.readouterr().out
 
 
-def test_verify_refuses_what_makes_no_sense(cell, folder, capsys):
-    write_table(folder / 'measured.csv', measured(cell[0], UR.random_joints(3, np.random)))
-    common = ['verify', 'measured.csv', '--chain', 'ur10e', '--calibration', 'result']
-    for arguments, text in (
-        ([*common, '--tolerance', '1'], 'at least 5 are needed'),
-        ([*common, '--tolerance', '0'], 'tolerance must be positive'),
-        ([*common, '--tolerance', 'inf'], 'tolerance must be positive'),
-        ([*common[:-1], 'missing', '--tolerance', '1'], 'missing'),
-        (['verify', 'none.csv', *common[2:], '--tolerance', '1'], 'cannot read none.csv'),
-    ):
-        assert main(arguments) == 1
-        assert text in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ('table', 'calibration', 'said'),
+    [
+        ('none.csv', 'result', 'cannot read none.csv'),
+        ('measured.csv', 'missing', 'there is no calibration at missing'),
+    ],
+)
+def test_verify_needs_what_it_is_given(folder, capsys, table, calibration, said):
+    given = ['verify', table, '--chain', 'ur10e', '--calibration', calibration]
+    assert main([*given, '--tolerance', '1']) == 1
+    assert said in capsys.readouterr().err
 
 
 def test_plan_writes_test_poses_that_are_seen(folder, capsys):

@@ -5,8 +5,6 @@
 import pytest
 from measured import TRAIN, measured, rows_of, write_csv
 
-from calib_ros.cli.main import main
-
 
 def bad_inputs():
     """Yield the name of a bad input, its arguments, and what the complaint must hold."""
@@ -104,29 +102,3 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     assert complaint in err
     assert err.count('\n') == 1
     assert err.endswith('\n')
-
-
-@pytest.mark.parametrize(
-    'arguments',
-    [
-        (),
-        ('calibrate',),
-        ('identify', '--csv', 'cell.csv'),
-        ('identify', '--chain', 'ur5e', '--csv', 'cell.csv', '--folds', 'five'),
-        ('simulate', 'bag', '--chain', 'ur5e', '--storage', 'rosbag1'),
-    ],
-)
-def test_wrong_usage_is_status_2(run, arguments):
-    with pytest.raises(SystemExit) as caught:
-        run(*arguments)
-    assert caught.value.code == 2
-
-
-@pytest.mark.parametrize('command', ['identify', 'plan', 'verify', 'import'])
-def test_help_tells_defaults_only_where_there_are_some(capsys, command):
-    with pytest.raises(SystemExit):
-        main([command, '--help'])
-    text = ' '.join(capsys.readouterr().out.split())
-    for nothing in ('(default: None)', '(default: )', '(default: False)'):
-        assert nothing not in text
-    assert command == 'import' or '(default: ' in text

@@ -90,30 +90,6 @@ def test_json_is_one_document_with_all_the_keys(written):
     assert after < 0.2 < 0.5 < before
 
 
-def test_the_identified_parameters_are_the_true_ones(written):
-    _, document = written
-    deviations = [
-        (parameter['value'] - TRUE.value(name)) / parameter['std']
-        for name, parameter in document['parameters'].items()
-        if parameter['std'] is not None and name.partition('.')[0] not in ('base', 'tool')
-    ]
-    assert len(deviations) == 18
-    assert np.abs(deviations).max() < 4.0
-    assert 0.4 < np.sqrt(np.mean(np.square(deviations))) < 1.7
-
-
-def test_a_result_is_a_verdict_and_six_rows(run, table):
-    status, out, err = run('identify', table, '--chain', 'ur5e')
-    assert (status, err) == (0, '')
-    lines = out.splitlines()
-    assert lines[0].startswith('accepted: ')
-    assert [line[:20].strip() for line in lines[1:7]] == [
-        *('robot', 'fitted to', 'position error', 'orientation error', 'judged by', 'valid')
-    ]
-    assert f'{TEST} held-out poses' in lines[5]
-    assert max(map(len, lines)) <= 80
-
-
 def test_out_writes_every_file(written):
     files = contents(written[0])
     assert files.keys() == set(RESULT_FILES)
@@ -231,27 +207,14 @@ def test_demo_shows_the_whole_way(run, tmp_path):
         assert (tmp_path / 'demo' / note).read_text() == 'mine'
 
 
-def nothing_to_gain(seed=5, held_out=TEST):
-    return rows_of(measured(UR, seed=seed), held_out)
-
-
-@pytest.mark.parametrize(('held_out', 'seed'), [(TEST, 5), (0, 6)])
-def test_where_nothing_is_to_gain_nothing_is_claimed(identified, tmp_path, seed, held_out):
-    table = write_csv(tmp_path / 'cell.csv', nothing_to_gain(seed, held_out))
-    status, document = identified('--csv', table, '--chain', 'ur5e')
-    assert status == Status.NOT_ACCEPTED == 3
-    assert document['accepted'] is False
-    assert 'no gain on held-out poses' in document['refusals'][0]
-
-
 def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, written, tmp_path):
     out = tmp_path / 'out'
     shutil.copytree(written[0], out)
     accepted = (out / 'calibration.yaml').read_bytes()
-    worse = write_csv(tmp_path / 'worse.csv', nothing_to_gain())
+    worse = write_csv(tmp_path / 'worse.csv', rows_of(measured(UR)))
     arguments = ('identify', '--csv', worse, '--chain', 'ur5e', '--out', out, '--force')
     status, said, _ = run(*arguments)
-    assert status == Status.NOT_ACCEPTED
+    assert status == Status.NOT_ACCEPTED == 3
     assert 'NOT accepted' in said
     assert (out / 'calibration.previous.yaml').read_bytes() == accepted
     assert contents(out).keys() == {*RESULT_FILES, 'calibration.previous.yaml'} - {

@@ -130,6 +130,14 @@ def test_help_of_a_command_is_that_command_with_help(shown):
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
         (('robots', 'ur5e'), '"ur5e" is one too many'),
         (('chain',), 'required: ROBOT'),
+        (
+            ('identify', 'measured.csv', '--chain', 'ur5e', '--folds', 'five'),
+            "invalid int value: 'five'",
+        ),
+        (
+            ('simulate', 'bag', '--chain', 'ur5e', '--storage', 'rosbag1'),
+            "invalid choice: 'rosbag1'",
+        ),
     ],
 )
 def test_wrong_usage_ends_with_an_example_of_that_command(shown, given, wrong):

@@ -24,6 +24,14 @@ def open_archive(folder, robot='arm', joints=2):
     return Archive(folder, robot, joints, lambda: 'settings: none\n')
 
 
+def written(folder, *numbers, robot='arm'):
+    """Write a journal with samples of these numbers, and close it."""
+    archive = open_archive(folder, robot)
+    for number in numbers:
+        archive.add(sample(number))
+    archive.close()
+
+
 def stamps(folder, robot='arm'):
     """Return the stamps that a resumed session has, while another may still write."""
     with TemporaryDirectory() as copy:
@@ -60,9 +68,7 @@ def test_robots_with_long_names_have_files_of_their_own(tmp_path):
 def test_robots_with_similar_names_have_files_of_their_own(tmp_path):
     robots = [f'arm/{name}' for name in ('12_3', '12/3', '12//3', '12 3', '12%2F3', '12%203', 'ö')]
     for k, robot in enumerate(robots):
-        archive = open_archive(tmp_path, robot)
-        archive.add(sample(k))
-        archive.close()
+        written(tmp_path, k, robot=robot)
     assert [stamps(tmp_path, robot) for robot in robots] == [[k] for k in range(len(robots))]
     names = sorted(path.name.rpartition('_')[0] for path in tmp_path.glob('*Z.csv'))
     assert {'arm_12_3', 'arm_12%2F3', 'arm_ö'} < set(names)
@@ -87,9 +93,7 @@ def test_the_newest_journal_is_resumed_when_the_clock_was_set_back(tmp_path):
 
 
 def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
-    first = open_archive(tmp_path)
-    first.add(sample(1))
-    first.close()
+    written(tmp_path, 1)
     second = open_archive(tmp_path)
     samples = [sample(2), sample(3), sample(3, validation=True), sample(4)]
     for each in samples:
@@ -133,14 +137,6 @@ def test_a_journal_from_which_all_was_taken_back_is_resumed(tmp_path):
     assert stamps(tmp_path) == []
 
 
-def test_cleared_samples_do_not_come_back(tmp_path):
-    archive = open_archive(tmp_path)
-    archive.add(sample(1))
-    old = archive.begin_anew()
-    assert 'train' in old.read_text()
-    assert stamps(tmp_path) == []
-
-
 def test_a_folder_of_several_robots(tmp_path):
     for number, robot in enumerate(('arm', 'arm_on_linear_axis', 'arm_A7', 'an/arm')):
         archive = open_archive(tmp_path, robot)
@@ -152,9 +148,7 @@ def test_a_folder_of_several_robots(tmp_path):
 
 
 def test_the_journal_of_a_robot_with_other_joints_is_refused(tmp_path):
-    archive = open_archive(tmp_path, joints=2)
-    archive.add(sample(1))
-    archive.close()
+    written(tmp_path, 1)
     with pytest.raises(InputError, match='q3'):
         open_archive(tmp_path, joints=3).resume()
 

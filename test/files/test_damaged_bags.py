@@ -10,7 +10,6 @@ import pytest
 from recorded import (
     MS,
     STREAMS,
-    TYPESTORE,
     assert_equal,
     damage,
     joint_state,
@@ -20,12 +19,14 @@ from recorded import (
     record,
     record_in_chunks,
     recording,
+    serialised,
     session_of,
     standing,
     storages,
     text_message,
+    write,
 )
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
 from calib_ros.files.recording import write_bag
@@ -68,10 +69,10 @@ def test_of_a_truncated_bag_the_rest_is_used(tmp_path, long_bags, storage, metad
 
 @storages
 def test_a_bag_that_was_never_closed_is_read(tmp_path, storage):
-    path = tmp_path / 'bag'
-    write_bag(path, recording(), storage)
-    whole = observations_of(path)
-    damage(path, metadata=False)
+    write_bag(tmp_path / 'bag', recording(), storage)
+    whole = observations_of(tmp_path / 'bag')
+    damage(tmp_path / 'bag', metadata=False)
+    path = (tmp_path / 'bag').rename(tmp_path / 'cell #1 50%20?')
     session, warnings = session_of(path)
     assert_equal(session.problem().observations, whole)
     assert len(warnings) == 1
@@ -113,14 +114,6 @@ def test_the_count_of_a_damaged_bag_is_of_the_messages_used(tmp_path, storage):
     path = record(tmp_path / 'bag', events, storage)
     damage(path, metadata=False)
     assert ' 101 messages' in session_of(path)[1][0]
-
-
-@storages
-def test_a_damaged_bag_in_a_folder_with_an_odd_name(tmp_path, storage):
-    write_bag(tmp_path / 'bag', recording(), storage)
-    damage(tmp_path / 'bag', metadata=False)
-    path = (tmp_path / 'bag').rename(tmp_path / 'cell #1 50%20?')
-    assert session_of(path)[0].account().samples == 30
 
 
 @pytest.mark.parametrize('share', [0.3, 0.9])
@@ -209,16 +202,13 @@ def test_one_packed_message_that_is_damaged_costs_no_other(tmp_path):
 
 
 def test_one_message_that_cannot_be_decoded_does_not_end_the_replay(tmp_path):
-    path = tmp_path / 'bag'
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=TYPESTORE)
-        kind = 'geometry_msgs/msg/PointStamped'
-        poses = writer.add_connection('/point', kind, typestore=TYPESTORE)
-        for k in range(1, 11):
-            data = TYPESTORE.serialize_cdr(joint_state(k * 10 * MS), JOINT_STATE)
-            writer.write(joints, k, data)
-            data = TYPESTORE.serialize_cdr(point_stamped(k * 10 * MS), kind)
-            writer.write(poses, k, data[:-9] if k == 3 else data)
+    content = []
+    for k in range(1, 11):
+        content.append(('/joint_states', k, serialised(joint_state(k * 10 * MS))))
+        data = serialised(point_stamped(k * 10 * MS))
+        content.append(('/point', k, data[:-9] if k == 3 else data))
+    types = {'/joint_states': JOINT_STATE, '/point': 'geometry_msgs/msg/PointStamped'}
+    path = write(tmp_path / 'bag', types, content)
     session, warnings = session_of(path)
     assert session.account().samples >= 2
     assert len(warnings) == 1

@@ -10,7 +10,6 @@ import yaml
 from hypothesis import given, strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty
-from calib_ros.cli.main import main
 from calib_ros.files import export
 from calib_ros.files.export import (
     ExportError,
@@ -205,18 +204,17 @@ def test_a_file_that_differs_is_refused(monkeypatch):
 
 
 @pytest.fixture
-def files(tmp_path, monkeypatch):
+def files(run, tmp_path):
     """Return a function that exports on the command line and returns the files by name."""
-    monkeypatch.chdir(tmp_path)
     _, chain = corrected('ur10e', 3)
     (tmp_path / 'calibration.yaml').write_text(dump_chain(chain, {'samples': 60}))
 
-    def run(*arguments):
-        common = ['export', 'calibration.yaml', '--chain', 'ur10e', '--out', 'out', '--force']
-        assert main([*common, *arguments]) == 0
+    def files(*more):
+        given = ('calibration.yaml', '--chain', 'ur10e', '--out', 'out', '--force', *more)
+        assert run('export', *given)[0] == 0
         return {path.name: path.read_text() for path in (tmp_path / 'out').iterdir()}
 
-    return run
+    return files
 
 
 def test_the_command_line_hands_on_where_the_numbers_come_from(files):

@@ -9,9 +9,8 @@ import zlib
 
 import numpy as np
 import pytest
+from recorded import TYPES, header, serialised, write
 from robots import DATA, needs_data
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError, ConfigError, InputError
@@ -199,28 +198,18 @@ def test_the_real_photographs(photographs, capsys, lens, least, limit):
 
 @needs_data
 def test_a_bag_of_the_real_photographs(photographs, capsys):
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = store.types
-    bag = photographs / 'bag'
+    bag, kinds = photographs / 'bag', ('Image', 'CompressedImage')
     files = sorted((REAL / 'images').iterdir(), key=lambda path: (len(path.name), path.name))
-    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        kinds = ('Image', 'CompressedImage')
-        raw, packed = (
-            writer.add_connection(f'/{kind}', f'sensor_msgs/msg/{kind}', typestore=store)
-            for kind in kinds
-        )
-        for k, path in enumerate(files[:4]):
-            time = types['builtin_interfaces/msg/Time'](k + 1, 0)
-            header = types['std_msgs/msg/Header'](time, 'camera')
-            data = np.frombuffer(path.read_bytes(), np.uint8)
-            image = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2BGR)
-            whole = types['sensor_msgs/msg/Image'](
-                header, *image.shape[:2], 'bgr8', 0, 4800, image.ravel()
-            )
-            small = types['sensor_msgs/msg/CompressedImage'](header, 'png', data)
-            for connection, message in ((raw, whole), (packed, small)):
-                kind = connection.msgtype
-                writer.write(connection, k, store.serialize_cdr(message, kind))
+    content = []
+    for k, path in enumerate(files[:4]):
+        head = header((k + 1) * 10**9, 'camera')
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+        image = cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2BGR)
+        whole = (*image.shape[:2], 'bgr8', 0, 4800, image.ravel())
+        for kind, values in zip(kinds, (whole, ('png', data)), strict=True):
+            message = TYPES[f'sensor_msgs/msg/{kind}'](head, *values)
+            content.append((f'/{kind}', k, serialised(message)))
+    write(bag, {f'/{kind}': f'sensor_msgs/msg/{kind}' for kind in kinds}, content)
     assert main(['images', str(bag), *corners_to(photographs, 'none.csv')]) == 1
     assert 'several topics of images, choose one with --topic' in capsys.readouterr().err
     with (photographs / 'corners.csv').open() as file:

@@ -6,14 +6,13 @@ import itertools
 import os
 import resource
 import shutil
-import sys
 from dataclasses import replace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from killed import KILLED, every_kill, forked, status_of, tree
-from measured import measured, rows_of, write_csv
+from measured import measured
 from rosbags.rosbag2 import Writer
 
 from calib_ros.cli import given, identify, main
@@ -89,21 +88,6 @@ def test_a_bag_on_a_full_disk_is_absent(tmp_path, storage, limit):
 
     assert status_of(forked(child)) == 0
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_command_that_writes_a_bag_says_so_when_the_disk_is_full(tmp_path, monkeypatch, capfd):
-    """It ends with status 1 and one line."""
-    table = write_csv(tmp_path / 'cell.csv', rows_of(measured()))
-    monkeypatch.chdir(tmp_path)
-
-    def child():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
-        assert main.main(['csv2bag', str(table), 'bag', '--chain', 'ur5e']) == 1
-        sys.stderr.flush()
-
-    assert status_of(forked(child)) == 0
-    assert 'calib_ros: bag: the file would be too large' in capfd.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ['cell.csv']
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@
 
 import sqlite3
 import struct
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -53,6 +54,13 @@ def test_with_any_metadata_the_messages_are_read(bag, content):
     assert replayed.read == 120
 
 
+def changed(file, *statements):
+    with closing(sqlite3.connect(file, isolation_level=None)) as connection:
+        for statement in statements:
+            connection.execute(statement)
+    return file
+
+
 SCHEMA = (
     'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, '
     'offered_qos_profiles TEXT)',
@@ -76,11 +84,7 @@ ENDLESS = 'WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SEL
     ],
 )
 def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, statements):
-    path = tmp_path / 'bag.db3'
-    with sqlite3.connect(path) as connection:
-        for statement in statements:
-            connection.execute(statement)
-    connection.close()
+    path = changed(tmp_path / 'bag.db3', *statements)
     with pytest.raises(InputError, match='is not what a recorder makes'):
         replay(path, session())
 
@@ -88,17 +92,12 @@ def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, statements)
 @pytest.mark.parametrize('bag', ['sqlite3'], indirect=True)
 def test_messages_without_data_are_lost_and_no_more(bag):
     (file,) = bag.glob('*.db3')
-    with sqlite3.connect(file) as connection:
-        (sql,) = connection.execute(
-            "SELECT sql FROM sqlite_master WHERE name='messages'"
-        ).fetchone()
-        connection.execute('PRAGMA writable_schema=ON')
-        loose = sql.replace('BLOB NOT NULL', 'BLOB')
-        connection.execute("UPDATE sqlite_master SET sql=? WHERE name='messages'", (loose,))
-    connection.close()
-    with sqlite3.connect(file) as connection:
-        connection.execute('UPDATE messages SET data=NULL WHERE id=7')
-    connection.close()
+    changed(
+        file,
+        'PRAGMA writable_schema=ON',
+        "UPDATE sqlite_master SET sql=replace(sql, 'BLOB NOT NULL', 'BLOB') WHERE name='messages'",
+    )
+    changed(file, 'UPDATE messages SET data=NULL WHERE id=7')
     replayed = replay(bag, session())
     assert (replayed.recorded, replayed.read) == (120, 119)
     assert 'without data' in replayed.warnings[0]
@@ -109,17 +108,14 @@ def test_messages_without_data_are_lost_and_no_more(bag):
 @pytest.mark.parametrize('column', ['name', 'type'])
 def test_topics_whose_names_are_no_text_are_not_read(bag, column, known):
     (file,) = bag.glob('*.db3')
-    with sqlite3.connect(file) as connection:
-        connection.execute(f"UPDATE topics SET {column}=x'05' WHERE type LIKE '%Point%'")
-    connection.close()
-    if not known:
-        (bag / 'metadata.yaml').unlink()
+    changed(file, f"UPDATE topics SET {column}=x'05' WHERE type LIKE '%Point%'")
     if known:  # the metadata name them
         replayed = replay(bag, session())
         assert (replayed.recorded, replayed.read) == (120, 100)
-    else:
-        with pytest.raises(InputError, match='has no pose topic'):
-            replay(bag, session())
+        return
+    (bag / 'metadata.yaml').unlink()
+    with pytest.raises(InputError, match='has no pose topic'):
+        replay(bag, session())
 
 
 @pytest.mark.parametrize('bag', ['mcap'], indirect=True)

@@ -76,11 +76,6 @@ def test_rows_marked_test_are_held_out(read):
     assert held_out.joints[:, 0].tolist() == [2, 5]
 
 
-def test_one_of_several_sessions_is_chosen(read):
-    fitted, _ = read(SESSIONS, 'A')
-    assert fitted.positions[:, 0].tolist() == [1, 3]
-
-
 def test_a_session_that_is_not_there_lists_those_that_are(read):
     with pytest.raises(UnknownNameError) as caught:
         read(SESSIONS, 'C')

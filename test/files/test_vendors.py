@@ -10,7 +10,6 @@ import yaml
 from urdfs import PANDA, UR10E, by_kinpy
 
 from calib_ros.apply.simulation import Cell, faulty
-from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError
 from calib_ros.files import vendors
 from calib_ros.files.export import ExportError, converted
@@ -213,14 +212,12 @@ def test_a_file_that_differs_is_refused(monkeypatch):
 
 
 @pytest.mark.parametrize('chain', ['ur10e', 'robot.urdf'])
-def test_the_command_line_writes_it(tmp_path, monkeypatch, chain):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_line_writes_it(run, tmp_path, chain):
     (tmp_path / 'robot.urdf').write_text(UR10E)
-    (tmp_path / 'calibration.yaml').write_text(
-        dump_chain(corrected(load_chain(chain)), {'samples': 60})
-    )
-    common = ['export', 'calibration.yaml', '--chain', chain, '--out', 'out']
-    assert main([*common, '--ur-hash', 'calib_42']) == 0
+    calibrated = dump_chain(corrected(load_chain(chain)), {'samples': 60})
+    (tmp_path / 'calibration.yaml').write_text(calibrated)
+    given = ('calibration.yaml', '--chain', chain, '--out', 'out', '--ur-hash', 'calib_42')
+    assert run('export', *given)[0] == 0
     document = yaml.safe_load((tmp_path / 'out/ur_kinematics.yaml').read_text())
     assert document['kinematics']['hash'] == 'calib_42'
     assert document['calibration'] == {'samples': 60}

@@ -7,16 +7,6 @@ import os
 import subprocess
 import sys
 
-import pytest
-from measured import measured, rows_of, write_csv
-
-from calib_ros.cli.main import main
-
-
-@pytest.fixture
-def table(tmp_path):
-    return write_csv(tmp_path / 'cell.csv', rows_of(measured()))
-
 
 def test_the_node_and_tables_do_without(table):
     """All in a new interpreter: nothing may have been imported before."""
@@ -35,16 +25,15 @@ def test_the_node_and_tables_do_without(table):
     assert json.loads(ran.stdout)['accepted'] is True
 
 
-def test_bags_say_how_to_install_it(tmp_path, table, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(['simulate', 'bag', '--chain', 'ur5e', '--poses', '3']) == 0
+def test_bags_say_how_to_install_it(run, tmp_path, table, monkeypatch):
+    assert run('simulate', 'bag', '--chain', 'ur5e', '--poses', 3)[0] == 0
     monkeypatch.setitem(sys.modules, 'rosbags', None)
     for arguments in (
-        ['identify', 'bag', '--chain', 'ur5e'],
-        ['simulate', 'new', '--chain', 'ur5e', '--poses', '12'],
-        ['csv2bag', str(table), 'new', '--chain', 'ur5e'],
+        ('identify', 'bag'),
+        ('simulate', 'new', '--poses', 12),
+        ('csv2bag', table, 'new'),
     ):
-        capsys.readouterr()
-        assert main(arguments) == 1
-        assert 'pip install rosbags' in capsys.readouterr().err
+        status, _, err = run(*arguments, '--chain', 'ur5e')
+        assert status == 1
+        assert 'pip install rosbags' in err
     assert not (tmp_path / 'new').exists()

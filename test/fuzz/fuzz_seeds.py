@@ -2,13 +2,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the seeds of the corpus: a small valid input or more for each target."""
 
+import sys
 import tempfile
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 import numpy as np
 from fuzz_targets import ARM, CORPUS, MARK
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from recorded import (
+    distance,
+    joint_state,
+    odometry,
+    point_stamped,
+    pose_stamped,
+    pose_with_covariance,
+    serialised,
+    transform_stamped,
+    write,
+)
 
 from calib_ros.files.tables import cells, columns
 from calib_ros.identification.records import nominal_document
@@ -16,8 +28,7 @@ from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.sampling.messages import DECODERS, JOINT_STATE
 from calib_ros.sampling.sample import Sample
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-T = STORE.types
+COVARIANCE = np.diag([1e-8] * 6)
 POSE = 'geometry_msgs/msg/PoseStamped'
 URDF = """<robot name="arm">
   <link name="base"/><link name="upper">
@@ -61,57 +72,27 @@ OPTIONS = (
 )
 
 
-def header(stamp):
-    return T['std_msgs/msg/Header'](T['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9)), 't')
+MAKERS = {
+    JOINT_STATE: lambda stamp: joint_state(stamp, (0.1, 0.2, stamp // (40 * 10**7) * 0.1)),
+    POSE: pose_stamped,
+    'geometry_msgs/msg/PoseWithCovarianceStamped': lambda stamp: pose_with_covariance(
+        stamp, COVARIANCE
+    ),
+    'geometry_msgs/msg/PointStamped': point_stamped,
+    'geometry_msgs/msg/TransformStamped': transform_stamped,
+    'nav_msgs/msg/Odometry': lambda stamp: odometry(stamp, COVARIANCE),
+    'sensor_msgs/msg/Range': lambda stamp: distance(stamp, 1.5),
+}
 
 
 def made(kind, k):
-    stamp = k * 10**7
-    if kind == JOINT_STATE:
-        none = np.zeros(0)
-        return T[kind](
-            header(stamp), ['a', 'b', 'c'], np.array([0.1, 0.2, k // 40 * 0.1]), none, none
-        )
-    point, turn = (
-        T['geometry_msgs/msg/Point'](1.0, 2.0, 3.0),
-        T['geometry_msgs/msg/Quaternion'](0.0, 0.0, 0.0, 1.0),
-    )
-    pose = T['geometry_msgs/msg/Pose'](point, turn)
-    covered = T['geometry_msgs/msg/PoseWithCovariance'](pose, np.diag([1e-8] * 6).ravel())
-    vector = T['geometry_msgs/msg/Vector3'](1.0, 2.0, 3.0)
-    still = T['geometry_msgs/msg/TwistWithCovariance'](
-        T['geometry_msgs/msg/Twist'](vector, vector), np.zeros(36)
-    )
-    rest = {
-        POSE: (pose,),
-        'geometry_msgs/msg/PoseWithCovarianceStamped': (covered,),
-        'geometry_msgs/msg/PointStamped': (point,),
-        'geometry_msgs/msg/TransformStamped': (
-            'target',
-            T['geometry_msgs/msg/Transform'](vector, turn),
-        ),
-        'nav_msgs/msg/Odometry': ('target', covered, still),
-        'sensor_msgs/msg/Range': (0, 0.0, 0.0, 9.0, 1.5, 0.0),
-    }[kind]
-    return T[kind](header(stamp), *rest)
-
-
-def serialised(kind, k):
-    return bytes(STORE.serialize_cdr(made(kind, k), kind))
+    return serialised(MAKERS[kind](k * 10**7))
 
 
 def bag(path, storage, mode, count):
-    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
-    if mode:
-        writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
-    with writer:
-        known = {
-            kind: writer.add_connection(f'/{kind[:4]}', kind, typestore=STORE)
-            for kind in (JOINT_STATE, POSE)
-        }
-        for k in range(1, count):
-            for kind, connection in known.items():
-                writer.write(connection, k, serialised(kind, k))
+    types = {f'/{kind[:4]}': kind for kind in (JOINT_STATE, POSE)}
+    content = [(t, k, made(kind, k)) for k in range(1, count) for t, kind in types.items()]
+    write(path, types, content, storage, mode)
 
 
 def put(name, number, data):
@@ -121,14 +102,14 @@ def put(name, number, data):
 
 
 def main():
-    position, covariance = np.array([1.0, 2.0, 3.0]), np.diag([1e-8] * 6)
+    position = np.array([1.0, 2.0, 3.0])
     samples = [
         Sample(
             k * 10**9,
             np.array([0.1 * k, 0.2, 0.3]),
             position=position,
             rotation=np.eye(3),
-            covariance=covariance if k % 2 else None,
+            covariance=COVARIANCE if k % 2 else None,
             approach=np.ones(3),
             device='d',
             target=f't{k % 2}',
@@ -193,13 +174,13 @@ def main():
         'message',
         0,
         MARK.join(
-            bytes([k % 7]) + serialised([JOINT_STATE, *DECODERS][k % 7], 20 + k) for k in range(14)
+            bytes([k % 7]) + made([JOINT_STATE, *DECODERS][k % 7], 20 + k) for k in range(14)
         ),
     )
-    put('message', 1, MARK.join(b'\0' + serialised(JOINT_STATE, k) for k in range(1, 9)))
+    put('message', 1, MARK.join(b'\0' + made(JOINT_STATE, k) for k in range(1, 9)))
     with tempfile.TemporaryDirectory() as name:
         for k, (storage, mode) in enumerate(
-            [('mcap', None), ('mcap', 'STORAGE'), ('sqlite3', None)]
+            [('mcap', 'none'), ('mcap', 'storage'), ('sqlite3', 'none')]
         ):
             path = Path(name) / 'bag'
             bag(path, storage, mode, 12)

@@ -27,11 +27,6 @@ def test_exported_files_carry_the_hash_of_the_table(solved):
         assert digest in each.content, each.name
 
 
-@pytest.fixture
-def table(tmp_path):
-    return write_csv(tmp_path / 'measured.csv', rows_of(measured()))
-
-
 def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
     out = tmp_path / 'out'
     told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']

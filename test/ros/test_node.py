@@ -124,12 +124,10 @@ def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):
     target = tmp_path / 'sub' / 'saved.yaml'
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'target_filename': str(target)}
     with Cell(**parameters) as cell:
-        refused = cell.call('save')
-        assert not refused.success
+        refused = cell.refused('save')
         assert 'identify' in refused.message
         cell.play(topics(recording))
-        answer = cell.call('identify')
-        assert answer.success, answer.message
+        answer = cell.done('identify')
         assert f'{STOPS} poses' in answer.message
         assert 'wrist_3_joint.theta' in cell.in_full(answer)
         # Heard although the subscriptions come after the publishing: the topics are latched.
@@ -148,16 +146,14 @@ def test_identify_answers_publishes_and_is_saved(tmp_path, recording, truth):
         record = calibration_record(texts[0].data)
         assert record['topics'] == ['/joint_states', '/measured_pose']
         assert record['samples'] == STOPS
-        saved = cell.call('save')
-        assert saved.success
+        saved = cell.done('save')
         assert str(target) in saved.message
         assert target.read_text() == texts[0].data
         report = target.with_suffix('.html')
         assert str(report) in saved.message
         assert 'Accepted' in report.read_text()
         assert record['table_sha256'] in report.read_text()
-        again = cell.call('save')
-        assert not again.success
+        again = cell.refused('save')
         assert 'exists already' in again.message
         assert target.read_text() == texts[0].data
 
@@ -207,8 +203,7 @@ def test_two_children_of_a_transform_are_two_targets(cell, recording, truth):
     both = pose_messages(poses, TransformStamped, child='left')
     both += pose_messages(second, TransformStamped, child='right')
     cell.play({'joint_states': joint_messages(recording), 'measured_transform': both})
-    answer = cell.call('identify')
-    assert answer.success, answer.message
+    cell.done('identify')
     chain = cell.node.session.calibration.chain
     assert {'base', 'tool', 'tool_right'} <= set(chain.frame_names)
     unseen = truth.random_joints(100, rng)
@@ -232,8 +227,7 @@ def test_a_camera_on_the_flange_and_a_draw_wire_as_sources(tmp_path, recording, 
                 'wire': pose_messages(poses, Range, distances=lengths, frame_id='wire'),
             }
         )
-        answer = cell.call('identify')
-        assert answer.success, answer.message
+        cell.done('identify')
         kinds = [
             (each.distances is not None, len(each)) for each in cell.node.session.problem().sets
         ]
@@ -272,8 +266,7 @@ def test_validation_topics_are_never_fitted(cell, recording):
     cell.play(
         topics(recording, measured_pose=poses[: 4 * last], validation_pose=poses[4 * last :])
     )
-    answer = cell.call('identify')
-    assert answer.success, answer.message
+    answer = cell.done('identify')
     assert f'{last} poses' in answer.message
     assert '6 held-out poses' in answer.message
 
@@ -291,8 +284,7 @@ def test_namespace_and_remapping(tmp_path, recording):
         )
         joints, poses = topics(recording).values()
         cell.play({'/cell_2/ur/joint_states': joints, '/tracker/pose': poses}, node=node)
-        answer = cell.call('identify', node='/cell_2/arm')
-        assert answer.success, answer.message
+        cell.done('identify', node='/cell_2/arm')
         texts = cell.listen(String, '/cell_2/arm/calibration')
         cell.spin_until(lambda: texts)
         record = calibration_record(texts[0].data)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
-from ros_cell import PATIENCE, STOPS, Cell, joint_messages, pose_messages, topics, values_of
+from ros_cell import PATIENCE, STOPS, Cell, joint_messages, part, pose_messages, topics, values_of
 from sensor_msgs.msg import JointState, PointCloud2, Range
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -27,22 +27,8 @@ NODE = 'calibration_node'
 @pytest.fixture
 def calibrated(cell, recording):
     cell.play(topics(recording))
-    assert cell.call('identify').success
+    cell.done('identify')
     return cell
-
-
-def part(recording, stops):
-    """Return the messages of the first stops."""
-    poses = recording.poses.select(np.arange(4 * stops))
-    end = poses.stamps_ns[-1] + 600_000_000
-    joints = [
-        message
-        for message, stamp in zip(
-            joint_messages(recording), recording.joint_stamps_ns, strict=True
-        )
-        if stamp < end
-    ]
-    return {'joint_states': joints, 'measured_pose': pose_messages(poses)}
 
 
 # The next pose
@@ -51,15 +37,14 @@ def part(recording, stops):
 def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
     early = cell.listen(JointState, f'{NODE}/next_pose')
     diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
-    cell.play(part(recording, 3))
+    cell.play(part(recording, 0.0, 4.0))
     cell.spin_until(lambda: early)
     assert list(early[0].name) == list(UR.joint_names)
     assert np.isfinite(early[0].position).all()
     cell.spin_until(
         lambda: diagnostics and values_of(diagnostics[-1])['enough samples'] == 'False'
     )
-    rest = topics(recording)
-    cell.play({k: v[len(part(recording, 3)[k]) :] for k, v in rest.items()})
+    cell.play(part(recording, 4.0, 25.0))
     cell.spin_until(lambda: values_of(diagnostics[-1])['enough samples'] == 'True')
     assert float(values_of(diagnostics[-1])['expected [mm]']) < 0.1
     cell.spin_until(lambda: len({tuple(message.position) for message in early}) > 1)
@@ -120,7 +105,7 @@ def test_errors_over_the_workspace_come_with_an_accepted_identification(cell, re
     heard = cell.listen(PointCloud2, f'{NODE}/workspace_error')
     cell.play(topics(recording))
     assert not heard
-    assert cell.call('identify').success
+    cell.done('identify')
     cell.spin_until(lambda: heard)
     (message,) = heard
     assert [field.name for field in message.fields] == ['x', 'y', 'z', 'error', 'sigma']
@@ -184,11 +169,16 @@ def send(cell, message):
     return said
 
 
-@pytest.fixture
-def corrected(cell):
+def corrections(cell):
+    """Return the corrected trajectories that will be heard."""
     heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
     cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
     return heard
+
+
+@pytest.fixture
+def corrected(cell):
+    return corrections(cell)
 
 
 def test_a_trajectory_is_corrected(calibrated, corrected, truth):
@@ -233,9 +223,8 @@ def test_other_joints_and_names_of_the_robot(tmp_path, recording):
         messages = topics(recording)
         messages['joint_states'] = joint_messages(recording, names)
         cell.play(messages)
-        assert cell.call('identify').success
-        heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
-        cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
+        cell.done('identify')
+        heard = corrections(cell)
         q = path(5)[0]
         wide = np.column_stack([np.arange(5.0), q[:, ::-1]])
         send(cell, trajectory(wide, names=['gripper', *names[::-1]]))
@@ -350,8 +339,7 @@ def test_messages_are_taken_while_it_computes(tmp_path, recording, monkeypatch):
     monkeypatch.setattr(guide_module, 'compensate_program', slow)
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         cell.node.session.adopt(Calibration(UR.with_frame('base', Frame()), UR))
-        heard = cell.listen(JointTrajectory, f'{NODE}/compensated_joint_trajectory', 10)
-        cell.spin_until(lambda: cell.node._guide._corrected.get_subscription_count() > 0)
+        heard = corrections(cell)
         cell.publisher(JointTrajectory, f'{NODE}/joint_trajectory').publish(trajectory(path(5)[0]))
         cell.spin_until(entered.is_set)
         cell.play(topics(recording))

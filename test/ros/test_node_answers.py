@@ -32,15 +32,13 @@ def test_errors_are_answers(cell, recording):
         ('validate', 'identify or load one first'),
         ('load', 'no saved calibration of ur10e'),
     ):
-        empty = cell.call(name)
-        assert not empty.success
+        empty = cell.refused(name)
         assert said in empty.message
     some = topics(recording)
     cell.play(
         {'joint_states': some['joint_states'][:120], 'measured_pose': some['measured_pose'][:8]}
     )
-    few = cell.call('identify')
-    assert not few.success
+    few = cell.refused('identify')
     assert '2 measured poses are too few, at least 5' in few.message
 
 
@@ -86,8 +84,7 @@ def test_what_made_poses_too_few_is_said_with_it(cell, recording):
     for message in poses[16:]:
         cell.publisher(PoseStamped, 'measured_pose').publish(message)
     cell.spin_until(lambda: cell.node.session.received['measurements'] == len(poses))
-    answer = cell.call('identify')
-    assert not answer.success
+    answer = cell.refused('identify')
     said = cell.in_full(answer)
     assert '4 measured poses are too few, at least 5 are needed' in said
     assert '1200 joint states and 96 measurements gave 4 poses' in said
@@ -103,8 +100,7 @@ def test_a_refusal_leaves_its_report(unsearched, cell, recording):
     ):
         message.pose.position.x += x
     cell.play(topics(recording, measured_pose=moved))
-    answer = cell.call('identify')
-    assert not answer.success
+    answer = cell.refused('identify')
     assert len(answer.message) <= 200
     assert cell.node._identifying._advice
     assert cell.node._identifying._advice in answer.message
@@ -139,19 +135,17 @@ def test_answers_are_in_the_log_as_well(cell, recording):
 
 def test_record_remove_last_and_clear(cell, recording):
     joints, poses = topics(recording).values()
-    assert cell.call('record', SetBool.Request(data=False)).success
+    cell.done('record', SetBool.Request(data=False))
     cell.play({'joint_states': joints[:10], 'measured_pose': poses[:2]})
     account = cell.node.session.account()
     assert account.unused == {'joints: not recording': 10, 'measurements: not recording': 2}
-    assert cell.call('record', SetBool.Request(data=True)).success
+    cell.done('record', SetBool.Request(data=True))
     cell.play({'joint_states': joints[10:300], 'measured_pose': poses[2:20]})
     assert len(cell.node.session.samples) == 5
-    removed = cell.call('remove_last')
-    assert removed.success
+    removed = cell.done('remove_last')
     assert removed.message == 'pose 5 removed'
     assert len(cell.node.session.samples) == 4
-    cleared = cell.call('clear')
-    assert cleared.success
+    cleared = cell.done('clear')
     assert '4 poses cleared; they stay in' in cleared.message
     assert cell.node.session.account().samples == 0
     assert cell.node.session.account().joint_states == 0
@@ -162,25 +156,21 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'mode': 'triggered'}
     with Cell(**parameters) as cell:
         cell.play({'joint_states': joints[:28], 'measured_pose': poses[:4]})
-        taken = cell.call('capture')
-        assert taken.success, taken.message
+        taken = cell.done('capture')
         assert taken.message.startswith('pose 1 taken (4 measurements, spread 0.0')
-        twice = cell.call('capture')
-        assert not twice.success
+        twice = cell.refused('capture')
         assert 'no measurements have come since the last pose' in twice.message
         cell.node.set_parameters([Parameter('socket', value='plate A/1')])
-        ball = cell.call('capture')
-        assert ball.success, ball.message
+        ball = cell.done('capture')
         assert ball.message == 'pose 2 taken: ball in socket plate A/1'
         (path,) = tmp_path.glob('*Z.csv')
         assert path.read_text().splitlines()[-1].endswith(',plate A,1,')
-        assert cell.call('remove_last').success
+        cell.done('remove_last')
         cell.node.set_parameters([Parameter('socket', value='A')])
         assert 'socket must be LOCATION/SOCKET' in cell.call('capture').message
         cell.node.set_parameters([Parameter('socket', value='')])
         cell.play({'joint_states': joints[28:40], 'measured_pose': poses[4:5]})
-        moving = cell.call('capture')
-        assert not moving.success
+        moving = cell.refused('capture')
         assert 'the arm has not stood for 0.2 s yet' in moving.message
         cell.play({'joint_states': joints[40:], 'measured_pose': poses[5:]})
         assert len(cell.node.session.samples) == 1
@@ -194,39 +184,33 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
     other.write_text('of another robot, whose name begins alike')
     with Cell(**parameters) as cell:
         cell.play(topics(recording))
-        assert cell.call('identify').success
-        nothing = cell.call('validate')
-        assert not nothing.success
+        cell.done('identify')
+        nothing = cell.refused('validate')
         assert 'measure some new poses' in nothing.message
-        assert cell.call('save').success
+        cell.done('save')
         chain = cell.node.session.calibration.chain
     with Cell(**parameters) as cell:
-        loaded = cell.call('load')
-        assert loaded.success, loaded.message
+        cell.done('load')
         np.testing.assert_array_equal(cell.node.session.calibration.chain.table, chain.table)
         assert cell.node.session.calibration.world_frame == 'tracker'
         texts = cell.listen(String, 'calibration_node/calibration')
         cell.spin_until(lambda: texts)
         np.testing.assert_array_equal(parse_chain(texts[0].data).table, chain.table)
         cell.play(topics(recording))
-        holds = cell.call('validate')
-        assert holds.success, holds.message
+        holds = cell.done('validate')
         assert 'the calibration holds: RMS 0.0' in holds.message
         assert f'{STOPS} poses measured since' in holds.message
-        agrees = cell.call('check')
-        assert agrees.success, agrees.message
+        agrees = cell.done('check')
         assert 'agrees with what was measured: RMS 0.0' in agrees.message
         cell.call('clear')
         moved = pose_messages(recording.poses)
         for message in moved:
             message.pose.position.x += 0.003
         cell.play(topics(recording, measured_pose=moved))
-        broken = cell.call('validate')
-        assert not broken.success
+        broken = cell.refused('validate')
         assert 'does not hold any more' in broken.message
         assert 'RMS 3.0' in broken.message
-        bumped = cell.call('check')
-        assert not bumped.success
+        bumped = cell.refused('check')
         assert 'does not fit any more, changed: base' in bumped.message
     filed = {(row.kind, row.verdict): row for row in History(history).rows('7')}
     holds, broken = (filed['validate', text] for text in ('holds', 'does not hold'))
@@ -242,8 +226,8 @@ def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, re
     parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path)}
     with Cell(**parameters, serial='7', target_filename=str(saved)) as cell:
         cell.play(topics(recording))
-        assert cell.call('identify').success
-        assert cell.call('save').success
+        cell.done('identify')
+        cell.done('save')
     for serial, loads in (('8', False), ('7', True), ('', True)):
         with Cell(**parameters, serial=serial, calibration_filename=str(saved)) as cell:
             answer = cell.call('load')
@@ -258,9 +242,9 @@ def saved(tmp_path_factory, recording):
     folder = tmp_path_factory.mktemp('saved')
     with Cell(chain='ur10e', data_dir=str(folder)) as cell:
         cell.play(topics(recording))
-        assert cell.call('identify').success
-        assert cell.call('save').success
-        assert cell.call('save').success
+        cell.done('identify')
+        cell.done('save')
+        cell.done('save')
     *_, newest = sorted(folder.glob('*Z.yaml'))
     return folder, newest
 
@@ -310,7 +294,7 @@ def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
         cell.spin_until(lambda: heard and said in values_of(heard[-1])['last identification'])
         assert node.session.calibration is None
         cell.play(topics(recording), node=node)
-        assert cell.call('identify').success
+        cell.done('identify')
 
 
 def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recording):
@@ -319,9 +303,9 @@ def test_the_settings_of_the_identification_are_saved_with_it(tmp_path, recordin
     with Cell(**parameters) as cell:
         cell.play(topics(recording))
         assert cell.set_parameters({'folds': 4})[0].successful
-        assert cell.call('identify').success
+        cell.done('identify')
         assert cell.set_parameters({'folds': 7})[0].successful
-        assert cell.call('save').success
+        cell.done('save')
         (path,) = tmp_path.glob('*Z.yaml')
         settings = yaml.safe_load(path.with_suffix('.settings.yaml').read_text())
         used = settings['/**']['ros__parameters']
@@ -333,8 +317,7 @@ def test_outliers_are_named_by_number_and_stamp(cell, recording):
     for message in some[24:28]:
         message.pose.position.z += 0.02
     cell.play(topics(recording, measured_pose=some))
-    answer = cell.call('identify')
-    assert answer.success, answer.message
+    answer = cell.done('identify')
     sample = cell.node.session.samples[6]
     stamp = f'{sample.stamp_ns // 10**9}.{sample.stamp_ns % 10**9:09d}'
     assert f'1 outlier carries no weight: pose 7 ({stamp})' in cell.in_full(answer)
@@ -343,16 +326,15 @@ def test_outliers_are_named_by_number_and_stamp(cell, recording):
 def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cell, recording):
     cell.play(topics(recording))
     texts = cell.listen(String, 'calibration_node/calibration')
-    assert cell.call('identify').success
+    cell.done('identify')
     cell.spin_until(lambda: texts)
     good = cell.node.session.calibration
-    assert cell.call('clear').success
+    cell.done('clear')
     nominal = load_chain('ur10e')
     noisy = measure(nominal, recording.poses.joints, np.random.default_rng(5), 1e-4, 1e-4)
     noisy = noisy.at(recording.poses.stamps_ns)
     cell.play(topics(recording, measured_pose=pose_messages(noisy)))
-    answer = cell.call('identify')
-    assert not answer.success
+    answer = cell.refused('identify')
     assert 'no gain' in answer.message
     assert 'last good calibration stays' in cell.in_full(answer)
     assert cell.node.session.calibration is good

@@ -93,8 +93,7 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
         assert f'resumed 10 poses of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
         cell.spin_until(lambda: len(samples_in(folder)) == 20)
-        answer = cell.call('identify')
-        assert answer.success, answer.message
+        answer = cell.done('identify')
         assert '22 poses' in answer.message  # two stops waited when it was killed
     expected = direct(recording)
     expected.finish()
@@ -142,8 +141,8 @@ sys.exit(main())
 def test_killed_while_it_saves(journal):
     command = ('-c', SLOW_SAVE + RUN)
     with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
-        assert cell.call('identify').success
-        assert cell.call('save').success
+        cell.done('identify')
+        cell.done('save')
         saved = sorted(journal.glob('*Z*.yaml'))
         contents = [path.read_text() for path in saved]
         cell.start_call('save')
@@ -152,8 +151,7 @@ def test_killed_while_it_saves(journal):
     assert sorted(journal.glob('*Z*.yaml')) == saved
     assert [path.read_text() for path in saved] == contents
     with Cell(chain='ur10e', data_dir=str(journal)) as cell:
-        loaded = cell.call('load')
-        assert loaded.success, loaded.message
+        loaded = cell.done('load')
         assert str(next(journal.glob('*Z.yaml'))) in loaded.message
 
 
@@ -223,14 +221,11 @@ def test_a_full_disk(tmp_path, recording):
         assert heard[-1].status[0].message.count('in memory only') == 1
         cell.spin_until(lambda: values_of(heard[-1])['samples'] == '22')
         assert len(samples_in(tmp_path)) == 4
-        answer = cell.call('clear')
-        assert not answer.success
+        answer = cell.refused('clear')
         assert 'poses are in memory only and would be lost' in answer.message
-        answer = cell.call('identify')
-        assert answer.success, answer.message
+        cell.done('identify')
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (100, hard))
-        unsaved = cell.call('save')
-        assert not unsaved.success
+        unsaved = cell.refused('save')
         assert 'too large for this disk' in unsaved.message
         assert unsaved.message.endswith('write to another place')
         assert [each.name for each in tmp_path.iterdir() if 'yaml' in each.name] == [
@@ -240,6 +235,6 @@ def test_a_full_disk(tmp_path, recording):
         level(DiagnosticStatus.OK, 'poses')
         cell.spin_until(lambda: 'memory' not in status[-1].data)
         assert len(samples_in(tmp_path)) == STOPS
-        assert cell.call('save').success
+        cell.done('save')
         assert child.end(signal.SIGINT) == 0
         assert child.output.count('poses are kept in memory only') == 1

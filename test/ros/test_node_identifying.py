@@ -35,11 +35,9 @@ def test_messages_are_taken_while_an_identification_runs(tmp_path, recording, he
         cell.play({'joint_states': joints[:1000], 'measured_pose': poses[:80]})
         first = cell.start_call('identify')
         cell.spin_until(lambda: problems)
-        second = cell.call('identify')
-        assert not second.success
+        second = cell.refused('identify')
         assert 'running' in second.message
-        unsaved = cell.call('save')
-        assert not unsaved.success
+        unsaved = cell.refused('save')
         assert 'no accepted calibration' in unsaved.message
         cell.play({'joint_states': joints[1000:], 'measured_pose': poses[80:]})
         assert cell.node.session.account().poses == len(poses)
@@ -49,10 +47,9 @@ def test_messages_are_taken_while_an_identification_runs(tmp_path, recording, he
         assert first.result().success, first.result().message
         assert len(problems[0].observations) == 20
         # The samples that came meanwhile were not fitted, so they may judge.
-        judged = cell.call('validate')
-        assert judged.success
+        judged = cell.done('validate')
         assert '4 poses measured since' in judged.message
-        assert cell.call('identify').success
+        cell.done('identify')
 
 
 STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_joint']
@@ -99,14 +96,13 @@ def test_the_status_names_the_stage_of_an_identification(tmp_path, recording, st
 def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stages):
     release, reached = stages
     with Cell(chain='ur10e', data_dir=str(tmp_path), model='auto') as cell:
-        none = cell.call('cancel')
-        assert not none.success
+        none = cell.refused('cancel')
         assert 'nothing to cancel' in none.message
         cell.play(topics(recording))
         texts = cell.listen(String, 'calibration_node/calibration')
         for _ in range(100):
             release.put(None)
-        assert cell.call('identify').success
+        cell.done('identify')
         cell.spin_until(lambda: texts)
         good = cell.node.session.calibration
         while not release.empty():
@@ -117,8 +113,7 @@ def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stag
             for _ in range(stage):
                 release.put(None)
             cell.spin_until(lambda last=stage: len(reached) == last + 1)
-            answer = cell.call('cancel')
-            assert answer.success
+            answer = cell.done('cancel')
             assert f'({reached[-1]})' in answer.message
             release.put(None)
             cell.spin_until(running.done)
@@ -130,7 +125,7 @@ def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stag
         assert len(cell.node.session.samples) == STOPS
         for _ in range(100):
             release.put(None)
-        assert cell.call('identify').success
+        cell.done('identify')
 
 
 def test_a_result_that_was_cancelled_at_last_is_not_published(cell, recording, held):
@@ -138,7 +133,7 @@ def test_a_result_that_was_cancelled_at_last_is_not_published(cell, recording, h
     cell.play(topics(recording))
     answer = cell.start_call('identify')
     cell.spin_until(lambda: problems)
-    assert cell.call('cancel').success
+    cell.done('cancel')
     release.set()
     cell.spin_until(answer.done)
     assert not answer.result().success
@@ -151,7 +146,7 @@ def test_clear_while_an_identification_runs(cell, recording, held):
     cell.play(topics(recording))
     running = cell.start_call('identify')
     cell.spin_until(lambda: problems)
-    assert cell.call('clear').success
+    cell.done('clear')
     release.set()
     cell.spin_until(running.done)
     assert running.result().success, running.result().message

@@ -9,9 +9,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from recorded import TYPES, serialised, write
 from ros_cell import PATIENCE, START, Cell, header, joint_messages, stamp_ns
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from calib_ros.apply.simulation import (
@@ -149,17 +148,9 @@ def for_bags(message, types):
 
 
 def bag_of(path, come):
-    store = get_typestore(Stores.ROS2_JAZZY)
     kinds = dict(zip((*TOPICS, CameraInfo), (*PICTURES, CAMERA_INFO), strict=True))
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        known = {}
-        for topic, message in come:
-            if topic not in known:
-                kind = kinds.get(type(message), JOINT_STATE)
-                known[topic] = writer.add_connection(f'/{topic}', kind, typestore=store)
-            made = for_bags(message, store.types)
-            data = store.serialize_cdr(made, known[topic].msgtype)
-            writer.write(known[topic], stamp_ns(message), data)
+    types = {f'/{topic}': kinds.get(type(message), JOINT_STATE) for topic, message in come}
+    write(path, types, ((f'/{t}', stamp_ns(m), serialised(for_bags(m, TYPES))) for t, m in come))
 
 
 def assert_same(first, second):

@@ -26,7 +26,7 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         corrected = cell.listen(PoseStamped, 'calibration_node/corrected_pose', 10)
         begun = time.monotonic()
         cell.play(topics(recording, joint_states=doubled))
-        assert cell.call('identify').success
+        cell.done('identify')
         cell.play({'joint_states': joints[-1:]})
         cell.spin_until(
             lambda: [m for m in corrected if m.header.stamp == joints[-1].header.stamp]
@@ -87,7 +87,7 @@ def test_the_status_is_short_and_its_first_words_are_those_that_matter(
 
 def test_residual_markers_are_well_formed(cell, recording):
     cell.play(topics(recording))
-    assert cell.call('identify').success
+    cell.done('identify')
     heard = cell.listen(MarkerArray, 'calibration_node/residuals')
     cell.spin_until(lambda: heard)
     (lines,) = heard[0].markers
@@ -115,7 +115,7 @@ def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, tr
     with Cell(chain='ur10e', data_dir=str(tmp_path), sources=sources) as cell:
         some = pose_messages(other, frame_id='elsewhere')
         cell.play(topics(recording, other=some))
-        assert cell.call('identify').success
+        cell.done('identify')
         heard = cell.listen(MarkerArray, 'calibration_node/residuals')
         cell.spin_until(lambda: heard)
         (lines,) = heard[0].markers

@@ -55,14 +55,12 @@ def test_the_robot_describes_itself_and_gets_a_corrected_description(tmp_path):
         assert chain.joint_names == load_chain('ur10e').joint_names
         assert chain.joints[0].upper == 3.0
         assert chain.base is None
-        refused = cell.call('export')
-        assert not refused.success
+        refused = cell.refused('export')
         assert 'no calibration to export' in refused.message
         truth = true_arm()
         cell.play(topics(shift(truth)))
-        assert cell.call('identify').success
-        answer = cell.call('export')
-        assert answer.success, answer.message
+        cell.done('identify')
+        answer = cell.done('export')
         (folder,) = [path for path in tmp_path.iterdir() if path.is_dir()]
         assert str(folder) in answer.message
         assert {path.name for path in folder.iterdir()} == TABLES | {'corrected.urdf'}

@@ -15,9 +15,8 @@ if 'CI' not in os.environ:
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rclpy.serialization import serialize_message
+from recorded import write
 from ros_cell import LATCHED, Cell, assert_same, direct, header, joint_messages, stamp_ns
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from tf2_msgs.msg import TFMessage
 
 from calib_ros.errors import ConfigError
@@ -30,7 +29,7 @@ from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, parse_sources
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPES = {'/tf': TRANSFORMS, '/tf_static': TRANSFORMS, '/joint_states': JOINT_STATE}
 SOURCE = '/tf parent=tracker child=tool'
 TRACKER = se3.transform(se3.exp_rotation(np.array([0.3, -0.2, 1.0])), np.array([2.0, 1.0, 0.5]))
 
@@ -79,18 +78,6 @@ def serialised(recording):
     return [(topic, int(stamp), serialize_message(message)) for topic, stamp, message in found]
 
 
-def write(path, content):
-    types = {'/tf': TRANSFORMS, '/tf_static': TRANSFORMS, '/joint_states': JOINT_STATE}
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=STORE)
-            for topic, kind in types.items()
-        }
-        for topic, stamp, data in content:
-            writer.write(connections[topic], stamp, data)
-    return path
-
-
 def test_direct_bag_and_live_give_equal_observations(tmp_path, recording):
     """As of poses: one by one without ROS, through a bag, and through a running node."""
     settings = Settings(sources=(SOURCE,))
@@ -101,7 +88,7 @@ def test_direct_bag_and_live_give_equal_observations(tmp_path, recording):
     for topic, _, data in content:
         assert feed(alone, [(streams[topic], data)], deserialised) == []
     replayed = CalibrationSession(load_chain('ur10e'), settings)
-    assert replay(write(tmp_path / 'bag', content), replayed).warnings == ()
+    assert replay(write(tmp_path / 'bag', TYPES, content), replayed).warnings == ()
     parameters = {'chain': 'ur10e', 'sources': [SOURCE], 'data_dir': str(tmp_path)}
     with Cell(**parameters) as cell:
         latched = cell.peer.create_publisher(TFMessage, '/tf_static', LATCHED)
