@@ -95,6 +95,17 @@ def test_modules_and_functions_are_small(module):
             assert node.end_lineno - node.lineno < 60, node.name
 
 
+def test_few_numbers_are_tuned():
+    tuned = [
+        f'{name}.{node.targets[0].id}'
+        for name, path in MODULES.items()
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.Assign)
+        if isinstance(node.value, ast.Constant) and type(node.value.value) in (int, float)
+    ]
+    assert len(tuned) <= 60, tuned
+
+
 def test_no_two_modules_import_each_other():
     graph = {
         module: {inner(name) for name in imports(path)} - {None}

@@ -31,7 +31,7 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.identification.identifiability import followed
-from calib_ros.identification.levels import CONFIDENT, SCALE, chance_of
+from calib_ros.identification.levels import CERTAIN, CONFIDENT, SCALE, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
@@ -40,8 +40,8 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
-FALSE = 0.005
-"""Probability of claiming a change of an arm that has not changed
+FALSE = 0.5 * (1.0 - CERTAIN)
+"""Probability of claiming a change of an arm that has not changed, one side of what is certain
 (benchmarks/recalibration.py)."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either

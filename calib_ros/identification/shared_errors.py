@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from calib_ros.identification.leastsquares import Fit, System, gram
-from calib_ros.identification.levels import CERTAIN, TELLING
+from calib_ros.identification.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
@@ -40,9 +40,6 @@ from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
-NEARBY = 3
-"""Neighbours in joint space of each configuration that are tested; a convention, which
-benchmarks/drift.py --quick does not tell from 1."""
 MOST_STOPS = 2 * SOME_POSES
 """Stops on which sizes are estimated; of more, every so many runs of a twentieth."""
 ELSEWHERE = 4.0 * LARGEST
@@ -99,8 +96,8 @@ class _Stops:
             first = np.flatnonzero(np.diff(self.time) == 1.0)
             second = first + 1
         else:
-            far, nearest = cKDTree(self.place).query(self.place, k=NEARBY + 1)
-            first, second = np.repeat(np.arange(count), NEARBY + 1), nearest.ravel()
+            far, nearest = cKDTree(self.place).query(self.place, k=SEVERAL + 1)
+            first, second = np.repeat(np.arange(count), SEVERAL + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < ELSEWHERE / 2)
             first, second = first[good], second[good]
         ends = (np.append(first, second), np.append(second, first))

@@ -68,7 +68,7 @@ SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
     """Return the result with what is suspicious in it, refused where it cannot be right.
 
-    `another` asks whether it is another robot: not where a mistake is named already.
+    `another` tells that no mistake is named already, which would come first.
     """
     if any(each.socket or each.plane for each in problem.sets):
         return result  # one place tells nothing of what follows
@@ -77,7 +77,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
     sigmas = _sigmas(problem, result)
     if refusals and sigmas:
-        refusals, sigmas = (Reason(Rule.MISTAKE, sigmas), *refusals), ''
+        reason, sigmas = Reason(Rule.MISTAKE, sigmas), ''
+        refusals = (reason, *refusals) if another else (*refusals, reason)
     found = (scale, sister, _gravity(problem, result), _coupling(result), sigmas)
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)

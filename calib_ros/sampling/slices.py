@@ -22,8 +22,9 @@ Series: TypeAlias = tuple[Stamps, FloatArray]
 """Stamps (N,), and rows (N, w) or values (N,) at them."""
 
 
-AS_FLOATS = 1e-6
-"""Difference, relative as well, of values that are the same: they may have been floats."""
+AS_FLOATS = 8.0 * float(np.finfo(np.float32).eps)
+"""Difference, relative as well, of values that are the same: they may have been floats, and have
+gone through some roundings."""
 
 
 class Rows:

@@ -129,6 +129,17 @@ def test_sigmas_in_millimetres_are_named(sigma, oriented):
         assert not any('sigma' in each for each in result.remarks)
 
 
+def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
+    rng = np.random.default_rng(0)
+    chain = load_chain('ur10e')
+    seen = measure(faulty(chain, Cell(), rng), chain.random_joints(40, rng), rng, 1e-4, 3e-4)
+    turned = replace(seen, joints=seen.joints * [1, 1, 1, 1, 1, -1])
+    result = identify(Problem(chain, turned, sigma_position=0.1, sigma_orientation=0.4))
+    first, *_, last = result.refusals
+    assert first.startswith('wrist_3_joint counts the other way round')
+    assert last.startswith('sigma_position is 0.1 m, and only')
+
+
 @pytest.mark.parametrize('turns', [5e-3, 1e-2])
 def test_orientations_far_worse_than_their_sigma_are_named(turns):
     """Of a camera or a small rigid body of markers: by default they spoil the positions."""
