@@ -3,7 +3,8 @@
 """The topics that the node hears, and how well it hears them.
 
 Messages wait in the queues of their subscriptions, serialised, until they are taken by the batch:
-no executor may serve these subscriptions.
+no executor may serve these subscriptions. Nor may it wait for their events, of lost messages say:
+Fast DDS wakes it for these as long as any message waits, and it would never rest.
 """
 
 from __future__ import annotations
@@ -82,6 +83,18 @@ class Hearing:
         return time.monotonic() - self.last > SILENCE
 
 
+class _Due:
+    """The wait set of one event that is looked at, whether it has come or not."""
+
+    def add_event(self, event: object) -> int:
+        """Take the event; return its number."""
+        return 0
+
+    def is_ready(self, kind: str, number: int) -> bool:
+        """Tell that it may be looked at."""
+        return True
+
+
 class Inputs:
     """Subscriptions to streams of messages, emptied by hand."""
 
@@ -95,10 +108,11 @@ class Inputs:
         self._heard: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
         self._inputs = dict(self._subscribe(stream) for stream in streams)
+        self._events = dict.fromkeys((e for each in self._inputs for e in each.event_handlers), 0)
 
-    def __contains__(self, subscription: Subscription) -> bool:
-        """Tell whether a subscription is one of these."""
-        return subscription in self._inputs
+    def __contains__(self, entity: object) -> bool:
+        """Tell whether something is one of these subscriptions, or their events."""
+        return entity in self._inputs or entity in self._events
 
     def take(self) -> list[tuple[Stream, bytes]]:
         """Return what has come since the last call, in the order in which it came."""
@@ -117,7 +131,14 @@ class Inputs:
         return [topic for topic, heard in self._heard.items() if heard.count]
 
     def look(self) -> None:
-        """Note the rates at which messages have come since the last look."""
+        """Note what was lost or not heard since the last look, and at which rates it came."""
+        for event, known in self._events.items():
+            event.add_to_wait_set(_Due())
+            event.is_ready(_Due())
+            told = event.take_data()
+            if told is not None and told.total_count != known:
+                self._events[event] = told.total_count
+                event.callback(told)
         now = time.monotonic()
         span, self._looked_at = now - self._looked_at, now
         for heard in self._heard.values():
@@ -186,7 +207,9 @@ class Inputs:
             heard.note_lost(event.total_count)
 
         return SubscriptionEventCallbacks(
-            incompatible_qos=self._guarded(note_deaf), message_lost=self._guarded(note_lost)
+            incompatible_qos=self._guarded(note_deaf),
+            message_lost=self._guarded(note_lost),
+            use_default_callbacks=False,  # `_of_other_types` tells
         )
 
     def _of_other_types(self) -> list[str]:

@@ -25,6 +25,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.time_source import CLOCK_TOPIC
+from rclpy.waitable import Waitable
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
@@ -201,6 +202,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Return the subscriptions that an executor serves: not the inputs, which a timer does."""
         inputs = getattr(self, '_inputs', ())  # rclpy asks while it makes the node
         return (each for each in super().subscriptions if each not in inputs)
+
+    @property
+    def waitables(self) -> Iterator[Waitable]:
+        """Return the events and others that an executor serves: not those of the inputs."""
+        inputs = getattr(self, '_inputs', ())
+        return (each for each in super().waitables if each not in inputs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
