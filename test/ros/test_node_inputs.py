@@ -149,3 +149,13 @@ def test_a_count_of_losses_goes_on_where_it_overflows():
     for total in (2**29, 2**30, 3 * 2**29, 2**31 - 1, 2**64 - 2**31, 2**64 - 2**31 + 2):
         heard.note_lost(total)
     assert heard.lost == 2**31 + 2
+
+
+def test_no_executor_waits_for_the_inputs_or_their_events(cell):
+    """Fast DDS wakes it for events as long as a message waits: a core would be busy."""
+    (heard,) = (
+        each for each in Node.subscriptions.fget(cell.node) if each.topic_name == '/joint_states'
+    )
+    assert len(heard.event_handlers) == 2
+    served = {*cell.node.subscriptions, *cell.node.waitables}
+    assert served.isdisjoint([heard, *heard.event_handlers])
