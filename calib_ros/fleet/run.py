@@ -112,9 +112,14 @@ def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
     """Return the sources of a robot whose results are not filed; the last one has a page."""
     try:
-        there, rows = sources(robot), results(robot, history.rows(robot.serial))
+        rows = results(robot, history.rows(robot.serial))
     except CalibrationError as err:
         found.note(robot.serial, '', str(err))
+        return []
+    there, wrong = sources(robot)
+    for pattern, words in wrong.items():
+        found.note(robot.serial, pattern, words)
+    if not there:
         return []
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
@@ -135,7 +140,7 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
     rows = results(robot, history.rows(robot.serial))
     if not rows or rows[-1].source in names or page_path(out, rows[-1]).exists():
         return []
-    there = sources(robot)
+    there, _ = sources(robot)
     return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
 
 

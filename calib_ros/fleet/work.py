@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from calib_ros.errors import CalibrationError, ConfigError, InputError, shortened
+from calib_ros.errors import CalibrationError, ConfigError, shortened
 from calib_ros.files.history import (
     Filing,
     Row,
@@ -70,25 +70,25 @@ class Outcome(NamedTuple):
     seconds: float = 0.0
 
 
-def sources(robot: Robot) -> tuple[Source, ...]:
-    """Return what there is of a robot, by name."""
-    found = []
+def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
+    """Return what there is of a robot, by name, and what is wrong with patterns, by pattern."""
+    found, wrong = [], {}
     for each in robot.measured:
         try:
             files, pattern = _file_system(each.files)
             matched = files.glob(pattern, detail=True)
-        except CalibrationError:
-            raise
         except Exception as err:  # file systems fail in ways of their own
-            raise InputError(f'{each.files} cannot be listed: {err}') from err
+            own = isinstance(err, CalibrationError)
+            wrong[each.files] = str(err) if own else f'{each.files} cannot be listed: {err}'
+            continue
         if not matched:
-            raise InputError(f'nothing matches {each.files}')
+            wrong[each.files] = f'nothing matches {each.files}'
         for path, info in sorted(matched.items()):
             fingerprint, modified = _state(files, path, info)
             url = path if is_local(files) else files.unstrip_protocol(path)
             url += each.files[each.files.find('::') :] if '::' in each.files else ''
             found.append(Source(url, each.session, fingerprint, modified))
-    return tuple(found)
+    return tuple(found), wrong
 
 
 def work(task: Task) -> Outcome:

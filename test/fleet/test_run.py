@@ -1,5 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import plants
 import pytest
 from distributed import LocalCluster
@@ -7,7 +9,7 @@ from distributed import LocalCluster
 from calib_ros.errors import ConfigError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet import run as running
-from calib_ros.fleet.plant import read_plant
+from calib_ros.fleet.plant import Measured, read_plant
 from calib_ros.fleet.run import Cluster, LostError, run
 from calib_ros.fleet.standing import standings
 from calib_ros.fleet.work import Outcome, Source, Task
@@ -64,6 +66,15 @@ def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
     assert page.exists()
 
 
+def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path):
+    first, second = plant
+    missing = Measured(str(tmp_path / 'archive/*.csv'))
+    first = replace(first, measured=(missing, *first.measured))
+    found = run((first, second), History(tmp_path / 'history'), cluster)
+    assert found.filed == 4
+    assert found.errors == {'A': {missing.files: f'nothing matches {missing.files}'}}
+
+
 def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     history = History(tmp_path / 'history')
     bad = tmp_path / 'nights/A/001.csv'
@@ -73,7 +84,7 @@ def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     found = run(plant, history, cluster)
     assert found.filed == 1
     assert str(bad) in found.errors['A'][str(bad)]
-    assert 'nothing matches' in found.errors['B']['']
+    assert found.errors['B'] == {(none := plant[1].measured[0].files): f'nothing matches {none}'}
 
 
 def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):

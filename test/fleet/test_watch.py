@@ -85,6 +85,18 @@ def test_several_changes_and_those_before_a_date(first, rng):
     assert watch([r for r in rows if r.time >= changes[1].time], 100.0).changes == ()
 
 
+def test_the_night_of_another_arm_is_no_bump_of_one_joint(first, rng):
+    rows = list(nights(first, rng, 8))
+    mine, other = plants.robot(0)[0], plants.robot(1)[0]
+    names = list(map(Parameter, first.names))
+    moved = [0.0 if mine.owns_frame(name) else other.offset(name, mine) for name in names]
+    rows[6] = replace(rows[6], offsets=rows[6].offsets + np.array(moved))
+    changes = watch(rows, 100.0).changes
+    assert [change.time for change in changes] == [rows[6].time, rows[7].time]
+    assert {change.joint for change in changes} == {''}
+    assert 'another robot' in str(changes[0])
+
+
 def test_what_cannot_be_compared_is_left_out(first, rng):
     rows = list(nights(first, rng, 6))
     few = [k for k, name in enumerate(first.names) if name != BUMPS[0]]
