@@ -221,8 +221,8 @@ class Archive:
             samples, warnings = read_journal(self._path, self._joints)
         except InputError as err:
             raise InputError(
-                f'{err}. It stays as it is: mend that line, move the file away to go on with the '
-                'one before, or start without resume to begin another'
+                f'{err}. It stays as it is: mend it, move it away to go on with the one before, '
+                'or start without resume to begin another'
             ) from err
         self._journal = Journal(self._path, self._joints)
         return samples, warnings

@@ -18,8 +18,7 @@ much the nights so far scatter more than their covariances tell, where they clea
 much more j leaves of the difference: what warms up, what the model lacks. `changes.py` names what
 changed, and all begins anew.
 
-Neither warmth nor model makes nights scatter CLEARLY more all at once: nights of a simulated arm
-scatter 0.9 times as much as usual, two arms 77 times (0.05 mm, 30 poses). Where every joint leaves
+Neither warmth nor model makes nights scatter CLEARLY more all at once. Where every joint leaves
 more, several are different: a mended arm, or measurements of another robot.
 """
 

@@ -77,9 +77,11 @@ def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
         try:
             files, pattern = _file_system(each.files)
             matched = files.glob(pattern, detail=True)
+        except CalibrationError as err:
+            wrong[each.files] = str(err)
+            continue
         except Exception as err:  # file systems fail in ways of their own
-            own = isinstance(err, CalibrationError)
-            wrong[each.files] = str(err) if own else f'{each.files} cannot be listed: {err}'
+            wrong[each.files] = f'{each.files} cannot be listed: {err}'
             continue
         if not matched:
             wrong[each.files] = f'nothing matches {each.files}'

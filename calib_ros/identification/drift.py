@@ -35,6 +35,9 @@ from calib_ros.identification.observations import SOME_POSES, Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
+SLOW = SEVERAL
+"""Cosines that are taken out of a series at most; no more than one for ten stops
+(benchmarks/drift.py)."""
 SHIFTS = 2 * SOME_POSES
 """Shifts that are tried at most, forwards and backwards; the first of them is none
 (benchmarks/drift.py)."""
@@ -160,7 +163,7 @@ def _weights(observations: Observations, begins: NDArray[np.intp]) -> FloatArray
 
 def slow_cosines(length: int) -> FloatArray:
     """Return (K, length) orthonormal: the constant and the slowest cosines of a series."""
-    order = np.arange(1 + min(SEVERAL, length // 10))
+    order = np.arange(1 + min(SLOW, length // 10))
     waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 

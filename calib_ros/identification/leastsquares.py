@@ -33,6 +33,8 @@ Folds: TypeAlias = Sequence[NDArray[np.intp]]
 STEP_TOLERANCE = 1e-6
 """The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
 larger, in RMS residuals): a thousandth of what a million rows tell."""
+PATIENCE = SEVERAL
+"""Steps in succession that may raise the cost before they are damped."""
 SEPARATION_SIGMA = EXCEPTION * Settings.sigma_position
 """Standard deviation [m] of a known distance between sockets, assumed: nearly exact beside what a
 device measures."""
@@ -260,7 +262,7 @@ def minimise(
     """Fit the named parameters, relinearising until the step vanishes.
 
     Gauss-Newton with columns scaled to unit length. A step may raise the cost for a moment, as
-    it must to get through a curved valley (watchdog; Chamberlain et al. 1982); when SEVERAL
+    it must to get through a curved valley (watchdog; Chamberlain et al. 1982); when PATIENCE
     steps have not brought it far enough below the best (Armijo 1966), for they may go to and fro,
     the fit goes back there and steps are damped (Levenberg 1944, Marquardt 1963), by the ratio of
     the gain to the one foreseen (Nielsen 1999).
@@ -273,7 +275,7 @@ def minimise(
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
-    damping, growth, patience, promised = 0.0, 2.0, SEVERAL, 0.0
+    damping, growth, patience, promised = 0.0, 2.0, PATIENCE, 0.0
     iteration, stalled, least_cost, least_left = 0, 0, np.inf, np.inf
     while iteration < iterations and stalled < ROUNDS:
         iteration += 1
@@ -295,7 +297,7 @@ def minimise(
             if damping > ROUNDING:
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
             elif gain > 1e-4 * promised:
-                damping, patience = 0.0, SEVERAL
+                damping, patience = 0.0, PATIENCE
             elif patience > 0:
                 patience -= 1
             else:

@@ -40,10 +40,9 @@ LEAST_ASIDE = 1 + IN_A_FRAME // 3
 of fewer, which are gross errors."""
 SEVERAL = 3
 """Causes that are looked for one after the other: what needs more is something else. Changes of an
-arm, mistakes at once, harmonics before all of them are tried, slow waves in a session, neighbours
-of a pose, steps that may lead upwards. A convention: benchmarks/recalibration.py changes one,
-mistakes.py makes three, errors of real_robots.py are the same with 1, and drift.py --quick is with
-one neighbour."""
+arm, mistakes at once, and harmonics, before all of them are tried. A convention:
+benchmarks/recalibration.py changes one, mistakes.py makes three, and errors of real_robots.py are
+the same with 1."""
 TRIED = 2 * SEVERAL
 """Candidates, the best by a rough look, that are looked at closely (benchmarks/mistakes.py)."""
 KNOWN = 1.0 / HALF_THE_DIGITS

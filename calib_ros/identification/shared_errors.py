@@ -40,6 +40,9 @@ from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
+NEARBY = SEVERAL
+"""Neighbours in joint space of each configuration that are tested; benchmarks/drift.py --quick
+does not tell them from 1."""
 MOST_STOPS = 2 * SOME_POSES
 """Stops on which sizes are estimated; of more, every so many runs of a twentieth."""
 ELSEWHERE = 4.0 * LARGEST
@@ -96,8 +99,8 @@ class _Stops:
             first = np.flatnonzero(np.diff(self.time) == 1.0)
             second = first + 1
         else:
-            far, nearest = cKDTree(self.place).query(self.place, k=SEVERAL + 1)
-            first, second = np.repeat(np.arange(count), SEVERAL + 1), nearest.ravel()
+            far, nearest = cKDTree(self.place).query(self.place, k=NEARBY + 1)
+            first, second = np.repeat(np.arange(count), NEARBY + 1), nearest.ravel()
             good = (first != second) & (far.ravel() < ELSEWHERE / 2)
             first, second = first[good], second[good]
         ends = (np.append(first, second), np.append(second, first))
