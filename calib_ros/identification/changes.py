@@ -269,3 +269,14 @@ def gauged(
     taken, wanted, left = followed(chain, fitted, others, q, LEVER, approach=approach)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
     return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size
+
+
+def predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
+    """Return V (P, P) [m^2]: d^T V d is the mean squared difference of positions by d.
+
+    Over the joint range, in the best frames.
+    """
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
+    _, _, left = followed(chain, frames, names, joints, 0.0)
+    return np.asarray(left.T @ left) / len(joints)

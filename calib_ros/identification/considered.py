@@ -59,17 +59,17 @@ def told_of(
     lengths: Mapping[str, float],
     by_device: bool,
     known: Normal | None,
+    most: int = 10 * SOME_POSES,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the products (P + 1, P + 1) of columns and residual, and those with what is in doubt.
 
     The latter are A^T N (P + 1, K) and N^T N + 1 (K, K), N times its standard deviations. All are
     in units of the `noise` [sigma given], without priors. The column of the scale follows those of
     the names if there are `lengths` that grow. `doubts` are standard deviations of what else moves
-    a parameter, and `by_device` tells whether devices may bend space. Of many samples every so
-    many are taken; `known` holds the products of all of them for the names alone.
+    a parameter, and `by_device` tells whether devices may bend space. Of more than `most` samples
+    every so many are taken; `known` holds the products of all of them for the names alone.
     """
     columns = list(dict.fromkeys([*names, *lengths]))
-    most = 10 * SOME_POSES
     share = -(-system.count // most)
     if known is not None and share == 1 and not lengths and not by_device:
         products = known.products.sum(axis=0)

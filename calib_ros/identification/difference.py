@@ -29,7 +29,7 @@ from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import Columns, Explanation, Told
 from calib_ros.identification.evidence import group_of
-from calib_ros.identification.identifiability import followed, structurally_independent
+from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import TYPICAL
@@ -156,7 +156,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     while len(changed) < SEVERAL and (reasons := changes.reasons_of(told, columns, freedom)):
         changed.append(reasons)
         told = told.beside(columns.spread(reasons))
-    predicted = _predicted(chain, names)
+    predicted = changes.predicted(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
     squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)
@@ -221,11 +221,3 @@ def _chance(told: Told, freedom: float, explained: int = 0) -> float:
     """Return the probability of so large a change of all parameters but some by noise."""
     rank = max(1, len(told.names) - explained)
     return chance_of(told.explained(np.eye(len(told.names)))[0], rank, freedom)
-
-
-def _predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
-    """Return V (P, P) [m^2]: d^T V d is the mean squared difference of positions by d."""
-    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
-    _, _, left = followed(chain, frames, names, joints, 0.0)
-    return np.asarray(left.T @ left) / len(joints)

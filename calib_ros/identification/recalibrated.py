@@ -10,7 +10,7 @@ from typing import Any
 from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import Explanation
-from calib_ros.identification.levels import ALIKE
+from calib_ros.identification.levels import ALIKE, CLEARLY
 from calib_ros.identification.records import reused_in_words
 from calib_ros.identification.validation import ErrorFigures
 from calib_ros.shown import Shown
@@ -23,9 +23,11 @@ class Recalibration(Shown):
     `changed` is what has changed, one after the other: the best explanation of each change, and
     those that cannot be told apart from it; `unexplained` is the probability of residuals as large
     as those that are left. `before` and `after` are errors of the new poses by the earlier
-    calibration, and by what the other poses tell; `anew` tells whether there are new frames, which
-    are fitted to all of the new poses for `before`. `reused` is the share of the poses that the
-    earlier calibration was fitted to: they would count twice. `odd` names the pose without
+    calibration, and by what the other poses tell; `known_before` and `known_after` are to what RMS
+    [m] positions over the joint range are known (one sigma), `moved` by what they change. `anew`
+    tells whether there are new frames, which are fitted to all of the new poses for `before`.
+    `reused` is the share of the poses that the earlier calibration was fitted to: they would count
+    twice. `odd` names the pose without
     which the others would be accepted, if there is one.
     """
 
@@ -34,6 +36,9 @@ class Recalibration(Shown):
     unexplained: float
     before: ErrorFigures
     after: ErrorFigures
+    known_before: float
+    known_after: float
+    moved: float
     reused: float = 0.0
     anew: bool = False
     odd: str = ''
@@ -44,7 +49,12 @@ class Recalibration(Shown):
         better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
         fits = self.unexplained > changes.FALSE and bool(agrees)
-        return fits and not (self.reused or self.scale)
+        return fits and self.determined and not (self.reused or self.scale)
+
+    @property
+    def determined(self) -> bool:
+        """Tell whether the arm is known about as well as before, or far better than it changed."""
+        return self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
 
     @property
     def scale(self) -> Explanation | None:
@@ -61,6 +71,9 @@ class Recalibration(Shown):
             'unexplained': self.unexplained,
             'before': asdict(self.before),
             'after': asdict(self.after),
+            'known_before_mm': 1e3 * self.known_before,
+            'known_after_mm': 1e3 * self.known_after,
+            'moved_mm': 1e3 * self.moved,
         }
 
     def in_words(self) -> str:
@@ -72,7 +85,7 @@ class Recalibration(Shown):
         if self.accepted:
             said = 'unchanged within what is known, brought up to date'
             if self.changed:
-                said = '; '.join(changes.reason_in_words(each) for each in self.changed)
+                said = self._causes()
             return f'accepted: {said}; {text}'
         if self.reused:
             why = f'{reused_in_words(self.reused)}, and give only those'
@@ -90,6 +103,13 @@ class Recalibration(Shown):
             )
         elif self.unexplained <= changes.FALSE:
             why = 'no few parameters explain what has changed; identify anew'
+        elif not self.determined:
+            before, after = 1e3 * self.known_before, 1e3 * self.known_after
+            why = (
+                f'the new poses do not show well enough what has changed ({self._causes()}): the '
+                f'arm would be known to {after:.3f} mm, before to {before:.3f} mm; measure more '
+                'poses, all over the joint range'
+            )
         elif self.anew:
             why = (
                 'the earlier calibration, in new frames, fits the new poses better; keep it, or '
@@ -98,3 +118,6 @@ class Recalibration(Shown):
         else:
             why = 'the new poses contradict each other; measure more'
         return f'NOT accepted: {why}. {text}'
+
+    def _causes(self) -> str:
+        return '; '.join(changes.reason_in_words(each) for each in self.changed)

@@ -7,7 +7,9 @@ by a growth g per root of a year (a random walk). The residuals r of the new pos
 arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ N(0, C + g^2 t). A
 larger change must have a cause that changed few parameters (`changes.py`). These become free (if
 two causes cannot be distinguished, those of both), and the estimate is the mean of dx given A and
-b, relinearised until it converges.
+b, relinearised until it converges. Smooth errors of the device (`considered.py`), then and now,
+are no change of the arm. The result is used if the arm is then known about as well as before, or
+far better than it changed: by few poses, or poses much alike, one cause imitates another.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration, about, made
 from calib_ros.identification.changes import SCALE_OF_DEVICE, Columns, Explanation, Told
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.leastsquares import System, minimise, normal_equations, products_of
+from calib_ros.identification.considered import told_of
+from calib_ros.identification.leastsquares import System, minimise, products_of
 from calib_ros.identification.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations, numbered
@@ -135,27 +138,37 @@ def _recalibrated(
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
     columns = Columns(arm.chain, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
-    earlier = arm.changed(np.zeros(len(arm.names)))
+    earlier, before = arm.changed(np.zeros(len(arm.names))), arm.square
     found = arm.solved(system)
-    while len(changed) < SEVERAL and (
-        reasons := changes.reasons_of(found.told.beside(arm.square), columns, previous.freedom)
-    ):
+    while len(changed) < SEVERAL and (reasons := arm.reasons(found.told, columns)):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
             columns = Columns(arm.chain, arm.names, movable)  # as much is usual
             continue
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
-    left = found.squares - float(found.told.vector @ found.change)
+    left = found.squares - float(found.told.vector @ found.told.mean(arm.doubted)[0])
     result = Recalibration(
         _updated(arm, found, problem, changed),
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
         *_judged(arm, found, system, sets),
+        *_known(arm, before, found),
         previous.reused(sets),
         bool(names),
     )
     return result, earlier
+
+
+def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:
+    """Return the RMS [m] over the joint range of what was unknown, of what is, and of the change.
+
+    Expected squares of the parameters' errors `before` are (P, P).
+    """
+    positions = changes.predicted(arm.chain, arm.names)
+    squares = before, found.covariance, np.outer(found.change, found.change)
+    first, second, moved = (float(np.sqrt(np.sum(positions * each))) for each in squares)
+    return first, second, moved
 
 
 def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
@@ -187,12 +200,17 @@ class _Found:
 
 @dataclass(frozen=True, eq=False)
 class _Arm:
-    """The earlier arm, parameters that are known to a covariance (P, P), effects considered."""
+    """The earlier arm, parameters that are known to a covariance (P, P), effects considered.
+
+    A device that stands elsewhere, or another, may show them off by `device` (P, P) as well; that
+    is no change of the arm.
+    """
 
     previous: Calibration
     chain: Chain
     names: tuple[Parameter, ...]
     square: FloatArray
+    device: FloatArray
 
     @classmethod
     def of(
@@ -212,13 +230,28 @@ class _Arm:
                     f'{each.base} and {each.tool}'
                 )
         chain, names, square = previous.chain, previous.names, previous.covariance
+        device = np.zeros_like(square)
         if (region := previous.region) is not None:
-            chain, names, square = region.chain, region.names, region.square
+            chain, names = region.chain, region.names
+            square, device = region.square, region.device @ region.device.T
         named = tuple(map(Parameter, names))
         grown = growth / changes.SIZES['m']  # a year
         sizes = [grown * changes.SIZES[n.unit] if n.of_dh else 0.0 for n in named]
         wandered = np.diag(np.square(sizes)) * max(years, 0.0)
-        return cls(previous, chain, named, square + wandered)
+        return cls(previous, chain, named, square + wandered, device)
+
+    @property
+    def doubted(self) -> FloatArray:
+        """Return the covariance (P, P) by what is not known of the arm, and by the device."""
+        return self.square + self.device
+
+    def reasons(self, told: Told, columns: Columns) -> tuple[Explanation, ...]:
+        """Return what has changed; of what the device may do by itself only another scale."""
+        freedom = self.previous.freedom
+        found = changes.reasons_of(told.beside(self.square), columns, freedom)
+        if found and found[0].names == (SCALE_OF_DEVICE,):
+            return found
+        return changes.reasons_of(told.beside(self.doubted), columns, freedom)
 
     @property
     def own(self) -> list[int]:
@@ -239,9 +272,13 @@ class _Arm:
         change = np.zeros(len(self.names))
         for _ in range(4):  # of changes by millimetres the second moves nothing any more
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
-            normal = normal_equations(chain, self.names, system)
-            told = Told(self.names, normal.matrix, normal.gradient + normal.matrix @ change)
-            squares = normal.cost + float(change @ (normal.gradient + told.vector))
+            plain, cross, doubtful = told_of(
+                chain, self.names, system, 1.0, {}, {}, True, None, system.count
+            )
+            products = plain - cross @ np.linalg.solve(doubtful, cross.T)
+            matrix, gradient = products[:-1, :-1], products[:-1, -1]
+            told = Told(self.names, matrix, gradient + matrix @ change)
+            squares = float(products[-1, -1] + change @ (gradient + told.vector))
             change, covariance = told.mean(self.square)
         return _Found(change, covariance, told, squares)
 

@@ -173,6 +173,50 @@ def test_one_gross_error_among_few_poses_is_named(earlier, slip):
     assert not recalibrate(previous, seen, 0.1).odd
 
 
+def test_a_gross_error_is_no_bent_link(earlier):
+    true, previous = earlier
+    seen = problem(true, 1, 3)
+    positions = seen.observations.positions.copy()
+    positions[0] += [2e-3, -1e-3, 2e-3]
+    wrong = replace(seen, observations=replace(seen.observations, positions=positions))
+    found = recalibrate(previous, wrong, 0.1)
+    assert found.changed
+    assert not found.accepted
+
+
+def test_poses_too_much_alike_to_show_what_has_changed_are_not_enough(earlier):
+    true, previous = earlier
+    now = true.with_offsets({'shoulder_lift_joint.theta': 5e-4})
+    rng = np.random.default_rng(2)
+    joints = UR10E.random_joints(1, rng) + rng.uniform(-0.1, 0.1, (4, 6))
+    alike = Problem(UR10E, measure(now, joints, rng, NOISE[0], oriented=False), **SIGMAS)
+    found = recalibrate(previous, alike, 0.1)
+    assert found.changed
+    assert not found.determined
+    assert not found.accepted
+    assert 'do not show well enough what has changed' in found.in_words()
+    assert recalibrate(previous, problem(now, 8, 2), 0.1).accepted
+
+
+@pytest.mark.parametrize('seed', [3, 8, 10, 13])
+def test_smooth_errors_of_a_device_that_was_moved_are_no_change_of_the_arm(seed):
+    arm, rng = load_chain('denso_hsr065'), np.random.default_rng(seed)
+    true = faulty(arm, Cell(), rng)
+
+    def bent(count):
+        """Return what a device with smooth errors as large as its sigma measures."""
+        seen = measure(true, arm.random_joints(count, rng), rng, *NOISE)
+        phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+        waves = np.sin(np.pi * seen.positions[:, [1, 2, 0]] + phases)
+        positions = seen.positions + np.sqrt(2.0) * NOISE[0] * waves
+        return Problem(arm, replace(seen, positions=positions), **SIGMAS)
+
+    previous = Calibration.of(identify(bent(60)))
+    for _ in range(4):
+        found = recalibrate(previous, bent(8), 0.1)
+        assert not found.changed, found.in_words()
+
+
 def test_another_arm_is_not_mended_by_8_poses(earlier):
     true, previous = earlier
     rng = np.random.default_rng(12)
