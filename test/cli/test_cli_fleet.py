@@ -66,7 +66,7 @@ def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, c
     assert signal.getsignal(signal.SIGINT) is before
     assert capsys.readouterr().err.splitlines() == [
         'note: results so far are filed: the next run does the rest',
-        'calib_ros: interrupted: no file is left half written',
+        'calib_ros: interrupted: no half-written file remains',
     ]
 
 
