@@ -36,7 +36,7 @@ def meant(
     if lost.size:
         raise InputError(
             f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from '
-            'the nearest commanded joint values: is it of that program?'
+            'the nearest commanded joint values: does it belong to that program?'
         )
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])

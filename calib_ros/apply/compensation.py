@@ -66,7 +66,8 @@ class Compensator(Shown, Limits):
         )
         if ours != theirs:
             raise ConfigError(
-                'the nominal and the calibrated chain must have the same joints in one order, not '
+                'the nominal and the calibrated chain must have the same joints in the same '
+                'order, not '
                 f'{ours} and {theirs}'
             )
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():
@@ -175,9 +176,7 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             worst = max(columns, key=lambda k: float(size[k]))
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
-    text += (
-        f'; largest error by the calibration {1e3 * result.position_before[kept].max():.3f} mm, '
-    )
+    text += f'; largest predicted error {1e3 * result.position_before[kept].max():.3f} mm, '
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
     text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
     text += f'{1e3 * result.orientation[kept].max():.3f} mrad'
@@ -185,9 +184,9 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
     if not compensator.follower.complete and turn > turned:
         x, y, z = compensator.tool
         text += (
-            f'; this arm cannot keep every orientation: the position corrected is that of the '
-            f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m from it '
-            f'may be {1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
+            '; this arm cannot keep every orientation: the corrected position is that of the '
+            f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m away may be '
+            f'{1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
         )
     if not compensator.follower.anywhere:
         squares = result.position[kept] ** 2 - result.reachable[kept] ** 2
@@ -265,7 +264,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
             )
         else:
             how = 'remain' if result.converged[k] else 'remain, without convergence'
-            reason = f'{left} {how}: more than is tolerated'
+            reason = f'{left} {how}: more than tolerated'
         found.append(Refusal(k, reason))
     return found
 

@@ -69,7 +69,7 @@ class Design(Shown):
         """
         kind = problem.kinds[0]
         if kind.distance or problem.separations:
-            raise InputError('planning is for measured poses or positions, not for distances')
+            raise InputError('planning needs measured poses or positions, not distances')
         model = problem.model
         priors = problem.prior_sigmas
         structural = structurally_independent(model, problem.free, problem.kinds)

@@ -321,7 +321,7 @@ def fewest(
         raise InputError(
             f'all {len(candidates)} candidates together predict {1e3 * best:.4f} mm, '
             f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
-            'more accurate device (--sigma-position), or want less'
+            'more accurate device (--sigma-position), or a larger --accuracy'
         )
     count = len(excited.names)  # poses determine several parameters each
     while True:
@@ -361,14 +361,14 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
         lines.append(f'{count:6}         - too few poses to determine all parameters')
     text = f'{count} of {candidates} candidates'
     if plan.efficiency is not None:
-        text += f', at least {100.0 * plan.efficiency:.0f} % of what the best choice would bring'
+        text += f', at least {100.0 * plan.efficiency:.0f} % as good as the best choice'
     lines.append(f'{text}; moves take {plan.travel:.0f} s')
     if needed is not None:
         lines.append(f'{needed} poses reach {wanted_mm:g} mm')
     if plan.lacking:
         lines.append(
             f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '
-            'further and in more combinations, or fix these parameters. The figures leave out '
-            'what these bring, and hold only where the joints move as in the candidates'
+            'further and in more combinations, or fix these parameters. The figures ignore these '
+            'parameters, and hold only where the joints move as in the candidates'
         )
     return '\n'.join(lines)

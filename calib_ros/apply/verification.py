@@ -234,7 +234,7 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     count = len(moments)
     if count - lost < least:
         raise InputError(
-            f'{count} poses were measured, at least {least + lost} are needed: five are '
+            f'{count} poses were measured; at least {least + lost} are needed: five are '
             'usual (calib_ros plan --iso9283)'
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
@@ -267,7 +267,7 @@ def _check(
     for each in sets:
         chain.joint_values(each.joints)
         if each.distances is not None or each.socket:
-            raise InputError('to verify, poses or positions must be measured, not distances')
+            raise InputError('verification needs measured poses or positions, not distances')
         if not {each.base, each.tool} <= set(chain.frame_names):
             raise InputError(
                 f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
@@ -275,7 +275,7 @@ def _check(
             )
         if fitted and each.pixels is not None:
             raise InputError(
-                'images do not tell a new place of base or tool: leave both as they were for the '
+                'images cannot locate a new base or tool: leave both as they were for the '
                 'calibration, or measure poses'
             )
 

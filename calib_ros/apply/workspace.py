@@ -48,7 +48,7 @@ class Survey(Shown):
         """Return the errors (N,) [m] by their names: only what is removed, if no more is known."""
         found = {'removed by the calibration': self.removed}
         if not np.isnan(self.remaining).any():
-            found |= {'uncertainty of that': self.sigma, 'expected to remain': self.remaining}
+            found |= {'its uncertainty': self.sigma, 'expected to remain': self.remaining}
         return found
 
     @property

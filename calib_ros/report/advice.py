@@ -18,8 +18,8 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.settings import EXCEPTION
 
 AGAIN = (
-    'Then identify again. Use the measurements so far with the new ones; if something was loose, '
-    'only the new ones.'
+    'Then identify again with old and new measurements, or with the new ones alone if something '
+    'was loose.'
 )
 
 
@@ -94,8 +94,8 @@ COARSE = (
 """What to check first where the measurements are far too coarse."""
 FEW = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
-    'What is left is as if the device had a noise of {:.2g} mm in each direction; {:.2g} mm are '
-    'set (sigma_position).'
+    'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
+    'sigma_position is {:.2g} mm.'
 )
 
 
@@ -136,6 +136,6 @@ def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Ad
         one = replace(rules()[rule], refusal='; '.join(texts))
         told.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
     for cause, texts in following.items():
-        heading = f'What probably follows from "{rules()[cause].heading}"'
+        heading = f'Likely consequences of "{rules()[cause].heading}"'
         told.append(Advice(heading, '', (), '; '.join(texts)))
     return tuple(told)

@@ -93,7 +93,7 @@ def against_noise(poses: Poses) -> Figure:
         data.append(_curve('markers', name, x, y, marker=marker))
     ends = np.array([-3.0, 3.0])
     data.append(_curve('lines', 'noise as stated', ends, ends, line=DOTTED))
-    across, up = axis('expected of pure noise [sigma]'), axis('measured [stated sigma]')
+    across, up = axis('expected from pure noise [sigma]'), axis('measured [stated sigma]')
     return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
 
@@ -164,7 +164,7 @@ def coverage(
     x = numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4)
     z = numbers(np.where(counts > 0, counts, np.nan))
     mesh = _heat_map(x, labels, z, '%{y}<br>%{z} poses', scale_of('poses'))
-    across = axis('place in the range of the joint [%]', range=[0, 100])
+    across = axis('position in the joint range [%]', range=[0, 100])
     layout = {'xaxis': across, 'yaxis': REVERSED, 'margin': _margin(130, 20, 50)}
     return {'data': [mesh], 'layout': layout}, tuple(rows)
 

@@ -164,7 +164,7 @@ class Guide:
 
     def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_QUEUED:
-            self._refuse(f'{MOST_QUEUED} others wait already, send them more slowly')
+            self._refuse(f'{MOST_QUEUED} others are already waiting; send them more slowly')
         elif too_large := _too_large(data):
             self._refuse(too_large)
         else:
@@ -187,7 +187,7 @@ class Guide:
     def _corrected_by(self, message: Any, calibration: Calibration | None) -> tuple[Any, str]:
         if calibration is None:
             raise InputError(
-                'there is no accepted calibration to correct it by: call ~/identify or ~/load'
+                'there is no accepted calibration to correct it with: call ~/identify or ~/load'
             )
         compensator = _compensator(self._session.chain, calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
@@ -234,5 +234,5 @@ def _too_large(data: bytes) -> str:
         (points, MOST_POINTS, 'points'),
     ):
         if count > most:
-            return f'{count} {what}, at most {most} are taken'
+            return f'{count} {what}; the limit is {most}'
     return ''

@@ -125,7 +125,7 @@ class DeferredTrigger:
     def _on_call(self, request: Any, response: Any) -> Any:
         def prepare() -> Answer:
             if self._running.is_set():
-                return False, 'refused: the call before is still running, wait for its answer'
+                return False, 'refused: the previous call is still running; wait for its answer'
             self._snapshot = [self._prepare()]
             return True, ''
 

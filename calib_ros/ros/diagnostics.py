@@ -90,11 +90,11 @@ class Diagnostics:
         if count < 2:
             return []
         words = (
-            f'{count} nodes are called {node.get_fully_qualified_name()}, and all of them answer '
-            'services: end one, or rename it (-r __node:=NAME)'
+            f'{count} nodes are named {node.get_fully_qualified_name()}, and all of them answer '
+            'services: stop one, or rename it (-r __node:=NAME)'
         )
         if before < 2:
-            node.get_logger().warning(f'{words}. One that was killed counts for some seconds')
+            node.get_logger().warning(f'{words}. A killed node still counts for some seconds')
         return [words]
 
     def _figures(self, account: Account) -> dict[str, Any]:

@@ -197,7 +197,7 @@ class Identifying:
             )
         else:
             if self._session.calibration is not None:
-                self.last += '; the last good calibration stays'
+                self.last += '; the last good calibration stays in use'
             self._keep_report(page)
         self.last += self._filer.identified(given.problem, result, self._session.settings)
         return result.accepted, self.last
@@ -221,7 +221,7 @@ class Identifying:
         if len(text) > ANSWER_LENGTH:
             path = self._archive.note(f'{text}\n')
             path = self._report or path
-            more = f' ... all of it: {path.name if path else "in the log"}'
+            more = f' ... full text: {path.name if path else "in the log"}'
             before, advice, _ = text.partition(self._advice or text)
             text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
         return success, text

@@ -147,9 +147,7 @@ class Inputs:
     def troubles(self) -> list[str]:
         """Return in words which topics are not heard as they should be."""
         wrong = [
-            f'nothing is heard on {topic} any more'
-            for topic, heard in self._heard.items()
-            if heard.silent
+            f'no more messages on {topic}' for topic, heard in self._heard.items() if heard.silent
         ]
         wrong += [
             f'{topic} is published {heard.deaf} is asked for'
@@ -161,7 +159,7 @@ class Inputs:
         wrong += [words for links in links_of(streams) for words in links.problems()]
         losing = [topic for topic, heard in self._heard.items() if heard.losing]
         if losing:
-            wrong.append(f'messages get lost on {", ".join(losing)}')
+            wrong.append(f'messages are lost on {", ".join(losing)}')
         return wrong
 
     def figures(self) -> dict[str, Any]:

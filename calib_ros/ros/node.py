@@ -252,7 +252,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             try:
                 log.info(f'{self._on_load(None)[1]}: it is published')
             except Exception as err:  # whatever is wrong with a file, samples can be taken
-                self._identifying.last = f'no calibration is published at the start: {err}'
+                self._identifying.last = f'no calibration is published at startup: {err}'
                 log.error(self._identifying.last)
         elif path is not None:
             log.info(
@@ -306,7 +306,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         count = len(self.session.samples)
         old = self._archive.begin_anew()
         self.session.clear()
-        kept = f'; they stay in {old}' if old else ''
+        kept = f'; they remain in {old}' if old else ''
         return True, f'{count} poses cleared{kept}; the calibration stays'
 
     def _on_record(self, request: Any) -> Answer:

@@ -180,7 +180,8 @@ class Keeper:
         serial, ours = calibration.record.get('robot_serial'), self._given.serial
         if serial and ours and serial != ours:
             raise InputError(
-                f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
+                f'{path} is the calibration of the robot with serial "{serial}"; this one is '
+                f'"{ours}"'
             )
         self.adopt(calibration, Published(text, ''))
         return path

@@ -92,20 +92,20 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         topic = node.resolve_topic_name('robot_description')
-        node.get_logger().info(f'waiting for {topic}, {DESCRIPTION_WAIT:g} s at most')
+        node.get_logger().info(f'waiting up to {DESCRIPTION_WAIT:g} s for {topic}')
         found, message = wait_for_message(
             String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
         )
         if not found:
             raise ConfigError(
-                f'no robot_description has come within {DESCRIPTION_WAIT:g} s: start '
+                f'no robot_description arrived within {DESCRIPTION_WAIT:g} s: start '
                 'robot_state_publisher first, or set chain to a file'
             )
         text = message.data
     elif Path(name).suffix in URDF_SUFFIXES:
         text = read_text(Path(name))
     elif any(links.values()):
-        raise ConfigError('base_link and tip_link are of use with a URDF only')
+        raise ConfigError('base_link and tip_link apply only to a URDF')
     else:
         return load_chain(name), ''
     return replace(chain_from_urdf(text, **links), base=None, tool=None), text

@@ -51,7 +51,7 @@ class JointNames:
         if not (missing and self.foreign):
             return ''
         return (
-            f'waiting for joint states, set joint_names? Those that come name '
+            f'waiting for joint states, set joint_names? Those received name '
             f'{", ".join(self.foreign)}, not {", ".join(self._names[k] for k in missing)}'
         )
 
@@ -112,7 +112,7 @@ class FrameNames:
 
 def strange(frame_id: str, usual: str) -> str:
     """Return in words that a measurement is not in the frame in which others are."""
-    return f'in frame "{frame_id}", not in "{usual}" as others'
+    return f'in frame "{frame_id}", not in "{usual}" like the others'
 
 
 class Part(NamedTuple):

@@ -26,7 +26,7 @@ ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]
 """A sample with the number of the round or the stop in which it was taken."""
 VIBRATING = 'measurements: still vibrating, or a spike'
-RESTLESS = 'measurements: a stop that spreads more than the noise'
+RESTLESS = 'measurements: a stop with more spread than noise'
 
 
 class Maker:

@@ -39,8 +39,8 @@ from calib_ros.settings import Settings
 
 NOT_RECORDING = 'not recording: call ~/record with true'
 ONE_FRAME = (
-    'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
-    'its own for each source'
+    'only one may be used: set frame_id (--frame-id) to it, or start again with a separate '
+    'device for each source'
 )
 
 
@@ -155,7 +155,7 @@ class CalibrationSession:
         if not self.samples:
             raise InputError('there is no pose to remove')
         sample = self.samples.pop()
-        self._entry.unused['measurements: of a pose that was taken back'] += sample.count
+        self._entry.unused['measurements: of a removed pose'] += sample.count
         self._collector.forget(sample)
         self.on_removed(sample)
         return sample
@@ -165,7 +165,7 @@ class CalibrationSession:
         for sample in samples:
             if sample.joints.shape != (len(self.chain.joints),):
                 raise InputError(
-                    f'poses to go on with have {len(sample.joints)} joint values, chain '
+                    f'poses to resume have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
             if sample.frame_id:
@@ -192,7 +192,7 @@ class CalibrationSession:
         track = self._collector.track
         silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
         if silent:
-            return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
+            return f'nothing can be sampled: no more joint states of {", ".join(silent)}'
         if others := self._names.foreign_ones(track.missing):
             return others
         if why := self._entry.refused.get(JOINTS):

@@ -187,7 +187,7 @@ def _by_arrival(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
 
 
 TOO_LATE = 'measurements: later than lateness allows'
-TOO_MANY = f'measurements: of one more than {MOST_NAMES} targets, or frames'
+TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
 
 
 class Waiting(dict[StreamKey, Rows]):

@@ -89,7 +89,7 @@ def _settled(values: FloatArray, reach: float) -> int:
     return int(last[-1]) + 2 if last.size else 0
 
 
-SAMPLED = 'of a stop that has its pose already'
+SAMPLED = 'of a stop that already has its pose'
 
 
 @dataclass
@@ -148,7 +148,7 @@ class Plan:
                 self.sampled(min(end, until))
                 continue
             if settings.mode == 'triggered':
-                self.add(min(end, until), 'nobody asked for them')
+                self.add(min(end, until), 'not requested')
                 continue
             last = min(end, begin + longest)
             if last > until or (goes_on and last == end):

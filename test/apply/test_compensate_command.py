@@ -121,7 +121,7 @@ def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
     status, said, err = run(TABLE)
     assert (status, err) == (0, '')
     assert said.startswith('wrote out.csv: 2 of 2 points corrected, by ')
-    assert 'largest error' in said
+    assert 'largest predicted error' in said
     before, after = (
         list(csv.DictReader((tmp_path / name).read_text().splitlines()))
         for name in ('program.csv', 'out.csv')
@@ -257,7 +257,7 @@ def test_an_existing_file_is_kept_unless_forced(run, tmp_path):
 def test_a_program_is_not_compensated_in_place(run, tmp_path):
     status, _, err = run(TABLE, '--force', out='program')
     assert status == 1
-    assert 'compensated twice is wrong' in err
+    assert 'compensating it twice is wrong' in err
     assert (tmp_path / 'program.csv').read_text() == TABLE
 
 
