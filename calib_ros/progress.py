@@ -93,7 +93,7 @@ class Progress:
             if self._began is None:
                 return False, f'nothing to cancel: not {self._what}'
             self._cancelled = True
-            return True, f'{self.words} ends after this stage'
+            return True, f'{self.words} will end after this stage'
 
     def _refuse_cancelled(self) -> None:
         if self._cancelled:

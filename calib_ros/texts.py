@@ -79,7 +79,7 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as err:
         raise error(
-            f'{where} is no text in UTF-8: save it as UTF-8, or is it another file?'
+            f'{where} is not UTF-8 text: save it as UTF-8, or is it the wrong file?'
         ) from err
 
 
@@ -122,7 +122,9 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     import yaml
 
     if len(text) > LARGEST_TEXT:
-        raise error(f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right one?')
+        raise error(
+            f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right file?'
+        )
     try:
         _weigh(yaml.parse(text, _loader()), where, error)
         documents = [each for each in yaml.load_all(text, _loader()) if each is not None]
@@ -196,9 +198,7 @@ class _Scales:
         elif event.anchor in self.anchors:
             nodes, height = self.anchors[event.anchor]
         else:
-            raise self._error(
-                f'{self._where}: alias "{event.anchor}" stands for nothing before it'
-            )
+            raise self._error(f'{self._where}: alias "{event.anchor}" is not defined before it')
         if above + height > DEEPEST:
             raise self._error(f'{self._where} is nested deeper than {DEEPEST} levels')
         if event.anchor:
@@ -214,7 +214,7 @@ class _Scales:
             key = getattr(inner, 'value', '<<')
             if keyed and k % 2 == 0 and key != '<<':
                 if key in keys:
-                    raise self._error(f'{self._where}: key "{key}" comes twice')
+                    raise self._error(f'{self._where}: key "{key}" appears twice')
                 keys.add(key)
             more, levels = self.node(inner, above + 1)
             nodes, height = nodes + more, max(height, levels + 1)

@@ -78,7 +78,7 @@ def parse_like(default: Any, value: object, where: str) -> Any:
         texts = value if isinstance(value, list | tuple) else (value,)
         if all(isinstance(each, str) for each in texts):
             return tuple(filter(None, texts))
-        wanted = "a list of texts such as ['a', 'b']"
+        wanted = "a list of strings such as ['a', 'b']"
     raise ConfigError(f'{where} must be {wanted}, not {value!r:.100}')
 
 

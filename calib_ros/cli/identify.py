@@ -171,7 +171,7 @@ def _detected(
     """Return what is to be fitted of corners of a board, and of a table besides."""
     for name in ('board', 'places'):
         if getattr(options, name) is None:
-            raise InputError(f'--detections needs --{name} as well')
+            raise InputError(f'--detections needs --{name}')
     board = boards.read_board(options.board)
     found = boards.read_detections(options.detections, board)
     places, posed = boards.read_places(options.places, len(chain.joints))

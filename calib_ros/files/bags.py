@@ -26,7 +26,7 @@ from calib_ros.sampling.topics import Reading, check_joints, choose
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
 
-ALLOW = 'take the rest all the same with --largest-loss'
+ALLOW = 'accept the rest with --largest-loss'
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
     """
     path = Path(path)
     if not (path.is_dir() or path.is_file()):
-        raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
+        raise InputError(f'there is no bag at {path}: give its folder or one of its files')
     session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
     with stored.unpacked_files(path) as folder:
         return _replay(path, folder, session, told)
@@ -187,8 +187,8 @@ def _chosen(
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
             raise InputError(
-                f'the bag does not define {stream.type} of {topic}: record it where that package '
-                'is installed'
+                f'the bag does not define {stream.type} of {topic}: record it on a computer with '
+                'that package'
             )
     _check_joints(session, streams, messages_on, deserialise)
     return streams, deserialise
@@ -219,8 +219,8 @@ def rosbag2() -> Any:
     except ImportError as err:
         raise InputError(
             f'bags need the Python package rosbags, which is not installed ({err}): pip install '
-            'rosbags, in a virtual environment where the system is managed (README, "Bags"); '
-            'tables (--csv) and the node do without'
+            'rosbags, in a virtual environment if Python is managed by the system (README, '
+            '"Bags"); tables (--csv) and the node work without it'
         ) from err
     return rosbag2
 

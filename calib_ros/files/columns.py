@@ -42,7 +42,7 @@ class Columns:
 
     def _no_number(self, row: int, name: str, text: str = '') -> InputError:
         return InputError(
-            f'{self.where(row, name)} must be a finite number, not {text!r}: mend that row, or '
+            f'{self.where(row, name)} must be a finite number, not {text!r}: correct that row or '
             'leave it out'
         )
 

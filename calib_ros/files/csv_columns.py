@@ -136,7 +136,7 @@ def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> 
     if (place := data.find(b'\0')) >= 0:
         line = above + 1 + data.count(b'\n', 0, place)
         raise InputError(
-            f'{path} is no text in UTF-8, line {line} has zero bytes: is it damaged? Save it as '
+            f'{path} is not UTF-8 text, line {line} has zero bytes: is it damaged? Save it as '
             'UTF-8'
         )
     if not data.isascii():
@@ -229,7 +229,7 @@ def csv_rows(
             yield (line := reader.line_num), row
     except csv.Error as err:
         raise InputError(
-            f'cannot read {path} from line {line + 1}: {err}: are its quotation marks in pairs?'
+            f'cannot read {path} from line {line + 1}: {err}: are its quotation marks paired?'
         ) from err
 
 
@@ -239,7 +239,7 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
         if any(mark in cell for cell in header):
             raise ColumnsError(
                 f'the cells of {path} are separated by {name}s: save it with commas between cells '
-                f'and points in numbers. Measurements are read as they are with --separator {name}'
+                f'and points in numbers. To read measurements as they are, give --separator {name}'
                 ' (and, where they differ, --decimal comma, --columns, --length, --angle)'
             )
 

@@ -73,7 +73,7 @@ class Foreign:
         good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
         if not good.all():
             lines = made.lines[~good].tolist()
-            notes.append(f'nothing was measured in {lines_in_words(lines)}: left out')
+            notes.append(f'nothing measured in {lines_in_words(lines)}: skipped')
             made = made.select(good)
         return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 

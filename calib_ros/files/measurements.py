@@ -161,8 +161,8 @@ class Measurements:
             if len(names) > 1:
                 found = ', '.join(f'{name} ({lines_in_words(lines[name])})' for name in names)
                 raise InputError(
-                    f'{self.path}: poses came in different frames: {found}; one is needed: '
-                    'leave out the rows of the others, or give each a device of its own'
+                    f'{self.path}: poses came in different frames: {found}; only one is allowed: '
+                    'leave out the rows of the others, or give each frame its own device'
                 )
 
 
@@ -198,7 +198,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         kinds = ' and '.join(np.array(KINDS)[filled[:, row]])
         raise InputError(
             f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each kind of '
-            'measurement a row of its own'
+            'measurement its own row'
         )
     kind = filled.argmax(axis=0)
     placed = kind == POSE

@@ -148,7 +148,7 @@ def _table(
     made = made.kept()
     made.check_frames()
     if made.test.all():
-        raise InputError(f'{made.path} has no rows to fit, only such that are marked test')
+        raise InputError(f'{made.path} has no rows to fit, only rows marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
     frames = Frames()
@@ -176,7 +176,7 @@ def check_table(made: MadeColumns) -> None:
     if not joints:
         raise InputError(
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
-            'chain whose joints they are called like (--chain), or their own table (--joints)'
+            'chain with those joint names (--chain), or their separate table (--joints)'
         )
     table_of(made, joints, tuple(dict.fromkeys(made.words.get('session', ()))))
 
@@ -214,7 +214,7 @@ def _of_journal(
                     parts.append(measurements(found, joints))
                     lines += whole.count(b'\n') + 1
                 if len(rest) > LARGEST_TEXT:
-                    raise InputError(f'{path}, line {lines + 1} has no end: is it a journal?')
+                    raise InputError(f'{path}, line {lines + 1} is incomplete: is it a journal?')
                 told(min(file.tell() / size, 1.0))
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
@@ -326,7 +326,7 @@ def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
 
 
 def _cut_off(path: Path, line: int) -> str:
-    return f'{path}: line {line} was cut off and is left out'
+    return f'{path}: line {line} was cut off and is ignored'
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:

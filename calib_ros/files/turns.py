@@ -91,7 +91,7 @@ def _rotations(
         return se3.exp_rotation(angles), np.asarray(left)
     if not layout.euler:
         raise ConfigError(
-            f'{made.path} has {called}: say what they are, --euler XYZ (or ZYX, '
+            f'{made.path} has {called}: say which, --euler XYZ (or ZYX, '
             'zyx, ...) or --rotation-vector'
         )
     return _from_euler(angles, layout.euler, names)

@@ -113,7 +113,7 @@ def vendor_files(
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(
-            f'"{checksum}" is no checksum of Universal Robots: the driver prints it at its start '
+            f'"{checksum}" is not a Universal Robots checksum: the driver prints it at its start '
             'as calib_ and digits'
         )
     found = []

@@ -169,8 +169,8 @@ class Calibration(Shown):
             return np.hypot(np.nan_to_num(left, nan=self.residual or 0.0), self.removed(joints)[0])
         if np.isnan(left).any():
             raise ConfigError(
-                'what remains after the correction cannot be predicted from a chain alone: give '
-                'the calibration.yaml of an identification, or ask for the nominal model'
+                'a chain alone does not predict the error after correction: give the '
+                'calibration.yaml of an identification, or use the nominal model'
             )
         return left
 
@@ -203,8 +203,8 @@ class Calibration(Shown):
             return words, ''
         return words, (
             'the calibration does not know the orientation well enough to correct it; positions '
-            'hold near the measured target only. Measure orientations as well, or a target '
-            'further off the last axis'
+            'hold only near the measured target. Measure orientations too, or a target further '
+            'from the last axis'
         )
 
 

@@ -89,7 +89,7 @@ def reason_in_words(reasons: Sequence[Explanation]) -> str:
     text = f'changed: {first.in_words()}'
     if others:
         named = ' or '.join(each.in_words() for each in others)
-        text += f', which cannot be told apart from {named}'
+        text += f', indistinguishable from {named}'
     return text
 
 

@@ -76,14 +76,13 @@ class Difference(Shown):
         size = f'{rms:.3f} mm RMS over the joint range (at most {limit:.3f} mm)'
         if self.beyond > changes.FALSE:
             return (
-                f'different by {size}, which noise does not explain, but smooth errors of the '
-                'device or what the models lack may: measure the same poses from the same place '
-                'to tell'
+                f'different by {size}: not noise, but perhaps smooth device errors or what the '
+                'models lack; to find out, measure the same poses from the same place'
             )
         if self.changed and self.unexplained > changes.FALSE:
             reasons = '; '.join(changes.reason_in_words(each) for each in self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
-        return f'many parameters are different, by {size}: identify anew, and look at the robot'
+        return f'many parameters differ, by {size}: identify again, and inspect the robot'
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values; lengths of predictions in mm."""
@@ -128,16 +127,16 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     arms = first.chain, second.chain
     ours, theirs = map(_rows_in_words, arms)
     if ours != theirs:
-        raise InputError(f'the joints {ours} and {theirs} are of other robots')
+        raise InputError(f'the joints {ours} and {theirs} belong to different robots')
     names, chain, change, left = _in_parameters_of(first, second)
     if not names:
-        raise InputError('the calibrations have fitted no parameter of the arm')
+        raise InputError('neither calibration fitted a parameter of the arm')
     square, lacking = np.zeros((2, len(names), len(names)))
     for number, each in enumerate((first, second), 1):
         if each.covariance is None:
             raise InputError(
-                f'calibration {number} does not hold the covariance of its parameters: '
-                'identify it again with this version'
+                f'calibration {number} has no parameter covariance: identify it again with this '
+                'version'
             )
         own = whole = _in_names(each.chain, names, each.names, each.covariance)
         region = each.region

@@ -58,8 +58,8 @@ def identify(
         if found := mistakes.explained(problem):
             raise InputError(f'the measurements do not fit the arm at all: {found}') from err
         raise InputError(
-            'the fit found no stable answer: check the arm, its joint values and the units, or '
-            'measure more poses all over the workspace'
+            'the fit found no stable solution: check the arm, joint values and units, or measure '
+            'more poses all over the workspace'
         ) from err
 
 

@@ -55,8 +55,8 @@ class Loss:
         count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
         where = f'from pose {self.row + 1} on' if late else f'before pose {self.row + 1}'
         return (
-            f'{where} the joint values stand {count} {"below" if rows > 0 else "above"} the '
-            'measurement that they belong to'
+            f'{where} the joint values stand {count} {"below" if rows > 0 else "above"} their '
+            'measurement'
         )
 
 

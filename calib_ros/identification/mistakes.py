@@ -189,7 +189,7 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) ->
     found = lost(_moved(problem, sets[0], 0), framed, _errors, _largest(problem))
     if found is None or found.error > NEARER * given.error:
         return None
-    remedy = 'is a row missing, or there twice, in one of two tables? Mend that'
+    remedy = 'is a row missing or duplicated in one of two tables? Correct it'
     return Explained((Suspect(found.what, remedy),), given.error, found.error)
 
 

@@ -102,7 +102,7 @@ class Observations(Shown):
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):
-            raise InputError('pixels need the points of the board that they show, and points them')
+            raise InputError('pixels and the board points they show must be given together')
         count, joints = len(self.stamps_ns), self.joints.shape[-1]
         for name, array in self._arrays().items():
             shape = (count, *(joints if size is None else size for size in _SHAPES[name]))
@@ -211,8 +211,8 @@ class Observations(Shown):
         """
         if not self.oriented.all():
             raise InputError(
-                'poses of a camera on the flange need their orientation (qx qy qz qw): without it '
-                'they cannot be turned round'
+                'poses of a camera on the flange need an orientation (qx qy qz qw): without it '
+                'they cannot be inverted'
             )
         turned = np.swapaxes(self.rotations, 1, 2)
         positions = -np.einsum('nij,nj->ni', turned, self.positions)
@@ -312,7 +312,7 @@ def _refuse_other_than_rotations(turns: FloatArray) -> None:
         what = 'left-handed' if np.linalg.det(turns[k]) < 0.0 else 'not orthogonal'
         raise InputError(
             f'the rotation of pair {k} (counted from 0) is {what}: {np.count_nonzero(wrong)} of '
-            f'{len(turns)} are no rotation matrices'
+            f'{len(turns)} are not rotation matrices'
         )
 
 

@@ -176,7 +176,7 @@ class Problem(Shown):
         if spread > 2.0 * reach:
             raise InputError(
                 f'the distances vary by {spread:.3g} m, more than an arm of {reach - TOOL:.3g} m '
-                'can move anything: are they in metres (--length)?'
+                'can cause: are they in metres (--length)?'
             )
 
     def _check_patterns(self) -> None:
@@ -186,11 +186,13 @@ class Problem(Shown):
                 raise UnknownNameError('parameter', pattern, names)
         for pattern in self.priors:
             if self._places(pattern):
-                raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
+                raise ConfigError(
+                    f'a frame is either known or unknown, and takes no prior: "{pattern}"'
+                )
         for pattern in self.fixed:
             if self._places(pattern):
                 raise ConfigError(
-                    f'a frame is held as a whole: give it in the chain file with "fixed: true", '
+                    'a frame is fixed as a whole: give it in the chain file with "fixed: true" '
                     f'instead of fixing "{pattern}"'
                 )
 

@@ -70,7 +70,7 @@ class Recalibration(Shown):
             'new poses (each left out in turn)'
         )
         if self.accepted:
-            said = 'unchanged within what is known, brought up to date'
+            said = 'unchanged within the uncertainty, updated'
             if self.changed:
                 said = '; '.join(changes.reason_in_words(each) for each in self.changed)
             return f'accepted: {said}; {text}'
@@ -79,21 +79,21 @@ class Recalibration(Shown):
         elif self.scale is not None:
             size, sigma = 1e6 * self.scale.change[0], 1e6 * self.scale.sigma[0]
             why = (
-                f'the measuring device has another scale than before, by {size:+.0f} ± '
+                f'the scale of the measuring device changed, by {size:+.0f} ± '
                 f'{sigma:.0f} ppm; check it with a known length, and the temperature and pressure '
                 'set in it'
             )
         elif self.odd:
             why = (
-                f'{self.odd} contradicts all others, which would be accepted without it; measure '
-                'it again, or leave it out'
+                f'{self.odd} contradicts all others, which would pass without it; measure it '
+                'again, or leave it out'
             )
         elif self.unexplained <= changes.FALSE:
-            why = 'no few parameters explain what has changed; identify anew'
+            why = 'no change of a few parameters explains the new poses; identify again'
         elif self.anew:
             why = (
                 'the earlier calibration, in new frames, fits the new poses better; keep it, or '
-                'identify anew from more poses'
+                'identify again from more poses'
             )
         else:
             why = 'the new poses contradict each other; measure more'

@@ -201,8 +201,8 @@ class _Arm:
         """Return that of a calibration that has a covariance and knows the frames of the sets."""
         if previous.covariance is None:
             raise InputError(
-                'the earlier calibration does not hold the covariance of its parameters: identify '
-                'it again with this version, from the poses of then'
+                'the earlier calibration has no parameter covariance: identify it again with '
+                'this version, from its own poses'
             )
         known = previous.chain.frame_names
         for each in sets:

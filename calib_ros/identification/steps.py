@@ -91,7 +91,7 @@ class Step:
         thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
         text += f'{thing} ({self.what}, {size})'
         if self.unused:
-            text += f'; what was measured {self.unused} carries no weight'
+            text += f'; measurements {self.unused} carry no weight'
         return text
 
 

@@ -231,7 +231,7 @@ def _cross_validate(
     )
     folds = _folds(problem, names, count, rows)
     if folds < 2:
-        return None, 'nothing: too few poses to leave any out'
+        return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     chains = zip(

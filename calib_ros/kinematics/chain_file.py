@@ -114,7 +114,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     content = parse_mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
-        raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
+        raise ConfigError(f'{where}: "joints" must be a list with one entry per joint')
     if len(rows) > MOST_NAMES:
         raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_NAMES}')
     parallel = content.get('parallel')

@@ -157,8 +157,8 @@ def corrected_urdf(
     q = arm.random_joints(1000, np.random.default_rng(0))
     if np.abs(found.forward(q) - arm.forward(q)).max() > SAME:
         raise ConfigError(
-            f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '
-            'that: let the tool frame be fitted instead, or add a fixed joint and a link'
+            f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can '
+            'absorb that: let the tool frame be fitted instead, or add a fixed joint and a link'
         )
     return edited
 
@@ -174,8 +174,8 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
     effects = [name for name, value in arm.effects if value]
     if effects:
         raise ConfigError(
-            f'a URDF cannot hold the effects {", ".join(effects)}, and without them the rest of '
-            'the chain is not accurate: identify with the model "geometric"'
+            f'a URDF cannot represent the effects {", ".join(effects)}, and the chain is not '
+            'accurate without them: identify with the model "geometric"'
         )
     q = nominal.random_joints(50, np.random.default_rng(0))
     found, expected = arm.forward(q), nominal.forward(q)

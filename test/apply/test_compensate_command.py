@@ -68,7 +68,7 @@ def test_degrees_are_refused_also_of_joints_without_limits(run, tmp_path, suffix
     (tmp_path / f'out{suffix}').unlink()
     status, _, err = run(write(np.degrees(q)), suffix=suffix, chain='free.yaml')
     assert status == 1
-    assert 'must be in radians; if these are, give the joint limits' in err
+    assert 'must be in radians; if they are, give the joint limits' in err
     assert not (tmp_path / f'out{suffix}').exists()
 
 
@@ -108,7 +108,7 @@ def test_other_calibrations_are_refused(run, tmp_path):
     (tmp_path / 'nominal.yaml').write_text(dump_chain(UR))
     status, _, err = run(TABLE, '--calibration', 'nominal.yaml', chain='calibration.yaml')
     assert status == 1
-    assert 'is a chain, but no calibration' in err
+    assert 'is a chain, but not a calibration' in err
     record = {'accepted': True, 'nominal': nominal_document(ROBOTS['ur10'])}
     (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
     status, _, err = run(TABLE)

@@ -330,7 +330,7 @@ def test_measurements_that_were_fitted_prove_nothing(cell, arm, folder, capsys):
     new = measured(true, UR.random_joints(40, np.random.default_rng(5)), 1)
     half = verify(arm, [fitted, new], 5e-4)
     assert half.reused == 0.5
-    assert '\n50 % of these are the measurements that the calibration was fitted' in in_words(half)
+    assert '\n50 % of these are measurements to which the calibration was fitted' in in_words(half)
     assert verify(arm, [new], 5e-4).reused == 0.0
     for name, seen, warned in (('fitted', fitted, True), ('new', new, False)):
         write_table(folder / f'{name}.csv', seen)
@@ -338,7 +338,7 @@ def test_measurements_that_were_fitted_prove_nothing(cell, arm, folder, capsys):
         assert main([*judge, '--tolerance', '1', '--out', name]) == 0
         files = [folder / name / each for each in ('report.html', 'verification.txt')]
         for text in (capsys.readouterr().out, *(file.read_text() for file in files)):
-            assert ('that the calibration was fitted to' in ' '.join(text.split())) is warned
+            assert ('to which the calibration was fitted' in ' '.join(text.split())) is warned
 
 
 def test_the_fitted_frame_costs_its_freedom(arm):

@@ -46,7 +46,7 @@ def bad_inputs():
     names = ('--joint-names', 'a,a,b,c,d,e,f')
     yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'
-    yield 'out is the root', (*good, '--out', '/'), '/ is the root of all folders: choose'
+    yield 'out is the root', (*good, '--out', '/'), '/ is the root folder: choose'
     yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
     yield 'csv2bag, bad table', ('csv2bag', 'number.csv', 'b', '--chain', 'ur5e'), 'line 4: q2'
     yield 'csv2bag, bag exists', ('csv2bag', 'good.csv', 'folder', '--chain', 'ur5e'), 'exists al'
@@ -67,7 +67,7 @@ def bad_inputs():
         ('compare', 'good.csv', 'none'),
         'is a table, but compare takes',
     )
-    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no text in UTF-8: save it'
+    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is not UTF-8 text: save it'
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
     yield (
         'a result as a table',

@@ -238,7 +238,7 @@ def test_samples_that_were_fitted_are_known_again():
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
     words = verdict(made.calibration, *made.validate(), made.reused())[1]
-    assert 'these are the measurements that the calibration was fitted to' in words
+    assert 'these are measurements to which the calibration was fitted' in words
 
 
 def test_a_bumped_robot_is_noticed():
