@@ -44,10 +44,10 @@ class Compensator(Shown, Limits):
     nominal : Chain
         The arm as the controller believes it, with the limits of its joints.
     calibrated : Chain
-        The arm as identified. Base and tool frames of both are left aside.
+        The arm as identified. Base and tool frames of both are ignored.
     tool : three floats
-        The point [m] in the flange frame whose position counts. It matters for arms that cannot
-        reach every orientation, and for the errors reported.
+        Tool point [m] in the flange frame. It matters for arms that cannot reach every
+        orientation, and for the reported errors.
     region : Region, optional
         Where the calibration may be used; samples elsewhere are refused.
 
@@ -106,7 +106,7 @@ class Compensation(Solution):
     Attributes
     ----------
     command : (N, n)
-        Joint values [rad or m] as the controller believes them.
+        Joint values [rad or m] before correction.
     joints : (N, n)
         The corrected ones; NaN in samples that are refused.
     refusals : tuple of Refusal
@@ -130,15 +130,15 @@ def compensate(
     approach: FloatArray | None = None,
     told: Told = nobody,
 ) -> Compensation:
-    """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
+    """Correct joint commands (N, n) [rad or m], given in their order of execution.
 
-    `approach` (N, n) holds the signs of the velocities before, for backlash;
-    `told` receives the share done.
+    `approach` (N, n) holds the signs of the preceding velocities, for backlash; `told` receives
+    the share done.
 
     Raises
     ------
     InputError
-        For joint values of the wrong shape or that are not finite.
+        For joint values of the wrong shape, or not finite.
 
     """
     command = np.array(joints, dtype=np.float64)

@@ -227,18 +227,18 @@ class Plan(Shown):
     joints : (K, n)
         Joint values [rad or m], the most informative first.
     visit : (K,)
-        Their order of visit.
+        Visiting order.
     travel : float
-        Time of the moves [s].
+        Time of all moves [s].
     accuracy : (K,)
         Predicted RMS position error [m] with the first 1, 2, ... K of them.
     at_random : (K,)
         The same with candidates taken at random (median of draws).
     efficiency : float or None
-        Lower bound against the best choice of as many candidates; None for o2 to o5 and for too
-        few poses to determine all parameters.
+        Lower bound relative to the best choice of as many candidates; None for o2 to o5 and for
+        too few poses to determine all parameters.
     lacking : tuple of str
-        Parameters that no choice of these candidates would determine; they are left out.
+        Parameters that no choice of these candidates would determine; they are ignored.
 
     """
 
@@ -271,11 +271,11 @@ def plan(
     told: Told = nobody,
     chosen: Index | None = None,
 ) -> Plan:
-    """Plan a number of measurements, and compare them with so many random draws.
+    """Plan a number of measurements, and compare them with random draws.
 
-    `candidates` (N, n) and those of a `task` (M, n) are joint values, `velocities` (n,) their
-    largest rates. `chosen` (K,) are indices that `fewest` found already; `choose` and
-    `visit_order` say what the other arguments mean.
+    `candidates` (N, n) and the `task` (M, n) are joint values, `velocities` (n,) their largest
+    rates. `chosen` (K,) are indices already found by `fewest`; `choose` and `visit_order` describe
+    the other arguments.
     """
     excited = design.determined_by(candidates)
     if chosen is None:

@@ -97,18 +97,18 @@ class Verification(Shown):
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds' or 'does not hold'
         'no verdict' where neither is known.
     needed : int or None
-        Configurations of which the same RMS error would decide, where it is undecided; None where
+        Number of configurations that would decide with the same RMS error, if undecided; None if
         even DECIDING would not.
     common : float
-        Share of the RMS error that is left without one common shift and turn of all positions.
+        Share of the RMS error that remains without one common shift and turn of all positions.
     by_program : bool
-        Whether the poses wanted are those of the program before its correction.
+        Whether the wanted poses are those of the uncorrected program.
     fitted : tuple of str
         Frames that were fitted to the new measurements.
     holds : bool or None
         Whether the error agrees with the one of the calibration (`Calibration.holds`), if known.
     reused : float
-        Share of the measurements that the calibration was fitted to (`Calibration.reused`).
+        Share of the measurements to which the calibration was fitted (`Calibration.reused`).
 
     """
 
@@ -164,24 +164,24 @@ def verify(
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
     tolerance : float, optional
-        Largest RMS position error [m] that will do; without one there is no verdict.
+        Largest acceptable RMS position error [m]; without it there is no verdict.
     confidence : float
         Of the verdict.
     new_base, new_tool : bool
-        The measuring device stands elsewhere than for the calibration; another target is on the
-        flange, or the same was mounted anew. Their frames are fitted, and each takes up the
-        errors of as many configurations, of three freedoms each, as it has freedoms.
+        The measuring device was moved; the target was replaced or remounted. Their frames are
+        fitted, and each absorbs the errors of as many configurations, of three freedoms each, as
+        it has freedoms.
     commanded : (M, n), optional
-        Joint values [rad or m] of the program before its correction: the nominal arm means there
-        what is wanted. Each measurement belongs to one of them (`commanded.py`).
+        Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
+        poses there. Each measurement belongs to one of them (`commanded.py`).
     told : Told
-        Of the share that is done.
+        Receives the share done.
 
     Raises
     ------
     InputError
         For too few poses, distances, a device or target that the calibration does not know, or
-        measurements far from all that was commanded.
+        measurements far from all commands.
 
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool

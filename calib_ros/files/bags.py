@@ -31,7 +31,7 @@ ALLOW = 'accept the rest with --largest-loss'
 
 @dataclass(frozen=True)
 class Replayed:
-    """What was read of a bag, and warnings about the rest."""
+    """What was read from a bag, and warnings about the rest."""
 
     recorded: int | None  # messages that it should hold; None where that is not known
     read: int  # of these; a message that cannot be decoded was not read
@@ -72,7 +72,7 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
     path : Path or str
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
-        Takes the messages; its settings name topics where the types leave a choice.
+        Receives the messages; its settings name topics if the types are ambiguous.
     told : Told
         Of the share of the messages that are read.
 

@@ -68,7 +68,7 @@ def read_table(
     foreign: Foreign | None = None,
     told: Told = nobody,
 ) -> Table:
-    """Read a CSV, or a table in any other layout.
+    """Read a CSV table, or one in any other layout.
 
     Parameters
     ----------
@@ -77,21 +77,21 @@ def read_table(
     joints : int
         Number of joints.
     sessions : sequence of str
-        Sessions to read; each but the first gets a base and a tool frame of its own.
+        Sessions to read; each after the first gets its own base and tool frames.
     sigmas : (float, float)
         Standard deviations [m, rad] of poses seen by a camera on the flange.
     eye_in_hand : bool
-        All poses are those of a fixed target in a camera on the flange.
+        All poses are of a fixed target in a camera on the flange.
     foreign : Foreign, optional
-        How to read a table that others have written.
+        How to read a table from another system.
     told : Told
         Of the share that is read.
 
     Raises
     ------
     InputError
-        For a missing column, a value that is no number, several sessions to choose from, or
-        measurements of one device in different frames. The message names the line.
+        For a missing column, a value that is not a number, an ambiguous session, or measurements
+        of one device in different frames. The message names the line.
 
     """
     path = Path(path)

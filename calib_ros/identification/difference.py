@@ -42,14 +42,14 @@ from calib_ros.shown import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Difference(Shown):
-    """The second of two calibrations less the first.
+    """The second of two calibrations minus the first.
 
     P parameters of the arm, `names`, differ by `change` (P,) with standard deviations `sigma` (P,)
-    [m, rad]. `chance` is the probability of so large a difference by the noise of both, `beyond`
-    with what devices do and models lack as well. Predicted positions differ by `rms` [m] over the
-    joint range in the best frames, by `limit` [m] at most (95 %); no parameters of the first model
-    can follow `left` [m] of it. `changed` is what has changed, each with what cannot be told apart
-    from it, `unexplained` the probability of what these leave.
+    [m, rad]. `chance` is the probability of such a difference from the noise of both, `beyond`
+    also from device errors and unmodelled effects. Predicted positions differ by `rms` [m] over
+    the joint range in the best frames, by `limit` [m] at most (95 %); no parameters of the first
+    model can follow `left` [m] of it. `changed` lists the changes, each with those
+    indistinguishable from it; `unexplained` is the probability of the remaining difference.
     """
 
     names: tuple[Parameter, ...]
@@ -65,11 +65,11 @@ class Difference(Shown):
 
     @property
     def same(self) -> bool:
-        """Tell whether nothing has changed as far as is known."""
+        """Tell whether no change was detected."""
         return self.chance > changes.FALSE and not self.changed
 
     def in_words(self) -> str:
-        """Return what is different."""
+        """Return the difference in words."""
         if self.same:
             return f'unchanged within {1e3 * self.limit:.3f} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
@@ -116,12 +116,12 @@ def _rows_in_words(chain: Chain) -> str:
 
 
 def difference(first: Calibration, second: Calibration) -> Difference:
-    """Return what is different in the second of two calibrations of one robot.
+    """Compare two calibrations of one robot.
 
     Raises
     ------
     InputError
-        When they are of other joints, or hold no covariance.
+        If they have different joints, or no covariance.
 
     """
     arms = first.chain, second.chain

@@ -56,7 +56,7 @@ def recalibrate(
     growth: float = GROWTH,
     new: Sequence[str] = (),
 ) -> Recalibration:
-    """Bring a calibration up to date by the poses of a problem.
+    """Update a calibration with the poses of a problem.
 
     Parameters
     ----------
@@ -67,14 +67,14 @@ def recalibrate(
     years : float
         Since then.
     growth : float
-        Standard deviation [m] by which lengths wander in a year; angles by twice that [rad].
+        Standard deviation [m] of the drift of lengths in a year; of angles twice that [rad].
     new : sequence of str
-        Frames of devices that stand elsewhere, and of targets mounted anew.
+        Frames of moved devices and of remounted targets.
 
     Raises
     ------
     InputError
-        When the calibration holds no covariance, or does not know a frame.
+        If the calibration has no covariance, or does not know a frame.
 
     """
     found, arm = _recalibrated(previous, problem, years, growth, new)

@@ -45,11 +45,10 @@ ONE_FRAME = (
 
 
 class CalibrationSession:
-    """Takes messages, keeps the samples, identifies, and keeps the last good result.
+    """Take messages, keep the samples, identify, and keep the last good result.
 
-    `on_sample` is called with every sample as soon as it is taken, `on_removed` with every one
-    that is taken back. What cannot be done is an InputError, settings that cannot be a
-    ConfigError.
+    `on_sample` is called with every sample as soon as it is taken, `on_removed` with every removed
+    one. Impossible requests raise InputError, impossible settings ConfigError.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class CalibrationSession:
         )
 
     def change(self, settings: Settings) -> None:
-        """Go on with other settings; the buffers and samples stay.
+        """Continue with other settings; the buffers and samples stay.
 
         Settings that no identification could use change nothing.
         """
@@ -113,18 +112,18 @@ class CalibrationSession:
             self._settle()
 
     def miss(self, kind: str, count: int, cause: str) -> None:
-        """Count messages that came and cannot be used."""
+        """Count received messages that cannot be used."""
         self._entry.miss(kind, count, cause)
 
     def finish(self) -> None:
-        """Make samples of everything that still waits; nothing more will come."""
+        """Make samples of all waiting messages; no more will arrive."""
         self._road.finish()
         self._settle(wait=True)
         self._kept.leave_out_strange()
 
     @property
     def received(self) -> Counter[str]:
-        """Return how many messages came so far, by kind."""
+        """Return the number of messages received so far, by kind."""
         return self._entry.received
 
     @property
@@ -135,9 +134,9 @@ class CalibrationSession:
     # Samples
 
     def capture(self, socket: str = '') -> tuple[int, str]:
-        """Take one sample of each source now; return how many, and why none if so.
+        """Take one sample of each source now; return how many, and the reason if none.
 
-        With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
+        With a `socket` LOCATION/SOCKET the ball sits in it, and only that sample is taken.
         """
         if not self.recording:
             return 0, NOT_RECORDING
@@ -151,7 +150,7 @@ class CalibrationSession:
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
     def remove_last(self) -> Sample:
-        """Take back the last sample."""
+        """Remove the last sample."""
         if not self.samples:
             raise InputError('there is no pose to remove')
         sample = self.samples.pop()
@@ -161,7 +160,7 @@ class CalibrationSession:
         return sample
 
     def restore(self, samples: Sequence[Sample]) -> None:
-        """Go on with samples taken before."""
+        """Continue with earlier samples."""
         for sample in samples:
             if sample.joints.shape != (len(self.chain.joints),):
                 raise InputError(
@@ -181,7 +180,7 @@ class CalibrationSession:
 
     @property
     def usable(self) -> list[Sample]:
-        """Return the samples that are identified on (`Kept.usable`)."""
+        """Return the samples used for identification (`Kept.usable`)."""
         return self._kept.usable()
 
     @property
@@ -234,7 +233,7 @@ class CalibrationSession:
 
     @property
     def hints(self) -> list[Hint]:
-        """Return what looks wrong in what is heard."""
+        """Return what looks wrong in the received messages."""
         found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
@@ -245,7 +244,7 @@ class CalibrationSession:
 
     @property
     def delay(self) -> Delay | None:
-        """Return how late the measurements are stamped, as far as the motion shows."""
+        """Return the delay of the measurement stamps, as far as the motion shows it."""
         return self._clocks.delay
 
     @property
@@ -255,14 +254,14 @@ class CalibrationSession:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return what the samples so far tell; None while they are too few."""
+        """Return the estimate from the samples so far; None while they are too few."""
         return self._live.update(self.usable)
 
     def status(self, work: str = '') -> str:
-        """Return in words what the arm does, what else goes on, and how far the samples are.
+        """Return in words the state of the arm, other activity, and the progress of sampling.
 
-        What an operator must know or do comes first: who has room for a line only cuts the rest.
-        `work` is what goes on besides.
+        What an operator must know or do comes first, so a truncated line keeps it. `work` is the
+        other activity.
         """
         told = [self.state, work]
         if why := self._entry.refused.get(POSES):
@@ -298,7 +297,7 @@ class CalibrationSession:
         return found
 
     def identify(self) -> Identification:
-        """Identify on the samples so far and keep the result if it is accepted."""
+        """Identify from the samples so far and keep the result if it is accepted."""
         problem = self.problem()
         try:
             result = identify_model(problem, self.settings.model)
@@ -310,9 +309,9 @@ class CalibrationSession:
         return result
 
     def adopt(self, calibration: Calibration, samples: Sequence[Sample] | None = None) -> None:
-        """Take a calibration as the present one.
+        """Use a calibration from now on.
 
-        `samples` are those that it may not be judged on, all of now by default.
+        `samples` must not be used to judge it; default: all current ones.
         """
         refuse_other_joints(calibration, self.chain)
         self._known = frozenset(self.samples if samples is None else samples)
@@ -328,7 +327,7 @@ class CalibrationSession:
         return now, nominal
 
     def reused(self) -> float:
-        """Return the share of the samples since that the calibration was fitted to."""
+        """Return the share of the later samples to which the calibration was fitted."""
         calibration, sets = self._since()
         return calibration.reused(sets)
 
@@ -373,6 +372,6 @@ class CalibrationSession:
 
 
 def too_few(err: TooFewObservationsError, came: str) -> InputError:
-    """Return an error of too few samples that tells what `came` of the messages, in words."""
+    """Return an error of too few samples that also says what `came` of the messages."""
     few, _, advice = str(err).rpartition('; ')
     return InputError(f'{few} ({came}); {advice}')
