@@ -80,10 +80,10 @@ def whole_folder(
 ) -> Iterator[Path]:
     """Yield a path at which to make a folder; it is put in place when the block has ended.
 
-    When the block fails, or the process is killed, there is no folder, or the one from before.
-    Missing parents are made. `own` are glob patterns of what belongs to the folder, which is only
-    replaced if `overwrite` is True; what an earlier folder holds besides is kept. By default there
-    must be no earlier one, and never another process that writes the same folder.
+    If the block fails, or the process is killed, there is no folder, or the earlier one. Missing
+    parents are made. `own` are glob patterns of what belongs to the folder, which is only replaced
+    if `overwrite` is True; what an earlier folder holds besides is kept. By default there must be
+    no earlier one, and never another process that writes the same folder.
     """
     place = Path(os.path.realpath(path))
     if not place.name:

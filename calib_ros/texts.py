@@ -235,7 +235,7 @@ def in_markdown(value: object) -> str:
 
 
 def to_cell(text: str) -> str:
-    """Return a text as a cell of a table, which is no formula."""
+    """Return a text as a table cell that is not a formula."""
     return f"'{text}" if FORMULA.match(text) else text
 
 

@@ -163,7 +163,7 @@ def run_length(slope: float, height: float, states: int = 200) -> float:
 
 @cache
 def limit(slope: float, nights: float) -> float:
-    """Return the height that a CUSUM exceeds after so many nights, on average, by chance."""
+    """Return the height that a CUSUM exceeds by chance after so many nights on average."""
 
     def less(height: float) -> float:
         return float(np.log(run_length(slope, height) / nights))

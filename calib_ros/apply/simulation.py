@@ -37,7 +37,7 @@ class Cell:
 def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
     """Return a chain with normally distributed errors, and frames anywhere.
 
-    Only parameters that are no gauge freedoms get errors, so that they can be compared with
+    Only parameters other than gauge freedoms get errors, so that they can be compared with
     identified ones.
     """
     names = [

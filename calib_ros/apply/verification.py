@@ -230,7 +230,7 @@ def _compared(
 
 
 def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
-    """Return the RMS error [m] of configurations, some of which fitted frames took up."""
+    """Return the RMS error [m] of configurations, some of them absorbed by fitted frames."""
     count = len(moments)
     if count - lost < least:
         raise InputError(
@@ -258,7 +258,7 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
-    """Refuse limits that are none, and measurements that the calibration says nothing about."""
+    """Refuse invalid limits, and measurements outside what the calibration knows."""
     if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
         raise ConfigError(
             'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '

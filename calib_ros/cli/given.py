@@ -74,7 +74,7 @@ def filing_of(
     measured: Path,
     *judged_by: object,
 ) -> Filing:
-    """Return what is filed of a result besides the result."""
+    """Return what is filed with a result."""
     settings = settings_hash(nominal, settings_of(options), *judged_by)
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     content = content_hash(
@@ -86,7 +86,7 @@ def filing_of(
 def origin_of(
     options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
 ) -> page.Origin:
-    """Return whence a result comes: the options, and the files that were read."""
+    """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     told = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}

@@ -168,7 +168,7 @@ def _detected(
     touched: dict[str, Any],
     screen: Screen,
 ) -> Loaded:
-    """Return what is to be fitted of corners of a board, and of a table besides."""
+    """Return what to fit from board corners, and from a table if given."""
     for name in ('board', 'places'):
         if getattr(options, name) is None:
             raise InputError(f'--detections needs --{name}')

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder in which a node keeps the journals and calibrations of one robot.
 
-A journal has every sample at once, in a table that can be identified by itself. A row is written
-by one call, so that a process that is killed leaves whole rows; a row that a crash of the machine
-cut off is left out when the journal is read again. Rows that cannot be written, because the disk
-is full say, wait in memory until they can be. A sample that is taken back gets a second row,
-marked `removed`; nothing is ever deleted.
+A journal receives every sample at once, as a table that `identify` reads. A row is written by one
+call, so that a process that is killed leaves whole rows; a row that a crash of the machine cut off
+is left out when the journal is read again. Rows that cannot be written, because the disk is full
+say, wait in memory until they can be. A sample that is taken back gets a second row, marked
+`removed`; nothing is ever deleted.
 """
 
 from __future__ import annotations

@@ -254,7 +254,7 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
 
 
 def _decoded(store: Any, data: bytes, kind: str) -> Any:
-    """Return a message; up to 12 bytes may stand behind it, of which the library takes 3.
+    """Return a message; up to 12 bytes may follow it, of which the library accepts 3.
 
     rclpy leaves as many behind lists that are empty where it serialises for a writer of bags.
     """

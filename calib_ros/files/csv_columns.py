@@ -111,7 +111,7 @@ class TextColumns(Columns):
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
-    """Return the columns of a CSV with rows, some of which it needs to have."""
+    """Return the columns of a CSV with rows; some columns are required."""
     return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
 
 
@@ -129,7 +129,7 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
 
 
 def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> Columns:
-    """Return the columns of the content of a CSV; refuse what is no table, or is too large.
+    """Return the columns of a CSV's content; refuse anything else, or too large.
 
     `above` are lines of the file before it.
     """

@@ -249,7 +249,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
 
 
 def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
-    """Return the columns with each measurement beside the joint values so many rows below."""
+    """Return the columns with each measurement beside the joint values some rows below."""
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')

@@ -136,7 +136,7 @@ class Measurements:
         again = (np.diff(stamps[order]) == 0) & (np.diff(number[order]) == 0)
         for row in np.sort(order[1:][again])[:1].tolist():
             raise InputError(
-                f'{self.path}, line {found.lines[row]}: stamp_ns {stamps[row]} is there already'
+                f'{self.path}, line {found.lines[row]}: stamp_ns {stamps[row]} already exists'
             )
         return found
 
@@ -297,7 +297,7 @@ def _check_header(columns: Columns, joints: int) -> None:
 def choices(
     columns: Columns, name: str, known: Mapping[str, object], what: str
 ) -> NDArray[np.generic]:
-    """Return what the cells (N,) of a column stand for, of which only some are known."""
+    """Return the meaning of the cells (N,) of a column; only some values are valid."""
     numbers, found = columns.labels(name)
     for k, word in enumerate(found):
         if word not in known:

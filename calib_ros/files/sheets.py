@@ -53,7 +53,7 @@ class Sheet:
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
-    """Read a table of which a layout is known.
+    """Read a table with a known layout.
 
     The header is the first line that has all columns of some `names`; where these are numbers of
     columns only, the first with some of the names `known`.

@@ -182,7 +182,7 @@ def check_table(made: MadeColumns) -> None:
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-    """Return the samples of a journal, of which there may be none, and warnings."""
+    """Return the samples of a journal, possibly none, and warnings."""
     found = _of_journal(path, joints)
     if found is None:  # cut off, or a table
         data, warnings = _read(path, columns(joints))
@@ -196,8 +196,8 @@ def _of_journal(
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
     """Return the rows of a journal, None without any, and warnings; None for other files.
 
-    What a node wrote may be of any length, for its samples were in memory before: it is read by
-    parts, and what is no journal is refused at its first part.
+    A node's journal may be of any length, since its samples were in memory before: it is read in
+    parts, and any other file is refused at its first part.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
     parts: list[Measurements] = []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A calibration, saved and loaded whole: a chain file with a record of where it comes from.
+"""A calibration, saved and loaded whole: a chain file with a record of its origin.
 
 What it removes at q is the distance between the nominal arm, in fitted frames, and the calibrated
 one. What remains is predicted by the expected squares C of the parameters' errors, with J the rows
@@ -242,18 +242,18 @@ def parse_calibration(
 ) -> Calibration:
     """Turn the text of a calibration into what it says; `where` names it in errors.
 
-    A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
-    all that calib_ros writes, and must not speak against a nominal chain that is given; nor may
-    the numbers be further from it than `largest_length` and `largest_angle` of the settings allow.
-    Without settings the identification has judged that, if it records the numbers of this chain.
-    Without a nominal chain that of the record is taken; without its frames those that bring it
-    closest to the corrected one.
+    A correction by the wrong chain moves the arm anywhere. So the record must be present, as in
+    all files of calib_ros, and must agree with a given nominal chain; nor may the numbers differ
+    from it by more than `largest_length` and `largest_angle` of the settings. Without settings the
+    identification has judged that, if it records the numbers of this chain. Without a nominal
+    chain the recorded one is used; without its frames, those that bring it closest to the
+    corrected one.
 
     Raises
     ------
     ConfigError
-        When the text is no chain file, a chain without a record, or a calibration that was not
-        accepted, or that was identified from another nominal chain.
+        If the text is not a chain file, has no record, or is a calibration that was not accepted
+        or was identified from another nominal chain.
 
     """
     chain = parse_chain(text, where)

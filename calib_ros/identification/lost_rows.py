@@ -102,7 +102,7 @@ def _paired(seen: Observations, rows: NDArray[np.intp], shift: int) -> Observati
 
 
 def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> FloatArray:
-    """Return (N,) the errors [m] of each measurement at joint values so many rows below."""
+    """Return (N,) the errors [m] of each measurement at joint values some rows below."""
     rows = np.arange(len(seen))
     inside = (rows + shift >= 0) & (rows + shift < len(seen))
     found = np.full(len(seen), np.inf)

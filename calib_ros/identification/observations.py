@@ -304,7 +304,7 @@ def _numbers(name: str, values: object) -> FloatArray:
 
 
 def _refuse_other_than_rotations(turns: FloatArray) -> None:
-    """Refuse matrices (N, 3, 3) of which one is far from any rotation."""
+    """Refuse matrices (N, 3, 3) if one is far from any rotation."""
     square = np.einsum('nij,nik->njk', turns, turns)
     wrong = np.abs(square - np.eye(3)).max(axis=(1, 2), initial=0.0) > NO_ROTATION
     wrong |= np.linalg.det(turns) < 0.0

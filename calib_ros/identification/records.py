@@ -380,7 +380,7 @@ class Fingerprint:
 
 
 def reused_in_words(share: float) -> str:
-    """Return a warning about measurements of which such a share was fitted; empty for none."""
+    """Return a warning about the share of measurements already fitted; empty for none."""
     if not share:
         return ''
     which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'

@@ -121,7 +121,7 @@ class Evidence:
         """Return how much more probable a group of size `std` is, and the precision (P,) then.
 
         As the logarithm of the ratio to what was `told`, of sizes (G,); those of the other groups
-        are looked for anew.
+        are searched for again.
         """
         own = self._names.index(group)
         rest = [k for k in range(len(self._names)) if k != own]

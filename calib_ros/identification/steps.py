@@ -14,7 +14,7 @@ unless they are fewer than a step has on the shorter side (`few_gross`). Known d
 sockets are not, for they say nothing about time.
 
 Unmodelled effects follow the joints, and no step in time explains more than half of their
-residuals. A drift is no step: a few cosines over the session explain it better.
+residuals. A drift is not a step: a few cosines over the session explain it better.
 """
 
 from __future__ import annotations

@@ -27,8 +27,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame
 
 COUNTS = 0.005
-"""Change of an RMS error that counts, of itself; less is how it happens to fall
-(benchmarks/real_robots.py)."""
+"""Change of an RMS error that counts, of itself; less is chance (benchmarks/real_robots.py)."""
 
 
 @dataclass(frozen=True)

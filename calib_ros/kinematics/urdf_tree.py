@@ -69,7 +69,7 @@ class Description:
         Raises
         ------
         ConfigError
-            When there is no serial chain of joints between them.
+            If no serial chain of joints connects them.
 
         """
         base = self.root if base is None else base
@@ -101,7 +101,7 @@ class Description:
         return tuple(path)
 
     def _usual_tip(self, base: str) -> str:
-        """Return the link at the end of the arm, if there is no doubt."""
+        """Return the link at the end of the arm, if it is unambiguous."""
         behind, moved = {base}, set()
         for joint in self.joints:
             if joint.parent in behind:

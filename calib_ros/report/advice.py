@@ -78,12 +78,12 @@ WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 """Where the description does not fit the arm."""
 WRONG = {*WRONG_ARM, Rule.CONVERGENCE, Rule.DRIFT, Rule.GAIN}
 WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
-"""What a description that does not fit brings by itself."""
+"""Consequences of a description that does not fit."""
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
     rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
 }
 BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
-"""What each cause brings by itself; the first cause that is there counts."""
+"""Consequences of each cause; the first cause present counts."""
 
 FAR = 1.0 / EXCEPTION
 """Ratio of what is left to the noise stated that an arm's own errors rarely reach."""
@@ -108,7 +108,7 @@ class Situation:
     sigma: float | None = None
 
     def said_of(self, one: Advice) -> Advice:
-        """Return the advice on a correction that does not show to help, as is right here."""
+        """Return the advice on a correction without a proven gain, as is right here."""
         if self.left >= FAR:
             steps = (each for each in one.steps if 'stood still' not in each)
             return replace(one, steps=(COARSE.format(self.left), *steps))

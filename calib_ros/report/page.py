@@ -115,7 +115,7 @@ class Report:
 
     @property
     def shown(self) -> tuple[Section, ...]:
-        """Return the sections of which any may have a figure."""
+        """Return the sections that may have a figure."""
         return (*filter(None, (self.picture,)), *self.sections)
 
 

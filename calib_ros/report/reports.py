@@ -149,7 +149,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
 
 
 def _refused(reasons: Sequence[Advice]) -> Verdict:
-    """Return why nothing is corrected: an arm with no error that the device sees is no bad one."""
+    """Return why nothing is corrected: an arm without visible errors is not a bad one."""
     tried = 'No correction was saved or sent to the robot. The figures show the correction tried.'
     if reasons[0].heading == GOOD_ARM.heading:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
@@ -159,7 +159,7 @@ def _refused(reasons: Sequence[Advice]) -> Verdict:
 
 
 def _notes(result: Identification) -> Iterator[str]:
-    """Yield what to know besides: of an accepted result, doubts stand in the verdict."""
+    """Yield further remarks; doubts about an accepted result are in the verdict."""
     if not result.accepted:
         yield from words.remarks(result)
     elif drift := words.drift_in_words(result.noise):
@@ -295,7 +295,7 @@ def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
 
 
 def _parameters(result: Identification) -> Section:
-    """Return the table of all parameters but the harmonics of gears, of which there are many."""
+    """Return the table of all parameters except the many gear harmonics."""
     rows = []
     listed = [p for p in result.parameters if group_of(p.name) != 'gear']
     unlisted = len(result.parameters) - len(listed)

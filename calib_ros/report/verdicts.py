@@ -35,7 +35,7 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the poses [mm], of which there may be none."""
+    """Return the lines of a table of the poses [mm]; none without poses."""
     again = any(pose.repeatability is not None for pose in found.each)
     lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
@@ -63,12 +63,12 @@ def limits(found: Verification) -> list[str]:
 
 
 def remarks(found: Verification) -> list[str]:
-    """Return what to know besides the figures, and what to do."""
+    """Return remarks on the figures, and what to do."""
     return [*limits(found), *hints(found)]
 
 
 def hints(found: Verification) -> list[str]:
-    """Return what was fitted anew, and where the error may come from."""
+    """Return what was refitted, and where the error may come from."""
     lines = []
     if found.fitted:
         lines.append(f'refitted, before and after alike: {" and ".join(found.fitted)}')

@@ -48,7 +48,7 @@ class Hearing:
     lost: int = 0
     """Messages that got lost on the way, as DDS tells by their numbers."""
     told: int = 0
-    """The total of which DDS told last."""
+    """The last total reported by DDS."""
     full: int = 0
     """How often the queue was found full, so that messages may be lost."""
     lost_before: int = 0

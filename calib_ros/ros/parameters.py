@@ -51,8 +51,8 @@ class Given(SimpleNamespace):
 def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     """Declare all parameters of the node; return what they were set to, and the names that were.
 
-    The node was told to declare what is set by itself, for rclpy tells no other way what that is.
-    Each is declared anew here, with what it is for. A value that cannot be is a ConfigError.
+    The node declares all parameters that are set, because rclpy lists them in no other way. Each
+    is declared again here, with its description. An impossible value is a ConfigError.
     """
     overrides = {
         name: each.value

@@ -258,7 +258,7 @@ class Clocks:
         return begun - WATCH_NS, begun + WATCH_NS
 
     def look(self, now_ns: int) -> None:
-        """Look what the motion shows if it is time to, and begin anew."""
+        """Evaluate the motion if it is time to, and start again."""
         if not (self._awake and self._begun_ns and abs(now_ns - self._begun_ns) > WATCH_NS):
             return
         joints, poses = self._joints, self._poses.values()

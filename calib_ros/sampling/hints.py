@@ -22,7 +22,7 @@ from calib_ros.settings import EXCEPTION, Settings
 
 LOST = 'were dropped (stamps or full buffers)'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
-_TWICE = re.compile(r'same stamp twice|is there already')
+_TWICE = re.compile(r'same stamp twice|already exists')
 
 
 @dataclass(frozen=True)

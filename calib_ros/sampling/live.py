@@ -9,7 +9,7 @@ that has gone further than the linear model holds. Wide priors stand for what no
 yet; at the end they weigh nothing, and the estimate is that of the batch.
 
 A sample that lies too far from where the others predict it is left out as suspicious. The first
-ones cannot be judged so, because the estimate bends to them. So it begins anew, from the nominal
+ones cannot be judged so, because the estimate bends to them. So it starts again, from the nominal
 chain and by the robust fit of the identification (`robust.py`), each time the number of samples
 has grown by a quarter: an early gross error is found, and what was left out wrongly comes back.
 
@@ -192,7 +192,7 @@ class LiveEstimate:
             self._linearise(self._estimate())
 
     def _linearise(self, chain: Chain) -> None:
-        """Begin the information anew at a chain, with the samples taken so far."""
+        """Restart the information at a chain, with the samples taken so far."""
         inverse, residual = self._prior.rows(chain, self._names)
         self._chain = chain
         self._information = np.diag(inverse**2)

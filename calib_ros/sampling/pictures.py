@@ -118,13 +118,13 @@ class Pictures:
         busy = [looked for looked in waiting if not looked.done()]
         if len(busy) >= MOST_WAITING:
             if not self.patient:
-                self.dropped['measurements: image while others were looked at'] += sample.count
+                self.dropped['measurements: image while others were processed'] += sample.count
                 return None
             busy[0].exception()
         middle = len(sample.images) // 2
         kept = [k for k, number in enumerate(sample.images) if number in self._kept]
         if not kept:
-            self.dropped['measurements: image let go, the memory for them was full'] += (
+            self.dropped['measurements: image dropped, the memory for them was full'] += (
                 sample.count
             )
             return None

@@ -126,7 +126,7 @@ class Plan:
 
     @property
     def stops(self) -> list[int]:
-        """Return the numbers of the stops of which samples are made."""
+        """Return the numbers of the stops that give samples."""
         return [k for k, why in enumerate(self.why) if not why]
 
     def of_stands(
