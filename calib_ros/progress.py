@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a long piece of work is: told by stages and shares, and ended between two of them."""
+"""Progress of long work: reported by stages and shares, and cancelled between two stages."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values on a screen: what they hold, in a few lines."""
+"""Values on a screen: their content in a few lines."""
 
 from __future__ import annotations
 

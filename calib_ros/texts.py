@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text files, tables and YAML, within limits, and texts of others as no more than text.
+"""Text files, tables and YAML, within limits; foreign texts are only text.
 
 A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
 with any number of digits. The stream of its events is looked at before anything is made of it.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as files, tables and messages give them: which are taken, and what is said of others."""
+"""Numbers from files, tables and messages: which are accepted, and the errors for others."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses at which the target can be measured, and the way from one to the next."""
+"""Poses at which the target can be measured, and their visiting order."""
 
 from __future__ import annotations
 

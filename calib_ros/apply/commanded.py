@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which point of a program each measurement belongs to.
+"""The program point to which each measurement belongs.
 
 An arm stands at the joint values of the program if that was not corrected, else at those that the
 correction makes of them. Along a path with points closer than the correction, the corrected ones

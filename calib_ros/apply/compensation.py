@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction in the robot's program: joint commands that reach the pose that was meant.
+"""The correction of a program: joint commands that reach the intended pose.
 
 A controller believes the nominal arm N, the real one is the calibrated arm C. A command q means
 the pose N(q) of the flange in the arm's base frame; it is replaced by the q' nearest to it with

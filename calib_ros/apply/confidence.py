@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How sure an RMS error is, and whether it grows from night to night.
+"""Confidence limits of an RMS error, and its growth from night to night.
 
 Limits of an RMS position error over poses like those measured: the sum of squares over K
 configurations with errors e_k is approximated by theta / nu chi2(nu) (Satterthwaite 1946) with

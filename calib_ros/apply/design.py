@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The information that poses would give about the parameters, before any is measured.
+"""The information of poses about the parameters, before they are measured.
 
 A pose adds A^T A to the information M about the parameters, with A (m, P) its rows of the weighted
 Jacobian: 6 by full pose, 3 by position. Neither needs a measured value. With C = M^-1 the

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How many poses to measure, which of many candidates, and the accuracy to expect.
+"""Choice of poses to measure, and the accuracy to expect.
 
 A pose with the rows A (m, P) of information (`design.py`) is judged by a matrix of m x m:
 

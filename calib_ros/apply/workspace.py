@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors over the workspace, and where in it a task is done best.
+"""Errors over the workspace, and the best place for a task.
 
 The optimal workspace of a task (Vacarescu et al., abstract) is the placement of its frame with the
 least expected error, the mean or the worst over its poses. A grid search, whose map is the

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of all commands; nothing here needs what the commands work with.
+"""The options of all commands; importing them loads nothing else.
 
 They are written as their help shows them: groups, and in these a line for each option. Behind its
 name are `!` if it must be given and, unless it is a flag, its placeholder, from which follows the

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the options given stand for: bags, tables, layouts, histories, reports."""
+"""What the given options mean: bags, tables, layouts, histories, reports."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What kind of file somebody gives, and which command takes it."""
+"""The kind of a given file, and the commands that accept it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros robots | chain`: the arms that are known."""
+"""`calib_ros robots | chain`: the arms supplied."""
 
 from __future__ import annotations
 

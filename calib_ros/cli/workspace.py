@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros workspace`: how good the arm is where."""
+"""`calib_ros workspace`: errors over the workspace."""
 
 from __future__ import annotations
 

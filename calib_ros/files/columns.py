@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns: numbers of all rows at once. What is wrong is said with its line."""
+"""A table by columns: numbers of all rows at once. Errors name the line."""
 
 from __future__ import annotations
 

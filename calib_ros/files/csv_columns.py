@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of a CSV: of a regular text, whose cells are cut at separators, or by csv."""
+"""The columns of a CSV: a regular text is cut at separators, any other read by csv."""
 
 from __future__ import annotations
 

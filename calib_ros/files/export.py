@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A corrected chain in the forms that controllers and other software read.
+"""A corrected chain in formats for controllers and other software.
 
     dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta; exact
     dh_standard.yaml, dh_modified.yaml the same as chain files, with base and tool; exact

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a table that others have written to the columns of ours, described in docs/tables.md."""
+"""From a table of another system to our columns, described in docs/tables.md."""
 
 from __future__ import annotations
 

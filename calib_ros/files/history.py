@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Results over time: a Parquet dataset to which rows are added, read by anything that reads one.
+"""Results over time: an append-only Parquet dataset.
 
 A row is a file `robot=SERIAL/KEY.parquet`. KEY is a hash of all that the result depends on: it is
 there once however often and by however many processes it is filed, as a whole or not at all.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How a table that others have written is laid out, described in docs/tables.md.
+"""Layouts of tables from other systems, described in docs/tables.md.
 
 A layout says which of their columns make ours (q1, x, qw ...), as expressions, in which units, and
 how rotations are written. Presets are layouts in YAML files; a user's own goes by its path.

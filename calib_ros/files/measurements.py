@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the rows of a table of measurements say, all rows at once, and by what rules."""
+"""The meaning of the rows of a measurement table, all at once, and their rules."""
 
 from __future__ import annotations
 

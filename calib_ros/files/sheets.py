@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of others as text in columns: files and workbooks, whatever is above their rows.
+"""Tables of other systems as text in columns: files and workbooks, with any head.
 
 What is guessed (the coding, the separator, the decimal sign, the line of the header) is said.
 """

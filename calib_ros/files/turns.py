@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, and standard deviations, as others write them: quaternions and covariances of them.
+"""Rotations and standard deviations of other systems, as quaternions and covariances.
 
 XYZ are turns about the axes as turned before, R = Rx(r1) Ry(r2) Rz(r3); xyz about fixed ones,
 which is ZYX in the other order. Standard deviations s of Euler angles make the covariance

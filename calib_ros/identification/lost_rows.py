@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A row that is missing in one of two tables put side by side: from there on no pair is one.
+"""A row missing from one of two tables put side by side: later rows are mismatched.
 
 Base and tool are known from the pairs of a third of the session, the first or the last. By these
 each measurement i is held against the joint values i + s, for small shifts s: before a row k the

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What comes of bringing a calibration up to date: accepted or not, and in words."""
+"""The outcome of a recalibration: accepted or not, and in words."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What an identification has found."""
+"""The result of an identification."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How large errors of one kind are: the sizes that make the data most probable (`evidence.py`)."""
+"""Sizes of the errors of each kind: those that make the data most probable (`evidence.py`)."""
 
 from __future__ import annotations
 

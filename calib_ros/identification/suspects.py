@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The usual mistakes in what is given for an arm: how each is undone, and what to do."""
+"""The usual mistakes in the input: how each is undone, and what to do."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What looks wrong in a result with good figures: one sentence each, and what to do.
+"""Suspicious results with good figures: one sentence each, and what to do.
 
 Scale. A device with a scale error s makes all lengths of the arm seem to grow alike; so does its
 temperature. With L the derivative of the fitted lengths by s (the frames take their share), x

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The chain from a robot's own description (URDF), and the corrected arm back into it.
+"""The chain from a robot description (URDF), and the corrected arm back into it.
 
     URDF     T_base_tip(q) = O_1 M_1(q_1) ... O_n M_n(q_n) O_tip
     chain    T_base_tip(q) = base A_1(q_1) ... A_n(q_n) tool

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot's description (URDF) as a tree of links and joints, and origins back into its text.
+"""A robot description (URDF) as a tree of links and joints, and origins back into its text.
 
 Origins are written into the text itself: everything else stays as it is, byte for byte.
 """

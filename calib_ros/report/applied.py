@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages of a verification, of a workspace and of a plan say."""
+"""The pages of a verification, a workspace and a plan."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a report as plotly reads them: plain dictionaries of `data` and `layout`."""
+"""Figures of a report for plotly: plain dictionaries of `data` and `layout`."""
 
 from __future__ import annotations
 

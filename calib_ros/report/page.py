@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A report as HTML, as PDF and in Markdown: each one file that needs nothing else, no network.
+"""A report as HTML, PDF and Markdown: each a single file that needs no network.
 
 jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
 None where they are not installed. All text of others is escaped.

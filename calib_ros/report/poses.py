@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured, pose by pose: where, how far off before and after, and whence.
+"""The measurements pose by pose: place, errors before and after, and source.
 
 It becomes a table, and what a page shows: single poses, above SINGLE bins, cells and quantiles.
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page of an identification says."""
+"""The page of an identification."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What pages of several kinds show alike: accuracy, identity, and figures of poses."""
+"""Sections shared by several pages: accuracy, identity, and figures of poses."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node offers around an identification: where to go next, how good where, corrections.
+"""The node's help around an identification: next pose, errors over the workspace, corrections.
 
     ~/next_pose          where to measure next, after every sample
     ~/workspace_error    the errors over the workspace, after every accepted identification

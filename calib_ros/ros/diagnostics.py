@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of itself once a second, whatever fails meanwhile."""
+"""The node's diagnostics, once a second, whatever else fails."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An identification of the node's samples, on a snapshot of them and a thread of its own."""
+"""An identification on a snapshot of the node's samples, in its own thread."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topics that the node hears, and how well it hears them.
+"""The node's subscriptions, and how well they work.
 
 Messages wait in the queues of their subscriptions, serialised, until they are taken by the batch:
 no executor may serve these subscriptions. Nor may it wait for their events, of lost messages say:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node is set to: parameters with their ranges, and the robot that they name.
+"""The node's settings: parameters with their ranges, and the robot they name.
 
 Every field of `Settings` is a parameter of the same name, with its text and its smallest value;
 `arguments.py` lists the others.

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How late a measuring device stamps, from the motion itself.
+"""The delay of a measuring device's stamps, from the motion itself.
 
 The speed of the target by the joints and the chain, and the speed by the measurements, are the
 same signal twice. Angular speed depends on no frame; linear speed is that of the flange, near

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is let in by the names in messages: joints, frames, targets; and the samples kept."""
+"""Admission by the names in messages (joints, frames, targets), and the samples kept."""
 
 from __future__ import annotations
 

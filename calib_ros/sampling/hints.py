@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What became of the messages, what looks wrong, and how far the samples are, in words."""
+"""The account of the messages, what looks wrong, and the progress of sampling, in words."""
 
 from __future__ import annotations
 

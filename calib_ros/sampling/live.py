@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The estimate while samples are being taken: what is known so far, and how many more it takes.
+"""The estimate during sampling: what is known so far, and how many more samples are needed.
 
 At a chain that is near enough, every sample adds its share J^T W J and J^T W r to the information
 matrix and vector, so the estimate and its covariance follow each sample at the cost of that sample

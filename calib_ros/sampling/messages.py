@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to numbers, and the sources that they come from.
+"""ROS messages to numbers, and their sources.
 
 Messages are read by their attributes only: rclpy's and rosbags' messages alike. What cannot be
 used is told by its cause, under which it is counted. A source says what comes on a topic, and

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stops of the arm: which become samples, which pass unseen, and the means measured at them.
+"""Stops of the arm: which become samples, which are ignored, and the means measured at them.
 
 An arm vibrates after its joints have stopped. So the mean begins where the measurements have come
 as close to the later ones as their noise allows, and a stop whose measurements still spread more

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a recording are read, and what must not be read as a measurement."""
+"""Choice of the topics of a recording to read."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements out of the transforms between frames that come on /tf and /tf_static.
+"""Measurements from the transforms between frames on /tf and /tf_static.
 
 A source names two frames. Between them there must be one link that moves; what stands still
 before and after it, in either direction, is composed with it at its stamps. Several moving links
