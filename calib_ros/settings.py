@@ -44,7 +44,7 @@ STARTUP = (
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
-    """Declare a setting with what a node parameter and a command line option need to know."""
+    """Declare a setting with the data for a node parameter and a command line option."""
     return field(default=default, metadata={'text': text, 'lower': lower})
 
 
@@ -161,7 +161,7 @@ class Settings:
     )
 
     def for_problem(self) -> dict[str, Any]:
-        """Return what an identification needs to know, by the names of `Problem`."""
+        """Return the settings of an identification, by the names of `Problem`."""
         from calib_ros.values import parse_number  # loads numpy, which no `--help` needs
 
         priors = {}

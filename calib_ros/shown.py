@@ -21,7 +21,7 @@ LISTED = 4 * NAMED
 
 
 def some(words: Sequence[str], most: int = NAMED) -> list[str]:
-    """Return the first of some words, and how many more there are."""
+    """Return the first of some words, and the number of the others."""
     more = len(words) - most
     return [*words[:most], f'and {more} more'] if more > 0 else list(words)
 

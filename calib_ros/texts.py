@@ -42,7 +42,7 @@ MOST_NODES = LARGEST_TEXT // 20
 MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
 """What Markdown takes for more than text; underscores only where they may begin emphasis."""
 FORMULA = re.compile(r"'*[=+\-@\t\r]")
-"""How a cell begins that a spreadsheet computes, whatever apostrophes are before it."""
+"""Start of a cell that a spreadsheet computes, after any apostrophes."""
 
 
 def read_text(
@@ -143,7 +143,7 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     import yaml
 
     class Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
-        """The fast one if there is one: a tenth of the time."""
+        """The fast one if available: a tenth of the time."""
 
     Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
     text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)

@@ -21,7 +21,7 @@ from calib_ros.kinematics.se3 import FloatArray
 def meant(
     nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
 ) -> FloatArray:
-    """Return the commanded joint values (N, n) [rad or m] that measured ones (N, n) stand for.
+    """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
 
     Those are the nearest of the program (M, n), as it is or corrected by the calibration.
 

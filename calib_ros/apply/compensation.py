@@ -32,7 +32,7 @@ from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
 
 BESIDE = LEVER / 3.0
-"""Distance [m] from the tool at which what a turn does is told: the length of small tools."""
+"""Distance [m] from the tool at which the effect of a turn is reported: a small tool's length."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -41,7 +41,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0
-"""So many make limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
+"""With this many, limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
 
 
 def rms_limits(

@@ -165,7 +165,7 @@ def accuracy(design: Design, joints: FloatArray, task: FloatArray) -> FloatArray
 
 
 def predicted(design: Design, task: FloatArray) -> float:
-    """Return the RMS position error [m] at task poses (T, n) predicted by what is known."""
+    """Return the predicted RMS position error [m] at task poses (T, n)."""
     known = triangular(design.known)
     if independent(known, design.names) != design.names:
         return float('inf')

@@ -22,7 +22,7 @@ from calib_ros.kinematics.se3 import FloatArray
 
 @dataclass(frozen=True)
 class Cell:
-    """How the simulated arm is made, moved and measured: m, rad, s, Hz."""
+    """Make, motion and measurement of the simulated arm: m, rad, s, Hz."""
 
     length_error: float = 5e-4
     angle_error: float = 1e-3

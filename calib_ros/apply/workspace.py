@@ -45,7 +45,7 @@ class Survey(Shown):
 
     @property
     def parts(self) -> dict[str, FloatArray]:
-        """Return the errors (N,) [m] by their names: only what is removed, if no more is known."""
+        """Return the errors (N,) [m] by name: only the removed ones, if no others are known."""
         found = {'removed by the calibration': self.removed}
         if not np.isnan(self.remaining).any():
             found |= {'its uncertainty': self.sigma, 'expected to remain': self.remaining}
@@ -198,7 +198,7 @@ def place(
     drawn: int = 20_000,
     told: Told = nobody,
 ) -> Placements:
-    """Find the placement of a task with the least expected error, mean or worst of its poses.
+    """Find the placement of a task with the smallest expected error, mean or worst of its poses.
 
     Poses (K, 4, 4) of the target are in the task's frame, whose axes are those of the base at
     turn 0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, which

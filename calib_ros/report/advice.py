@@ -101,7 +101,7 @@ LEFT = (
 
 @dataclass(frozen=True)
 class Situation:
-    """What was measured: different poses, what is left over the noise stated, that noise [m]."""
+    """The measurement: different poses, residual over stated noise, that noise [m]."""
 
     poses: int = ENOUGH
     left: float = 1.0
@@ -122,7 +122,7 @@ class Situation:
 
 
 def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Advice, ...]:
-    """Return the refusals in plain words, those of one rule together, and last what follows."""
+    """Return the refusals in plain words, grouped by rule, and last their consequences."""
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))

@@ -25,7 +25,7 @@ BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
 DOTTED = {'color': LIMIT, 'dash': 'dot'}
 QUANTILES = 2 * SOME_POSES
-"""Points of a curve that stands for any number of poses."""
+"""Points of a curve for any number of poses."""
 REVERSED = {'autorange': 'reversed', 'automargin': True}
 """A vertical axis with the first row on top."""
 ROUND = ('eccentricity', 'gear')
@@ -170,7 +170,7 @@ def coverage(
 
 
 def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
-    """Return what the drives add to the joint values, where these (N, n) lie; None for nothing."""
+    """Return what the drives add to joint values (N, n), over their range; None if nothing."""
     waves = [each for each in chain.effects if effects.group_of(each[0]) in ROUND]
     owners = np.array([Parameter(name).owner for name, _ in waves])
     driven = [k for k, name in enumerate(chain.joint_names) if name in owners]
@@ -193,7 +193,7 @@ def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
 
 
 def error_map(survey: Survey) -> Figure:
-    """Return the RMS of what a calibration removes and of what remains by radius and height."""
+    """Return the RMS of removed and remaining errors by radius and height."""
     x, y, z = survey.positions.T
     parts = dict(list(survey.parts.items())[::2])  # without sigma
     largest = 1e3 * max(float(np.quantile(errors, 0.99)) for errors in parts.values())

@@ -108,7 +108,7 @@ def somewhere(result: Identification) -> str:
 
 
 def doubts(result: Identification) -> tuple[str, ...]:
-    """Return what to check before an accepted result is used."""
+    """Return the checks to make before using an accepted result."""
     return tuple(f'Check before you use it: {each}.' for each in result.remarks)
 
 
@@ -322,7 +322,7 @@ def _parameters(result: Identification) -> Section:
 
 
 def _determined(result: Identification) -> Section:
-    """Return how well the arm is known, and what no measurement at these poses can tell."""
+    """Return how well the arm is known, and what these poses cannot determine."""
     sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
     return section(
         'determined',

@@ -52,7 +52,7 @@ def accuracy_section(
     with_outliers: ErrorFigures | None = None,
     intervals: bool = True,
 ) -> Section:
-    """Return the table of accuracy, before and after; `things` are what is counted."""
+    """Return the accuracy table, before and after; `things` are counted."""
     columns = [
         _column(name, found, interval_of(judged, when, INTERVAL) if intervals else None)
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
@@ -82,7 +82,7 @@ def identity_of(
     judged: tuple[str, str] = ('', ''),
     corrected: str = '',
 ) -> tuple[tuple[str, str], ...]:
-    """Return what the result is of, by whom and when; what is not told is left out."""
+    """Return the identity of the result: robot, people, times; unknown entries are omitted."""
     software = f'calib_ros {calib_ros.__version__}, Python {platform.python_version()}, '
     software += f'numpy {np.__version__}'
     rows = [

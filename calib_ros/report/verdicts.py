@@ -45,7 +45,7 @@ def each_in_words(found: Verification) -> list[str]:
 
 
 def limits(found: Verification) -> list[str]:
-    """Return what the verdict does not tell."""
+    """Return what the verdict leaves open."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if not found.by_program:
         lines.append(

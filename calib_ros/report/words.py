@@ -82,7 +82,7 @@ def remarks(result: Identification) -> list[str]:
 
 
 def notes(result: Identification) -> list[str]:
-    """Return what there is to know of the parameters fitted, one thing each."""
+    """Return the remarks on the fitted parameters, one each."""
     found = []
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
@@ -167,7 +167,7 @@ def _lost(calibration: Calibration, text: str) -> str:
 
 
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
-    """Return the result as one JSON document; `samples` is what became of the input."""
+    """Return the result as one JSON document; `samples` is the account of the input."""
 
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
@@ -254,7 +254,7 @@ def scatter_in_words(noise: Noise) -> str:
 
 
 def drift_in_words(noise: Noise) -> str:
-    """Return what speaks for a drift of the device: errors shared in succession alone."""
+    """Return the evidence for drift of the device: errors shared in succession only."""
     return neighbours_in_words(noise) if noise.shared == ('successive',) else ''
 
 
@@ -276,7 +276,7 @@ def neighbours_in_words(noise: Noise) -> str:
 
 
 def chance_in_words(chance: float) -> str:
-    """Return how well the gain stands against errors in succession."""
+    """Return how well the gain stands up to errors in succession."""
     share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'below 0.1'
     return (
         f'The chance that the improvement is only drift of the device is {share} % (share of '

@@ -60,7 +60,7 @@ MOST_QUEUED = qos_profile_services_default.depth
 
 
 class Guide:
-    """Publishes what helps before and after an identification.
+    """Publish help before and after an identification.
 
     `guarded` makes a function of one that logs what it raises. The next pose is chosen among
     `candidates` (N, n), or among random ones within the limits.
@@ -95,13 +95,13 @@ class Guide:
         )
 
     def join(self, timeout: float) -> bool:
-        """Begin nothing more and wait [s] for what runs; return whether it has ended."""
+        """Begin nothing more and wait [s] for running work; return whether it has ended."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         running = [each for each in self._pending if not each.cancelled()]
         return not wait(running, timeout).not_done
 
     def figures(self) -> dict[str, Any]:
-        """Return for the diagnostics how far it has come, and what became of trajectories."""
+        """Return the diagnostics: progress of sampling, and the last trajectory."""
         estimate = self._session.estimate
         wanted = self._session.settings.wanted_accuracy
         known = {} if estimate is None else {'expected [mm]': f'{1e3 * estimate.sigma:.4f}'}

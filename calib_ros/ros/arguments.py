@@ -120,7 +120,7 @@ PLACED = {
 
 
 def launch_arguments() -> dict[str, str]:
-    """Return the launch arguments of the node with what they are for.
+    """Return the launch arguments of the node with their descriptions.
 
     All are empty by default: what is not given is not passed, so that the parameter file, and
     the node's own defaults, hold.
@@ -130,7 +130,7 @@ def launch_arguments() -> dict[str, str]:
 
 
 def usage(program: str) -> argparse.ArgumentParser:
-    """Return a parser of what is not for ROS: of --help alone, which lists the parameters."""
+    """Return a parser of the arguments not for ROS: only --help, which lists the parameters."""
     lines = ['parameters:']
     for each in PARAMETERS.values():
         text = textwrap.fill(

@@ -99,7 +99,7 @@ ANSWER_LENGTH = LONGEST // 2
 
 
 class Snapshot(NamedTuple):
-    """What an identification works on, and what it was called with."""
+    """The input of an identification, and its settings."""
 
     problem: Problem
     model: str
@@ -122,7 +122,7 @@ class Snapshot(NamedTuple):
 
 
 class Identifying:
-    """Identifies, tells the result in words, and hands over what is `accepted`.
+    """Identify, report the result in words, and hand over an `accepted` one.
 
     `configuration` returns what the node is set to as a parameter file.
     """
@@ -228,7 +228,7 @@ class Identifying:
 
 
 def _without_middle(text: str, longest: int) -> str:
-    """Return a text whose last clause, the advice, is whole; what stands before it is cut."""
+    """Return a text with its last clause, the advice, whole; the text before it is cut."""
     end = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
     room = longest - len(text) + end - 1
     if len(text) <= longest or not longest // 4 < room < end:

@@ -161,7 +161,7 @@ class Keeper:
         return written
 
     def at_start(self) -> tuple[Path | None, bool]:
-        """Return which calibration there is to load, and whether it shall be at the start."""
+        """Return the calibration to load, and whether to load it at startup."""
         named = self._named('calibration_filename')
         path = named or self._archive.newest_calibration()
         return path, path is not None and (named is not None or self._given.autoload)

@@ -44,7 +44,7 @@ class Given(SimpleNamespace):
 
     @property
     def links(self) -> dict[str, Any]:
-        """Return the links of a URDF between which the arm is; None for those that are found."""
+        """Return the first and last link of the arm in a URDF; None for those to be found."""
         return {'base_link': self.base_link or None, 'tip_link': self.tip_link or None}
 
 
@@ -77,7 +77,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
-    """Return settings with what changes of parameters make of them."""
+    """Return settings with changed parameters applied."""
     values = {
         each.name: parse_like(getattr(Settings, each.name), each.value, each.name)
         for each in changes
@@ -87,7 +87,7 @@ def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
 
 
 def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
-    """Return the nominal chain, and the URDF that it comes from if it does."""
+    """Return the nominal chain, and its URDF if it comes from one."""
     name, links = given.chain, given.links
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -46,7 +46,7 @@ ADVANCE_NS = round(5e9 * REST_S)
 
 
 class Collector:
-    """Bounded buffers of joint samples and measurements, and what they are made into.
+    """Bounded buffers of joint samples and measurements, and the samples made from them.
 
     Joints that are `revolute` (n,) have angles for values.
     """
@@ -64,7 +64,7 @@ class Collector:
         self.rests = Rests(settings.pose_buffer)
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
-        """How much later than the joints' the stamps of measurements are."""
+        """The delay of measurement stamps after joint stamps."""
         self.holding = False
         """True while the delay is being looked for, so that nothing may be taken."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
@@ -210,7 +210,7 @@ class Collector:
                 rows.release(rows.count)
 
     def state(self) -> str:
-        """Return in words what the arm does, as far as samples are concerned."""
+        """Return in words the state of the arm, as far as samples are concerned."""
         self._sort()
         newest = self.track.newest_ns
         if not newest or self.track.missing:

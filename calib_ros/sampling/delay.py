@@ -44,7 +44,7 @@ MOST_TIME = 100.0 * LEAST_MOTION
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later than the joints' the stamps of measurements are, and how sure it is."""
+    """The delay of measurement stamps after joint stamps, and its certainty."""
 
     seconds: float
     correlation: float

@@ -31,7 +31,7 @@ class JointNames:
         self._names = names
         self._layouts: dict[tuple[str, ...], Layout] = {}
         self.foreign: tuple[str, ...] = ()
-        """Names that come while some of the chain's joints are never named."""
+        """Names received while some of the chain's joints are never named."""
 
     def layout(self, key: tuple[str, ...]) -> Layout:
         """Return which joints of the chain messages name, and the columns of their values."""
@@ -124,7 +124,7 @@ class Part(NamedTuple):
 
 
 class Entry:
-    """Lets in what can be used and counts what cannot, by its cause."""
+    """Admit usable messages and count the others by cause."""
 
     def __init__(self, names: JointNames, frames: FrameNames, joint_count: int) -> None:
         self._names, self._frames, self._joint_count = names, frames, joint_count
@@ -206,7 +206,7 @@ class Entry:
                 yield Piece(key, places, readings.stamps_ns, readings.numbers)
 
     def _by_frame(self, parts: Sequence[Part]) -> list[Part]:
-        """Return measurements one by one while it is open which of several frames is the usual."""
+        """Return measurements one by one while the usual one of several frames is undecided."""
         frames: dict[str, set[str]] = {}
         for each in parts:
             assert each.source is not None

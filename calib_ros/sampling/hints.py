@@ -27,7 +27,7 @@ _TWICE = re.compile(r'same stamp twice|already exists')
 
 @dataclass(frozen=True)
 class Account:
-    """What became of the messages: how many came, how many samples, what was dropped and why."""
+    """Account of the messages: how many arrived, how many samples, what was dropped and why."""
 
     joint_states: int
     poses: int
@@ -118,7 +118,7 @@ def apart(ahead: float) -> Hint:
 
 
 def unsettled(refused: int, stops: int) -> list[Hint]:
-    """Tell that many of the stops are refused because what is measured moves at them."""
+    """Report that many stops are refused because the target moves at them."""
     if refused < START or refused <= EXCEPTION * stops:
         return []
     words = (
@@ -208,7 +208,7 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
 def progress(
     chain: Chain, fitted: Sequence[FloatArray], estimate: Estimate | None, settings: Settings
 ) -> list[str]:
-    """Return how many samples there are to fit, what they promise, and which joints hardly moved.
+    """Return the number of samples to fit, their expected accuracy, and joints that hardly moved.
 
     `fitted` holds the joint values (n,) of each.
     """
@@ -220,7 +220,7 @@ def progress(
 
 
 def _forecast(estimate: Estimate, settings: Settings) -> str:
-    """Return in words what it takes until positions are known as well as wanted."""
+    """Return in words what is still needed for the wanted accuracy."""
     wanted = settings.wanted_accuracy
     more = estimate.more_for(wanted)
     if not more:

@@ -107,7 +107,7 @@ class LiveEstimate:
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
-        """Samples that lie too far from what the others predict; they are left out here."""
+        """Samples too far from the prediction of the others; they are ignored here."""
         self.refused = ''
         """Why the samples can be no problem, in words; empty if they can."""
 
@@ -295,7 +295,7 @@ class LiveEstimate:
         )
 
     def _excess(self, chain: Chain) -> float:
-        """Return the RMS residual of positions in units of what measurements scatter by."""
+        """Return the RMS residual of positions in units of the measurement scatter."""
         chosen = np.linspace(0, len(self._added) - 1, SOME).round().astype(int)
         some = [self._added[k] for k in np.unique(chosen)]
         total = 0.0

@@ -199,7 +199,7 @@ class CalibrationSession:
         return self._collector.state()
 
     def account(self) -> Account:
-        """Return what became of the messages so far."""
+        """Return the account of the messages so far."""
         fitted = [sample.joints for sample in self.samples if not sample.validation]
         usable, distinct = self.usable, len(fitted)
         if self.settings.mode != 'continuous' and fitted:
@@ -228,7 +228,7 @@ class CalibrationSession:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return what an engineer should know about the measurements."""
+        """Return warnings about the measurements."""
         return tuple(hint.text for hint in self.hints)
 
     @property
@@ -249,7 +249,7 @@ class CalibrationSession:
 
     @property
     def came(self) -> str:
-        """Return in words what became of the messages, and what looks wrong."""
+        """Return in words the account of the messages, and what looks wrong."""
         return '; '.join((str(self.account()), *self.warnings))
 
     @property

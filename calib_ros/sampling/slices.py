@@ -100,7 +100,7 @@ JOINTS, POSES = 'joints', 'measurements'
 NO_ACCIDENT = round(1.0 / (1.0 - CONFIDENT))
 """So many messages that differ from the others are no accident: one in so many may be."""
 SILENCE = 5.0 * Settings.lateness
-"""A joint or topic that was heard before and is silent for so long [s] is told."""
+"""A joint or topic that was active and is silent for this long [s] is reported."""
 
 
 class StreamKey(NamedTuple):

@@ -94,7 +94,7 @@ SAMPLED = 'of a stop that already has its pose'
 
 @dataclass
 class Plan:
-    """What becomes of measurements up to stamps, each from the end of the one before.
+    """The fate of measurements up to stamps, each from the end of the one before.
 
     Those up to each of the `ends` are not used for a reason, or it is empty and they are, from
     where their stop begins.
@@ -107,7 +107,7 @@ class Plan:
     begins: list[int] = field(default_factory=list)
 
     def add(self, until: int, why: str, begin: int = 0) -> None:
-        """Deal with what was measured up to a stamp."""
+        """Handle the measurements up to a stamp."""
         if until > self.done_ns:
             self.done_ns = until
             self.ends.append(until)

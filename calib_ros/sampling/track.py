@@ -128,7 +128,7 @@ class Track:
         return heard
 
     def room(self, columns: tuple[int, ...]) -> int:
-        """Return for how many more samples of some joints there is room."""
+        """Return the number of further samples of some joints that fit."""
         rows = self._parts.get(columns)
         return self._capacity if rows is None else self._capacity - rows.count
 
