@@ -99,7 +99,7 @@ def at_least(options: argparse.Namespace, **lowest: float) -> None:
 
 
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
-    """Refuse to overwrite existing paths, before any work is done."""
+    """Refuse to write what is there already, before any work is done."""
     for path in paths:
         if path.exists() and not options.force:
             raise InputError(f'{path} exists already: choose another name or --force')

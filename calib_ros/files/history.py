@@ -297,7 +297,7 @@ class History:
                 return _conformed(parquet.ParquetFile(file).read(), key)
         except Exception as err:  # a damaged file fails in many ways
             raise InputError(
-                f'{path} is not a row of a history ({err}): move it away, and its work is repeated'
+                f'{path} is no row of a history ({err}): move it away, its work is done again'
             ) from err
 
     def _write(self, path: str, content: bytes) -> None:
