@@ -243,7 +243,7 @@ def spoilt(problem):
         yield 'another robot', f'the arm is a {right}', replace(problem, chain=load_chain(wrong))
     elif 'iiwa' in chain.name:
         yield 'another robot', 'kuka_iiwa14', replace(problem, chain=load_chain('franka_fr3'))
-    yield 'a row later', 'the measurement that they belong to', mixed_up(problem)
+    yield 'a row later', 'their measurement', mixed_up(problem)
 
 
 def fewer(problem, count):

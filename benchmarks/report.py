@@ -38,10 +38,10 @@ from calib_ros.report.reports import identification_report
 SIZES = (500, 20_000, 500_000)
 SCREENS = {'': (1280, 800), '_phone': (400, 800)}
 FIGURES = {
-    'cumulated': 'How many poses are within an error',
+    'cumulated': 'Share of poses within an error',
     'angles': 'Angles found',
     'gauges': 'What the poses determine',
-    'correlations': 'Which parameters stand in for each other',
+    'correlations': 'Correlated parameters',
 }
 """Sections by their titles, of which pictures stand in docs/."""
 UR10 = ('ur10_ipa_leica', '--session', 'B', '--tolerance', '0.5', '--device', 'Leica T-Mac')

@@ -80,14 +80,14 @@ def whole_folder(
 ) -> Iterator[Path]:
     """Yield a path at which to make a folder; it is put in place when the block has ended.
 
-    When the block fails, or the process is killed, there is no folder, or the one from before.
-    Missing parents are made. `own` are glob patterns of what belongs to the folder, which is only
-    replaced if `overwrite` is True; what an earlier folder holds besides is kept. By default there
-    must be no earlier one, and never another process that writes the same folder.
+    If the block fails, or the process is killed, there is no folder, or the earlier one. Missing
+    parents are made. `own` are glob patterns of what belongs to the folder, which is only replaced
+    if `overwrite` is True; what an earlier folder holds besides is kept. By default there must be
+    no earlier one, and never another process that writes the same folder.
     """
     place = Path(os.path.realpath(path))
     if not place.name:
-        raise InputError(f'{path} is the root of all folders: choose a folder in it')
+        raise InputError(f'{path} is the root folder: choose a folder in it')
     place.parent.mkdir(parents=True, exist_ok=True)
     work = place.with_name(f'.{place.name}.partial')
     new, old = work / place.name, work / f'{place.name}.old'
@@ -191,7 +191,7 @@ def _lock(handle: int, work: Path, path: Path, made: bool) -> None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        raise InputError(f'{other}: wait for it or choose another name') from None
+        raise InputError(f'{other}: wait for it, or choose another name') from None
     except OSError:  # a file system without locks: whoever made the folder has it
         if not made:
             raise InputError(f'{other}, or was killed: remove {work} if none runs') from None
@@ -217,18 +217,18 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
     if own is None:
         raise InputError(f'{path} exists already: remove it or choose another name')
     if not place.is_dir():
-        raise InputError(f'{path} is no folder: choose another name')
+        raise InputError(f'{path} is not a folder: choose another name')
     if os.path.ismount(place) or Path.cwd().is_relative_to(place):
         raise InputError(
-            f'{path} is the current folder or a mount point, which cannot be put in place as a '
-            f'whole: choose a folder in it, such as {path / "result"}'
+            f'{path} is the current folder or a mount point, which cannot be replaced: choose a '
+            f'folder in it, such as {path / "result"}'
         )
     there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
     if there and not overwrite:
         from calib_ros.shown import some  # loads numpy, no `--help` needs it
 
         held = ', '.join(some(there))
-        raise InputError(f'{path} holds {held} already: choose another or --force')
+        raise InputError(f'{path} already holds {held}: choose another folder or --force')
 
 
 def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:

@@ -47,11 +47,11 @@ class CalibrationError(Exception):
 
 
 class ConfigError(CalibrationError):
-    """A chain file, a setting or a command line that cannot be used."""
+    """An unusable chain file, setting or command line."""
 
 
 class InputError(CalibrationError):
-    """A bag, a table or messages that cannot be used."""
+    """An unusable bag, table or message."""
 
 
 class UnknownNameError(ConfigError):
@@ -70,7 +70,7 @@ class ColumnsError(InputError):
 
 
 class TooFewObservationsError(InputError):
-    """Not enough matched pairs for the parameters asked for."""
+    """Too few matched pairs for the requested parameters."""
 
     def __init__(self, configurations: int, needed: int, why: str) -> None:
         self.configurations = configurations

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a long piece of work is: told by stages and shares, and ended between two of them."""
+"""Progress of long work: reported by stages and shares, and cancelled between two stages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def nobody(at: str | float) -> None:
 
 
 def share_of(told: Told, begin: float, end: float) -> Told:
-    """Return what tells of a part of the work, from one share of all of it to another."""
+    """Return a progress function for a part of the work, between two shares of the whole."""
     return lambda at: told(at if isinstance(at, str) else begin + at * (end - begin))
 
 
@@ -30,7 +30,7 @@ class CancelledError(CalibrationError):
 
 
 class Progress:
-    """What a piece of work on another thread is at: a `Told`; `what` says what the work does."""
+    """Progress of work on another thread: a `Told`; `what` names the work."""
 
     def __init__(self, what: str) -> None:
         self._what = what
@@ -51,17 +51,17 @@ class Progress:
                 self._ends = now + (now - self._began) * (1.0 / self.share - 1.0)
 
     def __str__(self) -> str:
-        """Return in words what is done, and for how long; empty while nothing is."""
+        """Return in words the work in progress and its duration; empty if idle."""
         return '' if self._began is None else f'{self.words}, {self.times}'
 
     @property
     def words(self) -> str:
-        """Return what the work is, and its stage."""
+        """Return the work and its stage."""
         return f'{self._what} ({self._stage})' if self._stage else self._what
 
     @property
     def times(self) -> str:
-        """Return the time spent, and how much is left if that is told."""
+        """Return the time spent, and the time left if known."""
         now = time.monotonic()
         words = f'{now - (self._began or now):.0f} s'
         if 0 < (percent := round(100.0 * self.share)) < 100:
@@ -77,7 +77,7 @@ class Progress:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Run the work in a `with` block; what is cancelled within it never leaves it well."""
+        """Run the work in a `with` block; cancelled work never ends it normally."""
         try:
             yield
             with self._lock:
@@ -93,7 +93,7 @@ class Progress:
             if self._began is None:
                 return False, f'nothing to cancel: not {self._what}'
             self._cancelled = True
-            return True, f'{self.words} ends after this stage'
+            return True, f'{self.words} will end after this stage'
 
     def _refuse_cancelled(self) -> None:
         if self._cancelled:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that can be set besides the chain."""
+"""All settings besides the chain."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
 CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
-"""By which poses are chosen."""
+"""For choosing poses."""
 Aim: TypeAlias = Literal['mean', 'worst']
 AIMS: tuple[Aim, ...] = get_args(Aim)
-"""What a placement is to make small."""
+"""What a placement minimises."""
 Model: TypeAlias = Literal['corrected', 'nominal']
 MODELS: tuple[Model, ...] = get_args(Model)
-"""By which an arm is commanded."""
+"""Chain that commands the arm."""
 STORAGES = ('mcap', 'sqlite3')
 """Of bags."""
 EXCEPTION = 0.1
@@ -44,30 +44,30 @@ STARTUP = (
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
-    """Declare a setting with what a node parameter and a command line option need to know."""
+    """Declare a setting with the data for a node parameter and a command line option."""
     return field(default=default, metadata={'text': text, 'lower': lower})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """How far a correction of joint commands may go."""
+    """Limits of a correction of joint commands."""
 
     largest_turn: float = _setting(0.1, 'largest correction of a revolute joint [rad]')
     largest_shift: float = _setting(0.05, 'largest correction of a prismatic joint [m]')
     largest_position_error: float | None = _setting(
         None,
-        'position error that may remain [m]; if not given 1e-6 in the directions in which the '
-        'joints can move the target, and any in others',
+        'position error that may remain [m]; default: 1e-6 where the joints can move the target, '
+        'any in other directions',
     )
     largest_orientation_error: float | None = _setting(
         None,
-        f'orientation error that may remain [rad]; if not given 1e-6, or {TURN_IN_PART} for arms '
+        f'orientation error that may remain [rad]; default: 1e-6, or {TURN_IN_PART} for arms '
         'that cannot reach every orientation',
     )
     orientation_weight: float | None = _setting(
         None,
-        'position error that counts as much as one radian, where both cannot vanish [m/rad]; if '
-        f'not given {LEVER}, or {LEVER_IN_PART} for arms that cannot reach every orientation',
+        'position error that weighs as much as one radian where both cannot vanish [m/rad]; '
+        f'default: {LEVER}, or {LEVER_IN_PART} for arms that cannot reach every orientation',
     )
     largest_change: float = _setting(
         0.5, 'largest change of the correction between successive samples, relative to the move'
@@ -76,97 +76,92 @@ class Limits:
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that can be set besides the chain; same names in the node and the CLI."""
+    """All settings besides the chain; the node and the command line use the same names."""
 
     sigma_position: float = _setting(
-        1e-4, 'standard deviation of a measured position without its own covariance [m]', 1e-9
+        1e-4, 'standard deviation of positions that come without a covariance [m]', 1e-9
     )
     sigma_orientation: float = _setting(
         1e-4 / LEVER,
-        'standard deviation of a measured orientation without its own covariance [rad]',
+        'standard deviation of orientations that come without a covariance [rad]',
         1e-9,
     )
     sigma_pixel: float = _setting(
-        0.3, 'standard deviation of a coordinate of a corner in an image [px]', 1e-6
+        0.3, 'standard deviation of a corner coordinate in an image [px]', 1e-6
     )
     sigma_scale: float = _setting(
         0.0,
-        'standard deviation of the scale of the measuring device [1], if it was checked with a '
-        'known length; 0: it was not',
+        'standard deviation of the scale of the measuring device [1], if checked with a known '
+        'length; 0: not checked',
         0.0,
     )
-    socket_distance: float = _setting(0.05, 'between the two sockets of a location [m]', 1e-6)
+    socket_distance: float = _setting(
+        0.05, 'distance between the two sockets of a location [m]', 1e-6
+    )
     max_gap: float = _setting(
         0.1, 'longest time between the two joint states that bracket a measurement [s]', 0.0
     )
     joint_buffer: int = _setting(
-        200_000, 'joint states that may wait; the older half is let go when it is full', 2
+        200_000, 'joint states kept waiting; when full, the older half is dropped', 2
     )
-    pose_buffer: int = _setting(
-        50_000, 'measurements that may wait, and poses kept, of each source', 1
-    )
+    pose_buffer: int = _setting(50_000, 'measurements kept waiting, and poses kept, per source', 1)
     mode: str = _setting(
         'dwell',
-        'dwell (each stop of the arm becomes a pose), continuous (each measurement does, moving '
-        'or not) or triggered (one by each call of ~/capture)',
+        'dwell (one pose per stop of the arm), continuous (one per measurement, moving or not) '
+        'or triggered (one per call of ~/capture)',
     )
     still: float = _setting(
-        5e-4, 'the arm stands while no joint leaves its value by more [rad or m]', 0.0
+        5e-4, 'the arm stands still while no joint moves by more [rad or m]', 0.0
     )
-    settle: float = _setting(
-        0.1, 'time after a stop in which it is not measured yet: vibration [s]', 0.0
-    )
-    shortest_stop: float = _setting(0.2, 'a shorter stop is no pose [s]', 0.0)
-    longest_stop: float = _setting(5.0, 'of a longer stop only the beginning is used [s]', 0.0)
+    settle: float = _setting(0.1, 'wait after each stop for vibration to die out [s]', 0.0)
+    shortest_stop: float = _setting(0.2, 'shorter stops are ignored [s]', 0.0)
+    longest_stop: float = _setting(5.0, 'only this much of a longer stop is used [s]', 0.0)
     lateness: float = _setting(
-        1.0, 'how much later than joint states of the same stamp measurements may come [s]', 0.0
+        1.0, 'how much later measurements may arrive than joint states of the same stamp [s]', 0.0
     )
     delay: float = _setting(
         0.0,
-        'how much later than those of the joints the stamps of measurements are known to be [s]',
+        'known delay of measurement stamps after joint stamps [s]',
         -10.0,
     )
     sources: tuple[str, ...] = _setting(
         (),
-        'topics of measurements, each as "TOPIC key=value ..." with the keys type, device, '
-        'target, eye_in_hand, validation; of /tf with parent and child; of images with board, '
-        'info, lens',
+        'measurement topics, each as "TOPIC key=value ..."; keys: type, device, target, '
+        'eye_in_hand, validation; /tf also parent and child; images also board, info, lens',
     )
-    joint_topics: tuple[str, ...] = _setting((), 'topics of joint states')
+    joint_topics: tuple[str, ...] = _setting((), 'joint state topics')
     wanted_accuracy: float = _setting(
-        1e-4, 'standard deviation of predicted positions that is enough [m]', 1e-9
+        1e-4, 'wanted standard deviation of predicted positions [m]', 1e-9
     )
-    frame_id: str = _setting('', 'frame that measurements must be in; default: any one')
-    folds: int = _setting(5, 'parts of the cross-validation', 2)
+    frame_id: str = _setting('', 'required frame of the measurements; default: any')
+    folds: int = _setting(5, 'number of cross-validation folds', 2)
     largest_length: float = _setting(
-        0.05, 'a corrected length further from nominal is not accepted: wrong robot? [m]', 0.0
+        0.05, 'a larger change of a length is not accepted: wrong robot? [m]', 0.0
     )
     largest_angle: float = _setting(
-        0.1, 'a corrected angle further from nominal is not accepted: wrong robot? [rad]', 0.0
+        0.1, 'a larger change of an angle is not accepted: wrong robot? [rad]', 0.0
     )
     largest_error: float = _setting(
         0.01, 'a larger RMS error on held-out poses is not accepted: wrong robot? [m]', 0.0
     )
-    loss: str = _setting(
-        'redescending', 'how gross errors are kept from the fit: redescending, huber or none'
-    )
+    loss: str = _setting('redescending', 'treatment of gross errors: redescending, huber or none')
     priors: tuple[str, ...] = _setting(
         (), 'standard deviations about nominal as NAME=SIGMA [m, rad], for example *.a=0.001'
     )
     model: str = _setting(
         'geometric',
-        'errors to fit: geometric; auto (adds the non-geometric effects that pay for themselves); '
-        'or groups of effects joined by +, for example ratio+eccentricity',
+        'errors to fit: geometric; auto (adds the non-geometric effects that reduce the held-out '
+        'error); or effect groups joined by +, for example ratio+eccentricity',
     )
     joint_names: tuple[str, ...] = _setting(
-        (), "names of the chain's joints in JointState, in its order; default: those of the chain"
+        (), 'names of the joints in JointState, in chain order; default: as in the chain'
     )
     fixed: tuple[str, ...] = _setting(
         (), 'parameters held at their nominal values, for example joint_2.a or *.alpha'
     )
 
     def for_problem(self) -> dict[str, Any]:
-        """Return what an identification needs to know, by the names of `Problem`."""
+        """Return the settings of an identification, by the names of `Problem`."""
         from calib_ros.values import parse_number  # loads numpy, which no `--help` needs
 
         priors = {}
@@ -191,7 +186,7 @@ class Settings:
                 for count, what in ((len(value), 'entries'), (longest, 'characters in an entry')):
                     if count > MOST_ENTRIES:
                         raise ConfigError(
-                            f'{item.name} has {count} {what}, at most {MOST_ENTRIES} are taken'
+                            f'{item.name} has {count} {what}; the limit is {MOST_ENTRIES}'
                         )
             if lower is not None and not math.isfinite(value):
                 raise ConfigError(f'{item.name} must be a finite number, not {value}')
@@ -202,5 +197,5 @@ class Settings:
             if value >= self.longest_stop:
                 raise ConfigError(
                     f'{name} ({value:g} s) must be shorter than longest_stop '
-                    f'({self.longest_stop:g} s): else no stop is ever sampled'
+                    f'({self.longest_stop:g} s), or no stop is ever sampled'
                 )

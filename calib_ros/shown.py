@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values on a screen: what they hold, in a few lines."""
+"""Values on a screen: their content in a few lines."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LISTED = 4 * NAMED
 
 
 def some(words: Sequence[str], most: int = NAMED) -> list[str]:
-    """Return the first of some words, and how many more there are."""
+    """Return the first of some words, and the number of the others."""
     more = len(words) - most
     return [*words[:most], f'and {more} more'] if more > 0 else list(words)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text files, tables and YAML, within limits, and texts of others as no more than text.
+"""Text files, tables and YAML, within limits; foreign texts are only text.
 
 A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
 with any number of digits. The stream of its events is looked at before anything is made of it.
@@ -42,7 +42,7 @@ MOST_NODES = LARGEST_TEXT // 20
 MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
 """What Markdown takes for more than text; underscores only where they may begin emphasis."""
 FORMULA = re.compile(r"'*[=+\-@\t\r]")
-"""How a cell begins that a spreadsheet computes, whatever apostrophes are before it."""
+"""Start of a cell that a spreadsheet computes, after any apostrophes."""
 
 
 def read_text(
@@ -79,7 +79,7 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
         return data.decode('utf-8-sig')
     except UnicodeDecodeError as err:
         raise error(
-            f'{where} is no text in UTF-8: save it as UTF-8, or is it another file?'
+            f'{where} is not UTF-8 text: save it as UTF-8, or is it the wrong file?'
         ) from err
 
 
@@ -122,7 +122,9 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     import yaml
 
     if len(text) > LARGEST_TEXT:
-        raise error(f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right one?')
+        raise error(
+            f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right file?'
+        )
     try:
         _weigh(yaml.parse(text, _loader()), where, error)
         documents = [each for each in yaml.load_all(text, _loader()) if each is not None]
@@ -141,7 +143,7 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
     import yaml
 
     class Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
-        """The fast one if there is one: a tenth of the time."""
+        """The fast one if available: a tenth of the time."""
 
     Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
     text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
@@ -196,9 +198,7 @@ class _Scales:
         elif event.anchor in self.anchors:
             nodes, height = self.anchors[event.anchor]
         else:
-            raise self._error(
-                f'{self._where}: alias "{event.anchor}" stands for nothing before it'
-            )
+            raise self._error(f'{self._where}: alias "{event.anchor}" is not defined before it')
         if above + height > DEEPEST:
             raise self._error(f'{self._where} is nested deeper than {DEEPEST} levels')
         if event.anchor:
@@ -214,7 +214,7 @@ class _Scales:
             key = getattr(inner, 'value', '<<')
             if keyed and k % 2 == 0 and key != '<<':
                 if key in keys:
-                    raise self._error(f'{self._where}: key "{key}" comes twice')
+                    raise self._error(f'{self._where}: key "{key}" appears twice')
                 keys.add(key)
             more, levels = self.node(inner, above + 1)
             nodes, height = nodes + more, max(height, levels + 1)
@@ -235,7 +235,7 @@ def in_markdown(value: object) -> str:
 
 
 def to_cell(text: str) -> str:
-    """Return a text as a cell of a table, which is no formula."""
+    """Return a text as a table cell that is not a formula."""
     return f"'{text}" if FORMULA.match(text) else text
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers as files, tables and messages give them: which are taken, and what is said of others."""
+"""Numbers from files, tables and messages: which are accepted, and the errors for others."""
 
 from __future__ import annotations
 
@@ -78,14 +78,14 @@ def parse_like(default: Any, value: object, where: str) -> Any:
         texts = value if isinstance(value, list | tuple) else (value,)
         if all(isinstance(each, str) for each in texts):
             return tuple(filter(None, texts))
-        wanted = "a list of texts such as ['a', 'b']"
+        wanted = "a list of strings such as ['a', 'b']"
     raise ConfigError(f'{where} must be {wanted}, not {value!r:.100}')
 
 
 def parse_mapping(
     value: object, keys: Sequence[str], where: str, needed: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return a mapping from YAML that has no other keys, and those that are needed."""
+    """Return a mapping from YAML with the required keys and no unknown ones."""
     if not isinstance(value, dict):
         raise ConfigError(
             f'{where} must be a mapping with the keys {", ".join(keys)}, not {value!r:.100}'
@@ -100,7 +100,7 @@ def parse_mapping(
 
 
 def parse_name(value: object, where: str) -> str:
-    """Return a name that can stand in a line of a table, a comment or a path."""
+    """Return a name that fits into a table line, a comment or a path."""
     name = str(value)
     if not name.isprintable() or len(name) > LONGEST_NAME:
         raise ConfigError(
@@ -127,7 +127,7 @@ def cell_integer(text: str, where: str) -> int:
 
 
 def covariance_fault(covariance: NDArray[np.float64]) -> str:
-    """Return what is wrong with a covariance (6, 6) of a measured pose; empty when nothing is."""
+    """Return what is wrong with a covariance (6, 6) of a measured pose; empty if nothing."""
     return str(covariance_faults(covariance[np.newaxis])[0])
 
 

@@ -27,9 +27,12 @@ from calib_ros.ros.arguments import node_options, switched
 
 ARGUMENTS = {
     'chain': ('', 'robot of the calibration, as for the node'),
-    'calibration': ('', 'calibration that ~/load takes; empty: the newest in data_dir'),
-    'planned': ('/planned_trajectory', 'topic of the trajectories as planned'),
-    'reviewed': ('/compensated_trajectory', 'topic of the corrected ones while nothing moves'),
+    'calibration': ('', 'calibration for ~/load; empty: the newest in data_dir'),
+    'planned': ('/planned_trajectory', 'topic of planned trajectories'),
+    'reviewed': (
+        '/compensated_trajectory',
+        'topic of corrected trajectories unless execute is true',
+    ),
     'controller': ('/joint_trajectory_controller', 'name of the controller'),
     'execute': ('false', 'true: the arm moves'),
 }

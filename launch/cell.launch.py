@@ -40,14 +40,14 @@ CONFIG = Path(__file__).parents[1] / 'config'
 OURS = {
     'urdf': (
         '',
-        'URDF of the robot, for robot_state_publisher; the chain too if nothing else names it',
+        'URDF of the robot, for robot_state_publisher; also the chain if no other is named',
     ),
     'tracker': ('', 'driver of the measuring device as PACKAGE/EXECUTABLE; default: none'),
-    'tracker_topic': ('pose', 'topic of poses of that driver, remapped to measured_pose'),
+    'tracker_topic': ('pose', 'pose topic of that driver, remapped to measured_pose'),
     'rviz': ('true', 'start RViz'),
     'fixed_frame': ('', 'fixed frame of RViz; default: frame_id, or tracker'),
-    'diagnostics': ('true', 'start the aggregator of diagnostics'),
-    'respawn_delay': ('2.0', 'time after which a node that was killed is started again [s]'),
+    'diagnostics': ('true', 'start diagnostic_aggregator'),
+    'respawn_delay': ('2.0', 'time before a killed node restarts [s]'),
 }
 ARGUMENTS = {name: ('', text) for name, text in launch_arguments().items()} | OURS
 
@@ -62,7 +62,7 @@ def calibration(given: dict[str, str]) -> list[LaunchDescriptionEntity]:
         again = calibration(given | {'resume': 'true'})
         delay = float(given['respawn_delay'])
         return [
-            LogInfo(msg=f'{NODE} was killed (signal {-event.returncode}): it goes on'),
+            LogInfo(msg=f'{NODE} was killed (signal {-event.returncode}): restarting'),
             TimerAction(period=delay, actions=again),
         ]
 

@@ -18,7 +18,7 @@ WIRE = StreamKey('distance', '', False, True, False)
 NOISE = 5e-5
 STOPS = np.array([[0.0, 0.0], [0.5, -0.4], [1.0, 0.3], [0.2, 0.9], [-0.6, 0.1]])
 MOVE = STAND = 1.0
-REST = 'measurements: of a stop that has its pose already'
+REST = 'measurements: of a stop that already has its pose'
 
 
 def place(joints):

@@ -154,7 +154,7 @@ class Cell:
 
     def in_full(self, answer):
         """Return an answer of ~/identify in full: what stands beside the journal if it was cut."""
-        _, cut, name = answer.message.partition(' ... all of it: ')
+        _, cut, name = answer.message.partition(' ... full text: ')
         folder = self.node._archive.folder
         text = (folder / name).with_suffix('.txt')
         return text.read_text().rstrip() if cut else answer.message

@@ -302,13 +302,13 @@ def test_too_many_devices_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ('content', 'said'),
     [
-        ('q1,x,y,z\n0,1,2,3\n'.encode('utf-16'), 'no text in UTF-8, line 1 has zero bytes'),
-        ('q1,é\n0,1\n'.encode('latin-1'), 'no text in UTF-8: save it as UTF-8'),
+        ('q1,x,y,z\n0,1,2,3\n'.encode('utf-16'), 'not UTF-8 text, line 1 has zero bytes'),
+        ('q1,é\n0,1\n'.encode('latin-1'), 'not UTF-8 text: save it as UTF-8'),
         (
             b'q1,x,y,z\n0,1,2,3\n' + bytes(5000),
             'line 3 has zero bytes: .* Save it as UTF-8$',
         ),
-        (b'q1,x,y,z\n0,1,2,3\n"0,1,2,3\n0,1,2,3\n', 'from line 3: .* quotation marks in pairs'),
+        (b'q1,x,y,z\n0,1,2,3\n"0,1,2,3\n0,1,2,3\n', 'from line 3: .* quotation marks paired'),
     ],
 )
 def test_a_table_that_is_no_text_is_refused_with_what_to_do(tmp_path, content, said):

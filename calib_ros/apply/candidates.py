@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses at which the target can be measured, and the way from one to the next."""
+"""Poses at which the target can be measured, and their visiting order."""
 
 from __future__ import annotations
 
@@ -84,8 +84,8 @@ def draw_candidates(
     while len(found) < count:
         if drawn > tries * count:
             raise InputError(
-                f'the target can be measured at {len(found)} of {drawn} random poses only, '
-                f'{count} candidates are wanted: widen what the device sees (--box, --cone), or '
+                f'the target can be measured at {len(found)} of {drawn} random poses only; '
+                f'{count} candidates are needed: widen what the device sees (--box, --cone), or '
                 'give a file of poses (--candidates)'
             )
         joints = design.chain.random_joints(10 * count, rng)
@@ -180,8 +180,8 @@ def iso_9283_poses(
             cubes, edge = grown, edge * factor
     if not len(cubes.centres):
         raise InputError(
-            'the arm keeps one orientation in no cube of its workspace: choose test poses '
-            'yourself; new ones anywhere will do'
+            'in no cube of its workspace can the arm keep one orientation: choose test poses '
+            'yourself; any new ones will do'
         )
     travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
     best = cubes.select(travel.argmin()[np.newaxis])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which point of a program each measurement belongs to.
+"""The program point to which each measurement belongs.
 
 An arm stands at the joint values of the program if that was not corrected, else at those that the
 correction makes of them. Along a path with points closer than the correction, the corrected ones
@@ -21,7 +21,7 @@ from calib_ros.kinematics.se3 import FloatArray
 def meant(
     nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
 ) -> FloatArray:
-    """Return the commanded joint values (N, n) [rad or m] that measured ones (N, n) stand for.
+    """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
 
     Those are the nearest of the program (M, n), as it is or corrected by the calibration.
 
@@ -36,7 +36,7 @@ def meant(
     if lost.size:
         raise InputError(
             f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from '
-            'the nearest commanded joint values: is it of that program?'
+            'the nearest commanded joint values: does it belong to that program?'
         )
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The correction in the robot's program: joint commands that reach the pose that was meant.
+"""The correction of a program: joint commands that reach the intended pose.
 
 A controller believes the nominal arm N, the real one is the calibrated arm C. A command q means
 the pose N(q) of the flange in the arm's base frame; it is replaced by the q' nearest to it with
@@ -32,7 +32,7 @@ from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
 
 BESIDE = LEVER / 3.0
-"""Distance [m] from the tool at which what a turn does is told: the length of small tools."""
+"""Distance [m] from the tool at which the effect of a turn is reported: a small tool's length."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,10 +44,10 @@ class Compensator(Shown, Limits):
     nominal : Chain
         The arm as the controller believes it, with the limits of its joints.
     calibrated : Chain
-        The arm as identified. Base and tool frames of both are left aside.
+        The arm as identified. Base and tool frames of both are ignored.
     tool : three floats
-        The point [m] in the flange frame whose position counts. It matters for arms that cannot
-        reach every orientation, and for the errors reported.
+        Tool point [m] in the flange frame. It matters for arms that cannot reach every
+        orientation, and for the reported errors.
     region : Region, optional
         Where the calibration may be used; samples elsewhere are refused.
 
@@ -66,7 +66,8 @@ class Compensator(Shown, Limits):
         )
         if ours != theirs:
             raise ConfigError(
-                'the nominal and the calibrated chain must have the same joints in one order, not '
+                'the nominal and the calibrated chain must have the same joints in the same '
+                'order, not '
                 f'{ours} and {theirs}'
             )
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():
@@ -105,7 +106,7 @@ class Compensation(Solution):
     Attributes
     ----------
     command : (N, n)
-        Joint values [rad or m] as the controller believes them.
+        Joint values [rad or m] before correction.
     joints : (N, n)
         The corrected ones; NaN in samples that are refused.
     refusals : tuple of Refusal
@@ -129,15 +130,15 @@ def compensate(
     approach: FloatArray | None = None,
     told: Told = nobody,
 ) -> Compensation:
-    """Correct joint commands (N, n) [rad or m], given in the order in which they are run through.
+    """Correct joint commands (N, n) [rad or m], given in their order of execution.
 
-    `approach` (N, n) holds the signs of the velocities before, for backlash;
-    `told` receives the share done.
+    `approach` (N, n) holds the signs of the preceding velocities, for backlash; `told` receives
+    the share done.
 
     Raises
     ------
     InputError
-        For joint values of the wrong shape or that are not finite.
+        For joint values of the wrong shape, or not finite.
 
     """
     command = np.array(joints, dtype=np.float64)
@@ -175,9 +176,7 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             worst = max(columns, key=lambda k: float(size[k]))
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
-    text += (
-        f'; largest error by the calibration {1e3 * result.position_before[kept].max():.3f} mm, '
-    )
+    text += f'; largest predicted error {1e3 * result.position_before[kept].max():.3f} mm, '
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
     text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
     text += f'{1e3 * result.orientation[kept].max():.3f} mrad'
@@ -185,9 +184,9 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
     if not compensator.follower.complete and turn > turned:
         x, y, z = compensator.tool
         text += (
-            f'; this arm cannot keep every orientation: the position corrected is that of the '
-            f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m from it '
-            f'may be {1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
+            '; this arm cannot keep every orientation: the corrected position is that of the '
+            f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m away may be '
+            f'{1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
         )
     if not compensator.follower.anywhere:
         squares = result.position[kept] ** 2 - result.reachable[kept] ** 2
@@ -265,7 +264,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
             )
         else:
             how = 'remain' if result.converged[k] else 'remain, without convergence'
-            reason = f'{left} {how}: more than is tolerated'
+            reason = f'{left} {how}: more than tolerated'
         found.append(Refusal(k, reason))
     return found
 

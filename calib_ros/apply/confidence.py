@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How sure an RMS error is, and whether it grows from night to night.
+"""Confidence limits of an RMS error, and its growth from night to night.
 
 Limits of an RMS position error over poses like those measured: the sum of squares over K
 configurations with errors e_k is approximated by theta / nu chi2(nu) (Satterthwaite 1946) with
@@ -41,7 +41,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0
-"""So many make limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
+"""With this many, limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
 
 
 def rms_limits(
@@ -163,7 +163,7 @@ def run_length(slope: float, height: float, states: int = 200) -> float:
 
 @cache
 def limit(slope: float, nights: float) -> float:
-    """Return the height that a CUSUM exceeds after so many nights, on average, by chance."""
+    """Return the height that a CUSUM exceeds by chance after so many nights on average."""
 
     def less(height: float) -> float:
         return float(np.log(run_length(slope, height) / nights))

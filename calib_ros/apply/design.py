@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The information that poses would give about the parameters, before any is measured.
+"""The information of poses about the parameters, before they are measured.
 
 A pose adds A^T A to the information M about the parameters, with A (m, P) its rows of the weighted
 Jacobian: 6 by full pose, 3 by position. Neither needs a measured value. With C = M^-1 the
@@ -69,7 +69,7 @@ class Design(Shown):
         """
         kind = problem.kinds[0]
         if kind.distance or problem.separations:
-            raise InputError('planning is for measured poses or positions, not for distances')
+            raise InputError('planning needs measured poses or positions, not distances')
         model = problem.model
         priors = problem.prior_sigmas
         structural = structurally_independent(model, problem.free, problem.kinds)
@@ -165,7 +165,7 @@ def accuracy(design: Design, joints: FloatArray, task: FloatArray) -> FloatArray
 
 
 def predicted(design: Design, task: FloatArray) -> float:
-    """Return the RMS position error [m] at task poses (T, n) predicted by what is known."""
+    """Return the predicted RMS position error [m] at task poses (T, n)."""
     known = triangular(design.known)
     if independent(known, design.names) != design.names:
         return float('inf')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How many poses to measure, which of many candidates, and the accuracy to expect.
+"""Choice of poses to measure, and the accuracy to expect.
 
 A pose with the rows A (m, P) of information (`design.py`) is judged by a matrix of m x m:
 
@@ -227,18 +227,18 @@ class Plan(Shown):
     joints : (K, n)
         Joint values [rad or m], the most informative first.
     visit : (K,)
-        Their order of visit.
+        Visiting order.
     travel : float
-        Time of the moves [s].
+        Time of all moves [s].
     accuracy : (K,)
         Predicted RMS position error [m] with the first 1, 2, ... K of them.
     at_random : (K,)
         The same with candidates taken at random (median of draws).
     efficiency : float or None
-        Lower bound against the best choice of as many candidates; None for o2 to o5 and for too
-        few poses to determine all parameters.
+        Lower bound relative to the best choice of as many candidates; None for o2 to o5 and for
+        too few poses to determine all parameters.
     lacking : tuple of str
-        Parameters that no choice of these candidates would determine; they are left out.
+        Parameters that no choice of these candidates would determine; they are ignored.
 
     """
 
@@ -271,11 +271,11 @@ def plan(
     told: Told = nobody,
     chosen: Index | None = None,
 ) -> Plan:
-    """Plan a number of measurements, and compare them with so many random draws.
+    """Plan a number of measurements, and compare them with random draws.
 
-    `candidates` (N, n) and those of a `task` (M, n) are joint values, `velocities` (n,) their
-    largest rates. `chosen` (K,) are indices that `fewest` found already; `choose` and
-    `visit_order` say what the other arguments mean.
+    `candidates` (N, n) and the `task` (M, n) are joint values, `velocities` (n,) their largest
+    rates. `chosen` (K,) are indices already found by `fewest`; `choose` and `visit_order` describe
+    the other arguments.
     """
     excited = design.determined_by(candidates)
     if chosen is None:
@@ -321,7 +321,7 @@ def fewest(
         raise InputError(
             f'all {len(candidates)} candidates together predict {1e3 * best:.4f} mm, '
             f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
-            'more accurate device (--sigma-position), or want less'
+            'more accurate device (--sigma-position), or a larger --accuracy'
         )
     count = len(excited.names)  # poses determine several parameters each
     while True:
@@ -361,14 +361,14 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
         lines.append(f'{count:6}         - too few poses to determine all parameters')
     text = f'{count} of {candidates} candidates'
     if plan.efficiency is not None:
-        text += f', at least {100.0 * plan.efficiency:.0f} % of what the best choice would bring'
+        text += f', at least {100.0 * plan.efficiency:.0f} % as good as the best choice'
     lines.append(f'{text}; moves take {plan.travel:.0f} s')
     if needed is not None:
         lines.append(f'{needed} poses reach {wanted_mm:g} mm')
     if plan.lacking:
         lines.append(
             f'no choice of these candidates determines {", ".join(plan.lacking)}: move the joints '
-            'further and in more combinations, or fix these parameters. The figures leave out '
-            'what these bring, and hold only where the joints move as in the candidates'
+            'further and in more combinations, or fix these parameters. The figures ignore these '
+            'parameters, and hold only where the joints move as in the candidates'
         )
     return '\n'.join(lines)

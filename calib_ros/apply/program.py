@@ -35,14 +35,14 @@ class Program(Shown):
     Attributes
     ----------
     names : tuple of str
-        Columns of the arrays; other joints than the arm's may be among them.
+        Columns of the arrays; they may include joints outside the arm.
     positions : (N, m)
-        Joint values [rad or m], in the order in which they are run through.
+        Joint values [rad or m], in their order of execution.
     velocities, accelerations : (N, m), optional
         Their derivatives.
     approach : (N, n), optional
-        Signs of the velocities with which the arm's joints come to their values, for backlash.
-        Found from the order of the positions when None.
+        Signs of the velocities with which the arm's joints reach their values, for backlash. Found
+        from the order of the positions if None.
 
     """
 
@@ -64,7 +64,7 @@ def compensate_program(
     Raises
     ------
     InputError, UnknownNameError
-        For a joint of the arm that is missing, and arrays that do not fit the names.
+        For a missing joint of the arm, and arrays that do not fit the names.
 
     """
     columns = _columns(compensator.nominal.joint_names, program)

@@ -22,7 +22,7 @@ from calib_ros.kinematics.se3 import FloatArray
 
 @dataclass(frozen=True)
 class Cell:
-    """How the simulated arm is made, moved and measured: m, rad, s, Hz."""
+    """Make, motion and measurement of the simulated arm: m, rad, s, Hz."""
 
     length_error: float = 5e-4
     angle_error: float = 1e-3
@@ -37,7 +37,7 @@ class Cell:
 def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
     """Return a chain with normally distributed errors, and frames anywhere.
 
-    Only parameters that are no gauge freedoms get errors, so that they can be compared with
+    Only parameters other than gauge freedoms get errors, so that they can be compared with
     identified ones.
     """
     names = [

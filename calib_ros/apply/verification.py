@@ -97,18 +97,18 @@ class Verification(Shown):
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds' or 'does not hold'
         'no verdict' where neither is known.
     needed : int or None
-        Configurations of which the same RMS error would decide, where it is undecided; None where
+        Number of configurations that would decide with the same RMS error, if undecided; None if
         even DECIDING would not.
     common : float
-        Share of the RMS error that is left without one common shift and turn of all positions.
+        Share of the RMS error that remains without one common shift and turn of all positions.
     by_program : bool
-        Whether the poses wanted are those of the program before its correction.
+        Whether the wanted poses are those of the uncorrected program.
     fitted : tuple of str
         Frames that were fitted to the new measurements.
     holds : bool or None
         Whether the error agrees with the one of the calibration (`Calibration.holds`), if known.
     reused : float
-        Share of the measurements that the calibration was fitted to (`Calibration.reused`).
+        Share of the measurements to which the calibration was fitted (`Calibration.reused`).
 
     """
 
@@ -164,24 +164,24 @@ def verify(
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
     tolerance : float, optional
-        Largest RMS position error [m] that will do; without one there is no verdict.
+        Largest acceptable RMS position error [m]; without it there is no verdict.
     confidence : float
         Of the verdict.
     new_base, new_tool : bool
-        The measuring device stands elsewhere than for the calibration; another target is on the
-        flange, or the same was mounted anew. Their frames are fitted, and each takes up the
-        errors of as many configurations, of three freedoms each, as it has freedoms.
+        The measuring device was moved; the target was replaced or remounted. Their frames are
+        fitted, and each absorbs the errors of as many configurations, of three freedoms each, as
+        it has freedoms.
     commanded : (M, n), optional
-        Joint values [rad or m] of the program before its correction: the nominal arm means there
-        what is wanted. Each measurement belongs to one of them (`commanded.py`).
+        Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
+        poses there. Each measurement belongs to one of them (`commanded.py`).
     told : Told
-        Of the share that is done.
+        Receives the share done.
 
     Raises
     ------
     InputError
         For too few poses, distances, a device or target that the calibration does not know, or
-        measurements far from all that was commanded.
+        measurements far from all commands.
 
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
@@ -230,11 +230,11 @@ def _compared(
 
 
 def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
-    """Return the RMS error [m] of configurations, some of which fitted frames took up."""
+    """Return the RMS error [m] of configurations, some of them absorbed by fitted frames."""
     count = len(moments)
     if count - lost < least:
         raise InputError(
-            f'{count} poses were measured, at least {least + lost} are needed: five are '
+            f'{count} poses were measured; at least {least + lost} are needed: five are '
             'usual (calib_ros plan --iso9283)'
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
@@ -258,7 +258,7 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
-    """Refuse limits that are none, and measurements that the calibration says nothing about."""
+    """Refuse invalid limits, and measurements outside what the calibration knows."""
     if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
         raise ConfigError(
             'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
@@ -267,7 +267,7 @@ def _check(
     for each in sets:
         chain.joint_values(each.joints)
         if each.distances is not None or each.socket:
-            raise InputError('to verify, poses or positions must be measured, not distances')
+            raise InputError('verification needs measured poses or positions, not distances')
         if not {each.base, each.tool} <= set(chain.frame_names):
             raise InputError(
                 f'the calibration knows the frames {", ".join(chain.frame_names)}, not '
@@ -275,7 +275,7 @@ def _check(
             )
         if fitted and each.pixels is not None:
             raise InputError(
-                'images do not tell a new place of base or tool: leave both as they were for the '
+                'images cannot locate a new base or tool: leave both as they were for the '
                 'calibration, or measure poses'
             )
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors over the workspace, and where in it a task is done best.
+"""Errors over the workspace, and the best place for a task.
 
 The optimal workspace of a task (Vacarescu et al., abstract) is the placement of its frame with the
 least expected error, the mean or the worst over its poses. A grid search, whose map is the
@@ -45,10 +45,10 @@ class Survey(Shown):
 
     @property
     def parts(self) -> dict[str, FloatArray]:
-        """Return the errors (N,) [m] by their names: only what is removed, if no more is known."""
+        """Return the errors (N,) [m] by name: only the removed ones, if no others are known."""
         found = {'removed by the calibration': self.removed}
         if not np.isnan(self.remaining).any():
-            found |= {'uncertainty of that': self.sigma, 'expected to remain': self.remaining}
+            found |= {'its uncertainty': self.sigma, 'expected to remain': self.remaining}
         return found
 
     @property
@@ -198,7 +198,7 @@ def place(
     drawn: int = 20_000,
     told: Told = nobody,
 ) -> Placements:
-    """Find the placement of a task with the least expected error, mean or worst of its poses.
+    """Find the placement of a task with the smallest expected error, mean or worst of its poses.
 
     Poses (K, 4, 4) of the target are in the task's frame, whose axes are those of the base at
     turn 0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, which

@@ -47,7 +47,7 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
     common.refuse_existing(options, options.out)
     if options.out.exists() and options.out.samefile(options.program):
         raise InputError(
-            '--out is the program itself: keep it, a program compensated twice is wrong'
+            '--out would overwrite the program: keep it, since compensating it twice is wrong'
         )
     nominal = load_chain(options.chain)
     arm = calibration_of(options.calibration, 'compensate --calibration', nominal)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of all commands; nothing here needs what the commands work with.
+"""The options of all commands; importing them loads nothing else.
 
 They are written as their help shows them: groups, and in these a line for each option. Behind its
 name are `!` if it must be given and, unless it is a flag, its placeholder, from which follows the
@@ -28,133 +28,133 @@ TYPES = {
 """By placeholder; of any other a text."""
 FORM = re.compile(r'([^=]*?)([*]\d+|[+?]|)(?:=(.*)|)$')
 """Placeholder or choices, how many values, and the default."""
-CHAIN = 'its name (calib_ros robots), a chain file, or a URDF'
-EARLIER = 'calibration.yaml, or the folder of identify --out'
-FORCE = 'replace what is there already'
-SEED = 'of the random numbers'
-HISTORY = 'file the result there as well, by --serial'
-CALIBRATION = 'folder of identify --out, or calibration.yaml alone'
+CHAIN = 'robot name (calib_ros robots), chain file or URDF'
+EARLIER = 'calibration.yaml, or folder from identify --out'
+FORCE = 'overwrite existing output'
+SEED = 'random seed'
+HISTORY = 'also file the result here, under --serial'
+CALIBRATION = 'folder from identify --out, or a calibration.yaml'
 SIMULATION = f"""\
   --poses N=60  poses to measure
   --seed N=0  {SEED}
-  --storage {'|'.join(STORAGES)}=mcap  of the bag"""
+  --storage {'|'.join(STORAGES)}=mcap  storage format of the bag"""
 MOVED = """\
-  --new-base  the measuring device stands elsewhere now
-  --new-tool  the target is another one, or mounted anew"""
+  --new-base  the measuring device was moved
+  --new-tool  the target was replaced or remounted"""
 LAYOUT = """\
-tables of other systems (docs/tables.md); what is not given is guessed
-  --preset NAME=  a layout by name, or your own .yaml
-  --length UNIT=  of lengths: m, cm, mm, um, in
-  --angle UNIT=  unit of angles, joint values included: rad, deg
-  --joint-angle UNIT=  unit of joint values where it is another one
+tables of other systems (docs/tables.md); anything not given is guessed
+  --preset NAME=  layout: a name, or your own .yaml
+  --length UNIT=  unit of lengths: m, cm, mm, um, in
+  --angle UNIT=  unit of angles, including joint values: rad, deg
+  --joint-angle UNIT=  unit of joint values, if different
   --euler ZYX=  rx ry rz are Euler angles; zyx: fixed axes
-  --quaternion wxyz=  order of qx qy qz qw, else xyzw
-  --separator NAME=  comma, semicolon, tab or space; guessed if not given
+  --quaternion wxyz=  order of the quaternion; default: xyzw
+  --separator NAME=  comma, semicolon, tab or space
   --decimal NAME=  point or comma
-  --sheet NAME=  of a workbook (.xlsx), else its first
-  --joints-preset NAME=  layout of the log --joints
+  --sheet NAME=  sheet of a workbook (.xlsx); default: the first
+  --joints-preset NAME=  layout of the --joints log
   @columns
   --rotation-vector  rx ry rz are a rotation vector
-  --inverse  the poses are those of the device in the target
-  --shift ROWS=0  joint values stand so many rows below their measurement
-  --joints FILE  log of the joint values, row by row"""
-COLUMNS = 'q1=A1,x={Pos X},y=-#3 ...: columns, or expressions of them; q*=A* for all joints'
+  --inverse  poses are of the device in the target frame
+  --shift ROWS=0  joint values are this many rows below their measurement
+  --joints FILE  separate log of joint values, matched row by row"""
+COLUMNS = 'q1=A1,x={Pos X},y=-#3 ...: columns or expressions; q*=A* for all joints'
 REPORT = """\
 for the report
   --operator NAME=  who measured
   --serial NAME=  serial number of the robot
   --device NAME=  measuring device and its serial number"""
-PDF = '  --pdf  report.pdf as well, with a certificate first'
+PDF = '  --pdf  also write report.pdf, starting with a certificate'
 OPTIONS = f"""
 # robots robots._robots
 # chain robots._chain
 which arm
   robot ROBOT  URDF, chain file, or a robot by its name (ur10e, ...)
-  --base-link LINK  of a URDF: where the arm starts, else its root
-  --tip-link LINK  of a URDF: where the arm ends, such as tool0
-  --convention NAME  of the table from a URDF: standard or modified
-  --out FILE  file to write instead
+  --base-link LINK  first link of the arm in a URDF; default: its root
+  --tip-link LINK  last link of the arm in a URDF, such as tool0
+  --convention NAME  DH convention for a URDF: standard or modified
+  --out FILE  write this file instead of printing
 # demo simulate._demo
 what to simulate
   --chain ROBOT=ur10e  {CHAIN}
-  --out FOLDER=demo  what it writes
+  --out FOLDER=demo  output folder
   --force  {FORCE}
 {SIMULATION}
 # simulate simulate._run
 what to simulate
-  bag BAG  folder of the bag to write
+  bag BAG  bag folder to write
   --chain! ROBOT  {CHAIN}
 {SIMULATION}
 # board camera._board
 the board
-  type charuco|markers  markers: a grid of them
+  type charuco|markers  chessboard with markers, or markers alone
   --columns! N  squares or markers across
   --rows! N  squares or markers down
-  --square! M  from one to the next
+  --square! M  side of a square, or marker spacing
   --marker! M  side of a marker
-  --dictionary NAME=DICT_5X5_250  DICT_APRILTAG_36h11, ...
-  --out! FILE  PDF; its YAML is put beside it
+  --dictionary NAME=DICT_5X5_250  marker dictionary of OpenCV
+  --out! FILE  PDF to write, with its YAML beside it
   --force  {FORCE}
 # images camera._images
 what to look at
   images IMAGES  folder of images, or a bag
   --board! FILE  YAML of the board
-  --topic NAME=  of the images in a bag, if there are several
-  --fewest N=6  corners that an image must show
-  --out! FILE  table: image, corner, u, v
+  --topic NAME=  image topic, if a bag has several
+  --fewest N=6  fewest corners an image must show
+  --out! FILE  table to write: image, corner, u, v
   --force  {FORCE}
 # plan plan._run
 what is wanted
   --chain! ROBOT  {CHAIN}
-  --poses N  how many; 25, or what --accuracy needs
+  --poses N  number of poses; default: 25, or as --accuracy needs
   --accuracy MM  wanted RMS position error at the task poses
   --iso9283  the five test poses of ISO 9283 instead
-  --task FILE  CSV q1..qn of where the arm will work; random poses if not given
-  --taken FILE  CSV q1..qn of poses measured already
+  --task FILE  CSV q1..qn of work poses; default: random poses
+  --taken FILE  CSV q1..qn of poses already measured
   --out FILE  CSV q1..qn to write, and its report beside it
   --force  {FORCE}
 poses to choose from
   --candidates FILE  CSV q1..qn of poses to choose from
-  --draw N=2000  random candidates without a file
+  --draw N=2000  random candidates, if no file is given
   --criterion {'|'.join(CRITERIA)}=d  determinant, index, or task error
-  --apart X=0.001  least move of a joint between poses [rad, m]
-  --velocity V+=1  of the joints [rad/s, m/s]
+  --apart X=0.001  smallest joint move between poses [rad, m]
+  --velocity V+=1  joint velocity [rad/s, m/s]
   --seed N=0  {SEED}
 what the device sees
-  --measured pose|position=pose  at each pose
+  --measured pose|position=pose  what is measured at each pose
   --box M*6  measurable region: lower, upper corner
-  --tracker M*3  where the device stands
-  --axis X*3=0,0,1  of the target, to face it
-  --cone DEG=45  between axis and line of sight
-  --world  box and tracker are in the world, not in the base
+  --tracker M*3  position of the device
+  --axis X*3=0,0,1  axis of the target that must face the device
+  --cone DEG=45  largest angle between axis and line of sight
+  --world  box and tracker are in the world frame, not the base frame
 @settings sigma_position sigma_orientation priors model fixed
 {REPORT}
 # fleet fleet._run_fleet
-what to look after
-  plant PLANT  plant.yaml: the robots (docs/fleet.md)
-  --history! DIR  where results are filed; also a URL
-  --out FOLDER  the report: index.html, a page of each robot
-  --metrics FILE  for Prometheus' text collector
+which robots
+  plant PLANT  plant.yaml: list of robots (docs/fleet.md)
+  --history! DIR  folder or URL for the results
+  --out FOLDER  report: index.html, and a page per robot
+  --metrics FILE  file for the Prometheus textfile collector
 who does the work
-  --scheduler ADDRESS=  of a dask cluster: tcp://host:8786
-  --workers N=0  processes here; 0: one a core
-  --memory SIZE=2GiB  of each of these, at most
+  --scheduler ADDRESS=  scheduler of a dask cluster: tcp://host:8786
+  --workers N=0  local processes; 0: one per core
+  --memory SIZE=2GiB  memory limit of each process
 alarms
-  --years N=100.0  between two false alarms of a robot that is measured every night
+  --years N=100.0  years between false alarms of a robot measured every night
 # history fleet._run_history
 what to list
   history DIR  folder or URL of a history
-  --robot SERIAL  this robot only
+  --robot SERIAL  only this robot
 # identify identify._run
 what to read
   measured MEASURED?  a table of measured poses, or a bag: folder, .mcap or .db3
-  --csv FILE  the same for a table of any name
+  --csv FILE  a table, whatever its file name
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session; several joined by commas
-  --eye-in-hand  the poses are those of a fixed target in a camera on the flange
-  --largest-loss SHARE={EXCEPTION}  of the messages of a bag, beyond which the result is not \
-accepted; 1: any
-  --sigma-touch M  of heights over touched planes, 1e-4 if not given
+  --eye-in-hand  poses are of a fixed target, seen by a camera on the flange
+  --largest-loss SHARE={EXCEPTION}  share of a bag's messages that may be lost or unused for \
+the result to be accepted; 1: any
+  --sigma-touch M  standard deviation of heights over touched planes; default: 1e-4
 what to write
   --out FOLDER  calibration, result and report
   --force  {FORCE}
@@ -162,33 +162,33 @@ what to write
   --json  print the result as JSON
   --tolerance MM  wanted RMS position error
 what a camera saw (docs/images.md)
-  --detections FILE  corners of a board, by calib_ros images
+  --detections FILE  board corners from calib_ros images
   --board FILE  YAML of that board
-  --places FILE  table of the arm at each image: image and q1 ... qn; with --chain flange_pose \
-x y z qx qy qz qw of the flange
-  --intrinsics FILE  camera_info, by camera_calibration
-  --lens given|fitted  fit the intrinsics as well; else given
+  --places FILE  table of the arm at each image: image and q1 ... qn; with --chain flange_pose, \
+image and x y z qx qy qz qw of the flange
+  --intrinsics FILE  camera_info file from camera_calibration
+  --lens given|fitted  fitted: fit the intrinsics too; default: given
 @settings
 {LAYOUT}
 {REPORT}
 {PDF}
 an earlier calibration (docs/history.md)
-  --previous CALIBRATION  bring this one up to date by a few poses, and say what has changed since
-  --growth MM={1e3 * GROWTH}  by which lengths wander in a year; angles by twice as many mrad
+  --previous CALIBRATION  update this calibration with a few poses, and report what changed
+  --growth MM={1e3 * GROWTH}  expected drift of lengths in a year; angles: twice as many mrad
 {MOVED}
 # verify verify._run
 what to judge
-  measured MEASURED  new measurements: a bag, or a table with q1..qn as reported, x y z ...
+  measured MEASURED  new measurements: a bag, or a table with reported q1..qn, x y z ...
   --chain! ROBOT  {CHAIN}
   --calibration! RESULT  {CALIBRATION}
-  --commanded FILE  the program before its correction, q1..qn: judge against the poses that it \
-means
+  --commanded FILE  the program before its correction, q1..qn: judge against the poses it \
+intends
   --session NAME  only rows with this name in the column session
 {MOVED}
 how to judge
-  --tolerance MM  wanted RMS position error; if not given: does the calibration still hold?
-  --confidence SHARE=0.95  of the verdict
-  --out FOLDER  the report and the residuals
+  --tolerance MM  wanted RMS position error; without it: does the calibration still hold?
+  --confidence SHARE=0.95  confidence of the verdict
+  --out FOLDER  folder for the report and the residuals
   --force  {FORCE}
   --history DIR  {HISTORY}
 @settings {' '.join(OF_BAGS)}
@@ -197,47 +197,47 @@ how to judge
 {PDF}
 # compare calibrated._compare
 what to compare
-  first FIRST  the earlier one: {EARLIER}
-  second SECOND  the later one: {EARLIER}
+  first FIRST  earlier {EARLIER}
+  second SECOND  later {EARLIER}
   --json  print the difference as JSON
 # compensate calibrated._compensate
 what to correct
   program PROGRAM  .csv with q1 ... qn, or .yaml with a JointTrajectory
   --chain! ROBOT  {CHAIN}
   --calibration! RESULT  {CALIBRATION}
-  --out! FILE  the corrected program
+  --out! FILE  corrected program to write
   --force  {FORCE}
 limits
-  --tool X,Y,Z=0,0,0  point in the flange frame whose position counts [m]
+  --tool X,Y,Z=0,0,0  tool point in the flange frame [m]
   @limits
 # export calibrated._export
 what to export
-  calibration CALIBRATION  calibration.yaml of identify --out
+  calibration CALIBRATION  calibration.yaml from identify --out
   --chain! ROBOT  {CHAIN}
-  --out! FOLDER  all forms
+  --out! FOLDER  folder to write
   --force  {FORCE}
-  --measured FILE  table with q1 ... qn where tables that cannot be exact are to be best; if not \
-given, the whole joint range
+  --measured FILE  table with q1 ... qn where inexact forms must fit best; default: the whole \
+joint range
 for URDF and drivers
-  --urdf FILE  nominal URDF of the robot, to correct as well
-  --base-link LINK  of the URDF: where the arm starts
-  --tip-link LINK  of the URDF: where the arm ends
-  --ur-hash calib_...=  checksum that the driver of Universal Robots prints at its start, for \
+  --urdf FILE  nominal URDF of the robot, to be corrected too
+  --base-link LINK  first link of the arm in the URDF
+  --tip-link LINK  last link of the arm in the URDF
+  --ur-hash calib_...=  checksum that the Universal Robots driver prints at its start, for \
 ur_kinematics.yaml
 # workspace workspace._run
 what to map
-  result RESULT  folder of identify --out, or a calibrated chain file alone
+  result RESULT  folder from identify --out, or a calibrated chain file
   --chain! ROBOT  {CHAIN}
-  --out! FOLDER  tables, words and figures
+  --out! FOLDER  folder for tables, text and figures
   --force  {FORCE}
-  --poses N=20000  random poses of the survey
-  --model {'|'.join(MODELS)}=corrected  by which the arm is commanded
+  --poses N=20000  random poses to survey
+  --model {'|'.join(MODELS)}=corrected  chain that commands the arm
   --seed N=0  {SEED}
 a task to place
-  --task FILE  CSV x y z qx qy qz qw in the frame of a task
-  --joint-box Q+  task: lower, then upper values
-  --aim {'|'.join(AIMS)}=mean  error over the poses of the task
-  --region M*6  for the task, lower, upper corner
+  --task FILE  CSV x y z qx qy qz qw in the task frame
+  --joint-box Q+  joint range of a task: lower, then upper values
+  --aim {'|'.join(AIMS)}=mean  error over the task poses to minimise
+  --region M*6  where the task may be placed: lower, upper corner
   --cells N=9  placements along each axis
   --turns N=1  turns about the vertical to try
 {REPORT}
@@ -250,11 +250,11 @@ what to convert
 @settings {' '.join(OF_BAGS)}
 # csv2bag convert._csv2bag
 what to convert
-  csv TABLE  the table
-  bag BAG  folder of the bag to write
+  csv TABLE  table of measured poses
+  bag BAG  bag folder to write
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session
-  --storage {'|'.join(STORAGES)}=mcap  of the bag
+  --storage {'|'.join(STORAGES)}=mcap  storage format of the bag
 # import convert._convert
 what to convert
   table TABLE  CSV, text in columns, or .xlsx

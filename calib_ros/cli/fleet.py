@@ -66,7 +66,7 @@ def _tidied_up(screen: Screen) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        screen.warn('results so far are filed: the next run does the rest', 'note')
+        screen.warn('results so far are saved; the next run continues', 'note')
         raise
     finally:
         signal.signal(signal.SIGINT, before)

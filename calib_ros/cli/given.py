@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the options given stand for: bags, tables, layouts, histories, reports."""
+"""What the given options mean: bags, tables, layouts, histories, reports."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from calib_ros.report import page
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
-WRITTEN = 'give the folder that identify --out wrote'
+WRITTEN = 'give the folder written by identify --out'
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
@@ -36,7 +36,7 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
         return None
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
     if options.joints_preset and options.joints is None:
-        raise InputError('--joints-preset is of use with --joints FILE only')
+        raise InputError('--joints-preset needs --joints FILE')
     units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
     log = layout_of(options.joints_preset, (), {} if options.joints_preset else units)
     layout = layout_of(options.preset, options.columns, given)
@@ -48,7 +48,7 @@ def history_of(options: argparse.Namespace) -> History | None:
     if options.history is None:
         return None
     if not options.serial:
-        raise InputError('--history files by serial number: give --serial as well')
+        raise InputError('--history files results by serial number: add --serial')
     return History(options.history)
 
 
@@ -58,7 +58,7 @@ def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Ca
     if path.is_dir() and not calibration_file(path).exists():
         if (path / 'result.json').exists():
             raise InputError(
-                f'the result in {path} was not accepted: there is no calibration; '
+                f'the result in {path} was not accepted, so there is no calibration; '
                 f'{path / "report.html"} says why and what to do'
             )
         raise InputError(f'{path} holds no calibration.yaml: {WRITTEN}')
@@ -74,7 +74,7 @@ def filing_of(
     measured: Path,
     *judged_by: object,
 ) -> Filing:
-    """Return what is filed of a result besides the result."""
+    """Return what is filed with a result."""
     settings = settings_hash(nominal, settings_of(options), *judged_by)
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     content = content_hash(
@@ -86,7 +86,7 @@ def filing_of(
 def origin_of(
     options: argparse.Namespace, inputs: Sequence[Path | None], settings: str = ''
 ) -> page.Origin:
-    """Return whence a result comes: the options, and the files that were read."""
+    """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     told = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}

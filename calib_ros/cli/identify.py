@@ -80,7 +80,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     else:
         show(found, screen)
         if options.out is None:
-            screen.bullet('nothing is saved: --out FOLDER writes the calibration and its report')
+            screen.bullet(
+                'nothing was saved: add --out FOLDER to write the calibration and its report'
+            )
         else:
             screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.Status.NOT_ACCEPTED
@@ -150,10 +152,12 @@ def _source(options: argparse.Namespace) -> str:
             options.csv, options.measured = options.measured, None
     source = 'table' if options.csv or options.detections else 'bag'
     if (options.measured is None) == (source == 'bag'):
-        raise InputError('give either a bag, or a table or --detections FILE, or both of these')
+        raise InputError(
+            'give a bag, or a table, or --detections FILE; a table and --detections go together'
+        )
     for name in OF_BAGS if source == 'table' else OF_TABLES:
         if getattr(options, name):
-            raise InputError(f'--{name.replace("_", "-")} is of no use with a {source}')
+            raise InputError(f'--{name.replace("_", "-")} does not apply to a {source}')
     return source
 
 
@@ -164,10 +168,10 @@ def _detected(
     touched: dict[str, Any],
     screen: Screen,
 ) -> Loaded:
-    """Return what is to be fitted of corners of a board, and of a table besides."""
+    """Return what to fit from board corners, and from a table if given."""
     for name in ('board', 'places'):
         if getattr(options, name) is None:
-            raise InputError(f'--detections need --{name} as well')
+            raise InputError(f'--detections needs --{name}')
     board = boards.read_board(options.board)
     found = boards.read_detections(options.detections, board)
     places, posed = boards.read_places(options.places, len(chain.joints))
@@ -251,7 +255,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         if each.steps:
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
-        screen.bullet('What probably follows from it is in the report')
+        screen.bullet('The report lists the likely consequences')
     elif 1.0 < result.noise.position < FAR and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
 

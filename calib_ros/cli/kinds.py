@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What kind of file somebody gives, and which command takes it."""
+"""The kind of a given file, and the commands that accept it."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ SUFFIXES = {
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
 WORDS = {
-    'bag': ('a bag', 'identify and verify take it, bag2csv makes a table of it'),
-    'table': ('a table', 'identify and verify take it, csv2bag makes a bag of it'),
-    'program': ('a program', 'compensate takes it'),
-    'chain': ('a YAML file', 'an arm, for --chain, or a calibration, for --calibration'),
-    'urdf': ('a URDF', 'commands take it as --chain'),
-    'result': ('the result of identify', 'workspace takes it, others as --calibration'),
-    'image': ('an image', 'images takes its folder'),
-    'images': ('a folder of images', 'images takes it'),
-    'report': ('a report', 'open it in a browser or a reader'),
+    'bag': ('a bag', 'use identify or verify, or bag2csv to make a table'),
+    'table': ('a table', 'use identify or verify, or csv2bag to make a bag'),
+    'program': ('a program', 'use compensate'),
+    'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
+    'urdf': ('a URDF', 'give it as --chain'),
+    'result': ('the result of identify', 'use workspace, or give it as --calibration'),
+    'image': ('an image', 'use images on its folder'),
+    'images': ('a folder of images', 'use images'),
+    'report': ('a report', 'open it in a browser or PDF reader'),
 }
 
 
@@ -69,7 +69,7 @@ def proposal(path: Path) -> str | None:
     if not kind:
         return None
     what, where = WORDS[kind]
-    return f'{path} is {what}, no command: {where} (calib_ros COMMAND --help)'
+    return f'{path} is {what}, not a command: {where} (calib_ros COMMAND --help)'
 
 
 def refuse_others(path: Path, command: str, *wanted: str) -> str:

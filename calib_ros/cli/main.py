@@ -29,40 +29,40 @@ from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened
 
 GROUPS = {
     'First steps': {
-        'chain': 'print the chain file of a robot, to read and to edit',
+        'chain': 'print the chain file of a robot, to read or edit',
         'demo': 'simulate an arm, identify it, and compare the result with the truth',
         'robots': 'list the arms that come with calib_ros',
         'simulate': 'write the bag of a simulated robot cell, with the true chain',
     },
     'Before measuring': {
-        'board': 'print a board for cameras, as PDF in its true size',
+        'board': 'make a board for cameras, as a PDF in true size',
         'images': 'find the corners of a board in photographs',
-        'plan': 'choose the poses to measure, and say how accurate they make',
+        'plan': 'choose the poses to measure, and predict the accuracy',
     },
     'Calibrate': {
-        'fleet': 'identify what is new of all robots of a plant, and tell which ones changed',
+        'fleet': 'identify all new recordings of a plant, and report which robots changed',
         'history': 'list results over time',
         'identify': 'identify the errors of an arm from a bag or a table of measured poses',
         'verify': 'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
     },
     'Use the calibration': {
-        'compare': 'test what has changed between two calibrations of one robot',
-        'compensate': 'correct the joint values of a program by a calibration',
-        'export': 'write a calibration in the forms that controllers and others read',
-        'workspace': 'map errors over the workspace, and place a task where they are least',
+        'compare': 'test what changed between two calibrations of one robot',
+        'compensate': 'correct the joint values of a program',
+        'export': 'write a calibration for controllers, drivers and URDF users',
+        'workspace': 'map errors over the workspace, and place a task where they are smallest',
     },
     'Convert files': {
         'bag2csv': 'write the poses of a bag as a table',
         'csv2bag': 'write a table of measured poses as a bag',
-        'import': 'write a table of another system as one of ours',
+        'import': 'convert a table from another system',
     },
 }
 """Commands by the groups of the overview, and what they do."""
 TEXTS = {name: text for group in GROUPS.values() for name, text in group.items()}
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
-    ('calib_ros robots', 'the arms that are known'),
-    ('calib_ros plan --chain ur10e --out plan.csv', 'which poses to measure'),
+    ('calib_ros robots', 'the arms supplied'),
+    ('calib_ros plan --chain ur10e --out plan.csv', 'the poses to measure'),
     ('calib_ros identify measured.csv --chain ur10e --out result/', ''),
     ('calib_ros verify new.csv --chain ur10e --calibration result/', ''),
     ('calib_ros compensate program.csv --chain ur10e --calibration result/ ...', ''),
@@ -86,9 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13
     except KeyboardInterrupt:
-        return _failed('interrupted: no file is left half written', 130)
+        return _failed('interrupted: no half-written file remains', 130)
     except MemoryError:
-        return _failed('there is not enough memory: give less data, or close other programs')
+        return _failed('out of memory: give less data, or close other programs')
     except OSError as err:
         return _failed(trouble(err))
     except CalibrationError as err:
@@ -136,7 +136,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
     """Return what is wrong with a word that a command does not know."""
     if not word.startswith('-'):
-        return f'"{word}" is one too many'
+        return f'unexpected argument "{word}"'
     option = word.partition('=')[0]
     hint = near(
         option, (each for action in parser._actions for each in action.option_strings), 0.7
@@ -180,10 +180,10 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
         added.example = _example(examples_of(name)[0])
         added.set_defaults(home=home, parser=added)
         add_options(added, options)
-        add_more = added.add_argument_group('on the screen').add_argument
-        text = 'only warnings, errors and what is asked for'
+        add_more = added.add_argument_group('output').add_argument
+        text = 'print only warnings, errors and the output asked for'
         add_more('--quiet', action='store_true', help=text)
-        add_more('-h', '--help', action='help', help='this text')
+        add_more('-h', '--help', action='help', help='show this help')
     return parser
 
 
@@ -239,8 +239,8 @@ def _overview() -> str:
         for name, text in entries.items():
             head = f'  {name:12}'
             lines.append(wrapped(text, head, ' ' * 14, help_width()))
-    lines += ['', 'The way:', *(f'  {command:45}{words}'.rstrip() for command, words in WAY)]
-    lines += ['', '`calib_ros COMMAND --help` tells the options of a command, with examples.']
+    lines += ['', 'Typical use:', *(f'  {command:45}{words}'.rstrip() for command, words in WAY)]
+    lines += ['', '`calib_ros COMMAND --help` lists the options of a command, with examples.']
     return '\n'.join(lines)
 
 

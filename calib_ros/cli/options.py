@@ -50,7 +50,7 @@ LAYOUT = (
 
 
 class Status(IntEnum):
-    """Exit status when the input was used but what came out does not do."""
+    """Exit status if the input was used but the outcome is insufficient."""
 
     NOT_ACCEPTED = 3
     INCOMPLETE = 4
@@ -58,7 +58,7 @@ class Status(IntEnum):
 
 
 def complete_robots(prefix: str, **_: Any) -> list[str]:
-    """Return what may be meant by the beginning of the name of a robot or file."""
+    """Return completions of the beginning of a robot or file name."""
     from glob import glob
 
     from calib_ros.kinematics.chain_file import shipped_robots  # loads numpy, no `--help` needs it

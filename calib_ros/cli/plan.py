@@ -27,7 +27,7 @@ from calib_ros.report.advice import ENOUGH
 from calib_ros.report.applied import plan_report
 
 TESTS = (
-    'P1 to P5 of ISO 9283 in a cube of {:.3f} m, one orientation: go to them in turn, 30 times, '
+    'P1 to P5 of ISO 9283 in a cube of {:.3f} m, one orientation: visit them in turn, 30 times, '
     'and measure. Collisions are not checked'
 )
 
@@ -71,7 +71,7 @@ def _measurement(
     rng: np.random.Generator,
     told: Told,
 ) -> tuple[FloatArray, str, Plan]:
-    """Return the poses to measure in the order of visit, what they promise, and the plan."""
+    """Return the poses to measure in visiting order, their predicted accuracy, and the plan."""
     size = len(design.chain.joints)
     if len(options.velocity) not in (1, size):
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
@@ -85,7 +85,9 @@ def _measurement(
         candidates = read_joints(options.candidates, design.chain)
         candidates = candidates[visibility.sees(design, candidates)]
         if not len(candidates):
-            raise InputError(f'the target can be measured at no pose of {options.candidates}')
+            raise InputError(
+                f'the device can measure the target at no pose of {options.candidates}'
+            )
     choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
     needed = chosen = None
     if options.accuracy is not None:
@@ -102,7 +104,7 @@ def _measurement(
 def _check(options: argparse.Namespace) -> None:
     for name in ('poses', 'accuracy', 'candidates', 'task', 'taken'):
         if options.iso9283 and getattr(options, name) is not None:
-            raise InputError(f'--{name} is of no use with --iso9283')
+            raise InputError(f'--{name} does not apply to --iso9283')
     common.at_least(options, poses=1, draw=1, seed=0, apart=0)
     if options.accuracy is not None and not options.accuracy > 0.0:
         raise InputError(f'--accuracy must be positive, not {options.accuracy}')

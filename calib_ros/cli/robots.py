@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros robots | chain`: the arms that are known."""
+"""`calib_ros robots | chain`: the arms supplied."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _robots(options: argparse.Namespace, screen: Screen) -> int:
         lines.append(f'{name:21}{len(chain.joints):6}  {chain.convention:10}{length:6.2f} m')
     screen.data('\n'.join(lines))
     screen.say('')
-    screen.say('calib_ros chain NAME prints one, to read or to edit')
+    screen.say('calib_ros chain NAME prints one, to read or edit')
     return 0
 
 
@@ -50,7 +50,7 @@ def _chain(options: argparse.Namespace, screen: Screen) -> int:
         for key in ('base', 'tool'):
             text += f'# {key}: {json.dumps(frames[key] | {"fixed": True})}\n'
     elif given:
-        raise InputError(f'--{next(iter(given)).replace("_", "-")} is of use with a URDF only')
+        raise InputError(f'--{next(iter(given)).replace("_", "-")} applies only to a URDF')
     else:
         text = dump_chain(load_chain(options.robot))
     if options.out is None:

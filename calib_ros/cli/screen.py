@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a command shows: results on standard output; signs of life and warnings on the other.
+"""Output of a command: results on standard output; progress and warnings on standard error.
 
 On a terminal with rich in colour, with a bar; else plain, in lines of 80 columns. Nothing but
 printable characters leaves it: a topic or a joint may have any name.

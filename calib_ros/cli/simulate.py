@@ -36,9 +36,9 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         bag = folder / 'bag'
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
-        screen.say('2. reading that recording as one of a real cell')
+        screen.say('2. reading the recording as if from a real cell')
         loaded = of_bag(*given.replayed(bag, chain, settings, screen))
-        screen.say('3. identifying the errors from it')
+        screen.say('3. identifying the errors')
         configuration = words.configuration_yaml(options.chain, settings)
         origin = given.origin_of(options, [bag], configuration)
         with screen.work('identifying') as work:

@@ -84,7 +84,7 @@ def show(found: Verification, screen: Screen) -> None:
         'position error': f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm',
         'largest': f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm',
         'orientation error': orientation,
-        f'{100.0 * found.confidence:g} % sure': interval,
+        f'{100.0 * found.confidence:g} % confidence': interval,
         'tolerance': tolerance,
     }
     screen.table(tuple(rows.items()))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros workspace`: how good the arm is where."""
+"""`calib_ros workspace`: errors over the workspace."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
-    """Map, place, print what comes out, and return the files of it."""
+    """Map, place, print the results, and return their files."""
     from calib_ros.report import plots
 
     arm = given.calibration_of(options.result, 'workspace', load_chain(options.chain))

@@ -2,11 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folder in which a node keeps the journals and calibrations of one robot.
 
-A journal has every sample at once, in a table that can be identified by itself. A row is written
-by one call, so that a process that is killed leaves whole rows; a row that a crash of the machine
-cut off is left out when the journal is read again. Rows that cannot be written, because the disk
-is full say, wait in memory until they can be. A sample that is taken back gets a second row,
-marked `removed`; nothing is ever deleted.
+A journal receives every sample at once, as a table that `identify` reads. A row is written by one
+call, so that a process that is killed leaves whole rows; a row that a crash of the machine cut off
+is left out when the journal is read again. Rows that cannot be written, because the disk is full
+say, wait in memory until they can be. A sample that is taken back gets a second row, marked
+`removed`; nothing is ever deleted.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class Journal:
         if plain != found and expected.startswith(plain):
             raise InputError(
                 f'{self.path} was saved by another program (a byte order mark, or lines that end '
-                'in CR LF), so no rows can be added: save it without these, or move it. calib_ros '
-                'identify reads it as it is'
+                'in CR LF), so no rows can be added: save it without these, or move it. '
+                'calib_ros identify can read it'
             )
         if not expected.startswith(found):
             raise InputError(
@@ -140,8 +140,8 @@ class Archive:
                 pass
         except OSError as err:
             raise InputError(
-                f'poses cannot be kept in {folder} ({err.strerror}): set data_dir to a folder '
-                'in which files can be written'
+                f'poses cannot be kept in {folder} ({err.strerror}): set data_dir to a writable '
+                'folder'
             ) from err
         self._path = self._new_path(JOURNAL)
 
@@ -221,8 +221,8 @@ class Archive:
             samples, warnings = read_journal(self._path, self._joints)
         except InputError as err:
             raise InputError(
-                f'{err}. It stays as it is: mend it, move it away to go on with the one before, '
-                'or start without resume to begin another'
+                f'{err}. It is left untouched: repair it, move it away to continue the one '
+                'before, or start without resume to begin another'
             ) from err
         self._journal = Journal(self._path, self._joints)
         return samples, warnings

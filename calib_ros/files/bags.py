@@ -26,12 +26,12 @@ from calib_ros.sampling.topics import Reading, check_joints, choose
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
 
-ALLOW = 'take the rest all the same with --largest-loss'
+ALLOW = 'accept the rest with --largest-loss'
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """What was read of a bag, and warnings about the rest."""
+    """What was read from a bag, and warnings about the rest."""
 
     recorded: int | None  # messages that it should hold; None where that is not known
     read: int  # of these; a message that cannot be decoded was not read
@@ -72,14 +72,14 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
     path : Path or str
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
-        Takes the messages; its settings name topics where the types leave a choice.
+        Receives the messages; its settings name topics if the types are ambiguous.
     told : Told
         Of the share of the messages that are read.
 
     """
     path = Path(path)
     if not (path.is_dir() or path.is_file()):
-        raise InputError(f'there is no bag at {path}: give its folder, or one of its files')
+        raise InputError(f'there is no bag at {path}: give its folder or one of its files')
     session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
     with stored.unpacked_files(path) as folder:
         return _replay(path, folder, session, told)
@@ -187,8 +187,8 @@ def _chosen(
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
             raise InputError(
-                f'the bag does not define {stream.type} of {topic}: record it where that package '
-                'is installed'
+                f'the bag does not define {stream.type} of {topic}: record it on a computer with '
+                'that package'
             )
     _check_joints(session, streams, messages_on, deserialise)
     return streams, deserialise
@@ -219,8 +219,8 @@ def rosbag2() -> Any:
     except ImportError as err:
         raise InputError(
             f'bags need the Python package rosbags, which is not installed ({err}): pip install '
-            'rosbags, in a virtual environment where the system is managed (README, "Bags"); '
-            'tables (--csv) and the node do without'
+            'rosbags, in a virtual environment if Python is managed by the system (README, '
+            '"Bags"); tables (--csv) and the node work without it'
         ) from err
     return rosbag2
 
@@ -254,7 +254,7 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
 
 
 def _decoded(store: Any, data: bytes, kind: str) -> Any:
-    """Return a message; up to 12 bytes may stand behind it, of which the library takes 3.
+    """Return a message; up to 12 bytes may follow it, of which the library accepts 3.
 
     rclpy leaves as many behind lists that are empty where it serialises for a writer of bags.
     """

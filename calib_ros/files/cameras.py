@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that are sources of measurements: from image and CameraInfo messages to corners."""
+"""Cameras as measurement sources: from image and CameraInfo messages to corners."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns: numbers of all rows at once. What is wrong is said with its line."""
+"""A table by columns: numbers of all rows at once. Errors name the line."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Columns:
 
     def _no_number(self, row: int, name: str, text: str = '') -> InputError:
         return InputError(
-            f'{self.where(row, name)} must be a finite number, not {text!r}: mend that row, or '
+            f'{self.where(row, name)} must be a finite number, not {text!r}: correct that row or '
             'leave it out'
         )
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of a CSV: of a regular text, whose cells are cut at separators, or by csv."""
+"""The columns of a CSV: a regular text is cut at separators, any other read by csv."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ class TextColumns(Columns):
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
-    """Return the columns of a CSV with rows, some of which it needs to have."""
+    """Return the columns of a CSV with rows; some columns are required."""
     return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
 
 
@@ -129,14 +129,14 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
 
 
 def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> Columns:
-    """Return the columns of the content of a CSV; refuse what is no table, or is too large.
+    """Return the columns of a CSV's content; refuse anything else, or too large.
 
     `above` are lines of the file before it.
     """
     if (place := data.find(b'\0')) >= 0:
         line = above + 1 + data.count(b'\n', 0, place)
         raise InputError(
-            f'{path} is no text in UTF-8, line {line} has zero bytes: is it damaged? Save it as '
+            f'{path} is not UTF-8 text, line {line} has zero bytes: is it damaged? Save it as '
             'UTF-8'
         )
     if not data.isascii():
@@ -229,7 +229,7 @@ def csv_rows(
             yield (line := reader.line_num), row
     except csv.Error as err:
         raise InputError(
-            f'cannot read {path} from line {line + 1}: {err}: are its quotation marks in pairs?'
+            f'cannot read {path} from line {line + 1}: {err}: are its quotation marks paired?'
         ) from err
 
 
@@ -239,7 +239,7 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
         if any(mark in cell for cell in header):
             raise ColumnsError(
                 f'the cells of {path} are separated by {name}s: save it with commas between cells '
-                f'and points in numbers. Measurements are read as they are with --separator {name}'
+                f'and points in numbers. To read measurements as they are, give --separator {name}'
                 ' (and, where they differ, --decimal comma, --columns, --length, --angle)'
             )
 

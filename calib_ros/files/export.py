@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A corrected chain in the forms that controllers and other software read.
+"""A corrected chain in formats for controllers and other software.
 
     dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta; exact
     dh_standard.yaml, dh_modified.yaml the same as chain files, with base and tool; exact
@@ -221,7 +221,7 @@ def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
 
 
 def head(chain: Chain, what: str, error: float, digest: str) -> str:
-    """Return the line that says what a file is, how far [m] off the arm, and of which table."""
+    """Return the line with a file's kind, its error [m] against the arm, and its table."""
     name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
     return f'# {name}: {what}; metres and radians; {exact}; calibrated table {digest}\n'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a table that others have written to the columns of ours, described in docs/tables.md."""
+"""From a table of another system to our columns, described in docs/tables.md."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Foreign:
         good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
         if not good.all():
             lines = made.lines[~good].tolist()
-            notes.append(f'nothing was measured in {lines_in_words(lines)}: left out')
+            notes.append(f'nothing measured in {lines_in_words(lines)}: skipped')
             made = made.select(good)
         return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 
@@ -249,7 +249,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
 
 
 def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
-    """Return the columns with each measurement beside the joint values so many rows below."""
+    """Return the columns with each measurement beside the joint values some rows below."""
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')

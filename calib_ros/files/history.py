@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Results over time: a Parquet dataset to which rows are added, read by anything that reads one.
+"""Results over time: an append-only Parquet dataset.
 
 A row is a file `robot=SERIAL/KEY.parquet`. KEY is a hash of all that the result depends on: it is
 there once however often and by however many processes it is filed, as a whole or not at all.
@@ -47,7 +47,7 @@ FOLDER, ENDING = 'robot=', '.parquet'
 
 @dataclass(frozen=True)
 class Filing:
-    """What is known of a result besides the result: whose it is, when and from what."""
+    """What is filed with a result: its robot, time and source."""
 
     serial: str
     time: datetime
@@ -127,7 +127,7 @@ def digest(content: object) -> str:
 
 
 def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
-    """Return the hash of all that a result depends on besides the measurements."""
+    """Return the hash of everything but the measurements that a result depends on."""
     return digest([chain_document(nominal), asdict(settings), *more])
 
 
@@ -151,7 +151,7 @@ def is_time(stamp_ns: int) -> bool:
 
 
 def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
-    """Return when the last pose was measured; another time where stamps are no times."""
+    """Return when the last pose was measured; another time if stamps are not times."""
     last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
     if not is_time(last):
         return otherwise or datetime.now(timezone.utc)

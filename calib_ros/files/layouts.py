@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How a table that others have written is laid out, described in docs/tables.md.
+"""Layouts of tables from other systems, described in docs/tables.md.
 
 A layout says which of their columns make ours (q1, x, qw ...), as expressions, in which units, and
 how rotations are written. Presets are layouts in YAML files; a user's own goes by its path.
@@ -41,8 +41,8 @@ WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')
 """Texts that are taken over."""
 NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
 UNREADABLE = (
-    '"{}" is no expression of columns: give names, {{names with blanks}} or numbers of columns '
-    '(#7) with + - * / and brackets'
+    '"{}" is not an expression of columns: give names, {{names with blanks}} or column '
+    'numbers (#7) with + - * / and brackets'
 )
 TOKEN = re.compile(
     r'\s*(?:\{([^{}]+)\}|#([0-9]+)|((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)'
@@ -156,9 +156,9 @@ class Layout:
             )
         ways = [name for name in ('euler', 'quaternion', 'rotation_vector') if getattr(self, name)]
         if len(ways) > 1:
-            raise ConfigError(f'rotations are written one way: give {" or ".join(ways)}')
+            raise ConfigError(f'only one form of rotation is allowed: give {" or ".join(ways)}')
         if self.decimal == ',' and self.cut == ',':
-            raise ConfigError('cells cannot be separated by commas that are decimal ones as well')
+            raise ConfigError('the comma cannot separate both cells and decimals')
         if not isinstance(self.columns, Mapping) or len(self.columns) > MOST_ENTRIES:
             raise ConfigError(
                 '"columns" of a layout must map our columns to expressions of theirs'

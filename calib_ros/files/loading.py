@@ -65,7 +65,7 @@ def replayed(
 
 
 def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
-    """Return what is to be fitted of a bag, of which no more than a share may be lost."""
+    """Return what to fit from a bag, of which only a share may be lost."""
     problem, account = session.problem(), session.account()
     samples = {'recorded': read.recorded, 'read': read.read, **asdict(account)}
     refusals = read.refusals(account, largest_loss)

@@ -53,7 +53,7 @@ class Room:
         self._left = LARGEST_TABLE + 1000 * packed
 
     def take(self, size: int) -> None:
-        """Let so many bytes be unpacked."""
+        """Allow so many bytes to be unpacked."""
         self._left -= size
         if self._left < 0:
             raise InputError('it unpacks to 1000 times its size')

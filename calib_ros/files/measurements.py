@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the rows of a table of measurements say, all rows at once, and by what rules."""
+"""The meaning of the rows of a measurement table, all at once, and their rules."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ class Measurements:
         again = (np.diff(stamps[order]) == 0) & (np.diff(number[order]) == 0)
         for row in np.sort(order[1:][again])[:1].tolist():
             raise InputError(
-                f'{self.path}, line {found.lines[row]}: stamp_ns {stamps[row]} is there already'
+                f'{self.path}, line {found.lines[row]}: stamp_ns {stamps[row]} already exists'
             )
         return found
 
@@ -161,8 +161,8 @@ class Measurements:
             if len(names) > 1:
                 found = ', '.join(f'{name} ({lines_in_words(lines[name])})' for name in names)
                 raise InputError(
-                    f'{self.path}: poses came in different frames: {found}; one is needed: '
-                    'leave out the rows of the others, or give each a device of its own'
+                    f'{self.path}: poses came in different frames: {found}; only one is allowed: '
+                    'leave out the rows of the others, or give each frame its own device'
                 )
 
 
@@ -198,7 +198,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         kinds = ' and '.join(np.array(KINDS)[filled[:, row]])
         raise InputError(
             f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each kind of '
-            'measurement a row of its own'
+            'measurement its own row'
         )
     kind = filled.argmax(axis=0)
     placed = kind == POSE
@@ -297,7 +297,7 @@ def _check_header(columns: Columns, joints: int) -> None:
 def choices(
     columns: Columns, name: str, known: Mapping[str, object], what: str
 ) -> NDArray[np.generic]:
-    """Return what the cells (N,) of a column stand for, of which only some are known."""
+    """Return the meaning of the cells (N,) of a column; only some values are valid."""
     numbers, found = columns.labels(name)
     for k, word in enumerate(found):
         if word not in known:

@@ -61,7 +61,7 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
     for k, i in np.argwhere((np.abs(values) > TWO_TURNS) & free)[:1].tolist():
         raise InputError(
             f'{where(k, i)}{values[k, i]:.6g} is more than two turns of {chain.joint_names[i]}, '
-            'which has no limits: joint values must be in radians; if these are, give the joint '
+            'which has no limits: joint values must be in radians; if they are, give the joint '
             'limits (lower, upper) in the chain file'
         )
 
@@ -162,8 +162,8 @@ def _read_yaml(text: str, where: str) -> ProgramFile:
     for k, point in enumerate(points):
         if not isinstance(point, dict):
             raise InputError(
-                f'{where}, point {k + 1} must be a mapping, not {point!r}; a message that was cut '
-                'short is printed as a whole by ros2 topic echo --full-length'
+                f'{where}, point {k + 1} must be a mapping, not {point!r}; ros2 topic echo '
+                '--full-length prints messages whole'
             )
 
     def text_with(corrected: Program) -> str:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of others as text in columns: files and workbooks, whatever is above their rows.
+"""Tables of other systems as text in columns: files and workbooks, with any head.
 
 What is guessed (the coding, the separator, the decimal sign, the line of the header) is said.
 """
@@ -53,7 +53,7 @@ class Sheet:
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
-    """Read a table of which a layout is known.
+    """Read a table with a known layout.
 
     The header is the first line that has all columns of some `names`; where these are numbers of
     columns only, the first with some of the names `known`.
@@ -65,7 +65,7 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     else:
         text, coding = _text(path)
         if coding:
-            notes.append(f'the text is taken for {coding}')
+            notes.append(f'the text is read as {coding}')
         if '\r' in text:
             text = text.replace('\r\n', '\n').replace('\r', '\n')
         if layout.comment:
@@ -126,8 +126,10 @@ def _text(path: Path) -> tuple[str, str]:
     with suppress(UnicodeDecodeError):
         return data.decode('utf-8-sig'), ''
     if b'\0' in data:
-        raise InputError(f'cannot read {path}: it is no text, and no workbook by its name (.xlsx)')
-    return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is no UTF-8'
+        raise InputError(
+            f'cannot read {path}: it is not text, and not a workbook by its name (.xlsx)'
+        )
+    return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is not UTF-8'
 
 
 def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
@@ -250,7 +252,7 @@ def _first(
                 left = lines_in_words([line for line, _ in rows[at + 1 : k]])
                 notes.append(f'there are no numbers in {left}: left out')
             return k
-    raise InputError(f'{path} has no rows of numbers in the columns that are named')
+    raise InputError(f'{path} has no rows of numbers in the columns named')
 
 
 def _is_number(cell: str, decimal: str) -> bool:

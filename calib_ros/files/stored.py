@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The messages that are stored in a recording.
+"""The messages stored in a recording.
 
 An intact one is read by its index. A damaged one, cut off or never closed by its recorder, has
 none, so its files are read from their beginning up to the damage. So are those that the library,

@@ -68,7 +68,7 @@ def read_table(
     foreign: Foreign | None = None,
     told: Told = nobody,
 ) -> Table:
-    """Read a CSV, or a table in any other layout.
+    """Read a CSV table, or one in any other layout.
 
     Parameters
     ----------
@@ -77,21 +77,21 @@ def read_table(
     joints : int
         Number of joints.
     sessions : sequence of str
-        Sessions to read; each but the first gets a base and a tool frame of its own.
+        Sessions to read; each after the first gets its own base and tool frames.
     sigmas : (float, float)
         Standard deviations [m, rad] of poses seen by a camera on the flange.
     eye_in_hand : bool
-        All poses are those of a fixed target in a camera on the flange.
+        All poses are of a fixed target in a camera on the flange.
     foreign : Foreign, optional
-        How to read a table that others have written.
+        How to read a table from another system.
     told : Told
         Of the share that is read.
 
     Raises
     ------
     InputError
-        For a missing column, a value that is no number, several sessions to choose from, or
-        measurements of one device in different frames. The message names the line.
+        For a missing column, a value that is not a number, an ambiguous session, or measurements
+        of one device in different frames. The message names the line.
 
     """
     path = Path(path)
@@ -148,7 +148,7 @@ def _table(
     made = made.kept()
     made.check_frames()
     if made.test.all():
-        raise InputError(f'{made.path} has no rows to fit, only such that are marked test')
+        raise InputError(f'{made.path} has no rows to fit, only rows marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
     frames = Frames()
@@ -176,13 +176,13 @@ def check_table(made: MadeColumns) -> None:
     if not joints:
         raise InputError(
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
-            'chain whose joints they are called like (--chain), or their own table (--joints)'
+            'chain with those joint names (--chain), or their separate table (--joints)'
         )
     table_of(made, joints, tuple(dict.fromkeys(made.words.get('session', ()))))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-    """Return the samples of a journal, of which there may be none, and warnings."""
+    """Return the samples of a journal, possibly none, and warnings."""
     found = _of_journal(path, joints)
     if found is None:  # cut off, or a table
         data, warnings = _read(path, columns(joints))
@@ -196,8 +196,8 @@ def _of_journal(
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
     """Return the rows of a journal, None without any, and warnings; None for other files.
 
-    What a node wrote may be of any length, for its samples were in memory before: it is read by
-    parts, and what is no journal is refused at its first part.
+    A node's journal may be of any length, since its samples were in memory before: it is read in
+    parts, and any other file is refused at its first part.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
     parts: list[Measurements] = []
@@ -214,7 +214,7 @@ def _of_journal(
                     parts.append(measurements(found, joints))
                     lines += whole.count(b'\n') + 1
                 if len(rest) > LARGEST_TEXT:
-                    raise InputError(f'{path}, line {lines + 1} has no end: is it a journal?')
+                    raise InputError(f'{path}, line {lines + 1} is incomplete: is it a journal?')
                 told(min(file.tell() / size, 1.0))
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
@@ -326,7 +326,7 @@ def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
 
 
 def _cut_off(path: Path, line: int) -> str:
-    return f'{path}: line {line} was cut off and is left out'
+    return f'{path}: line {line} was cut off and is ignored'
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations, and standard deviations, as others write them: quaternions and covariances of them.
+"""Rotations and standard deviations of other systems, as quaternions and covariances.
 
 XYZ are turns about the axes as turned before, R = Rx(r1) Ry(r2) Rz(r3); xyz about fixed ones,
 which is ZYX in the other order. Standard deviations s of Euler angles make the covariance
@@ -91,7 +91,7 @@ def _rotations(
         return se3.exp_rotation(angles), np.asarray(left)
     if not layout.euler:
         raise ConfigError(
-            f'{made.path} has {called}: say what they are, --euler XYZ (or ZYX, '
+            f'{made.path} has {called}: say which, --euler XYZ (or ZYX, '
             'zyx, ...) or --rotation-vector'
         )
     return _from_euler(angles, layout.euler, names)

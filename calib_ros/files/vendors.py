@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics files of vendors' own descriptions, so that these make the corrected arm.
+"""Kinematics files with which vendors' own descriptions give the corrected arm.
 
     ur_kinematics.yaml      kinematics_params_file of ur_description and the UR driver
     franka_kinematics.yaml  kinematics.yaml of a robot of franka_description
@@ -113,7 +113,7 @@ def vendor_files(
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(
-            f'"{checksum}" is no checksum of Universal Robots: the driver prints it at its start '
+            f'"{checksum}" is not a Universal Robots checksum: the driver prints it at its start '
             'as calib_ and digits'
         )
     found = []

@@ -51,15 +51,15 @@ def refusals(
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
     if validation is None:
-        text = 'too few poses to leave some out of the fit and test the result on them'
+        text = 'too few poses to hold some out and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
     share = validation.outliers / len(validation.judged)
     if share > MOST_OUTLIERS:
         if result.step is not None and not result.step.harmful:
             failed.append(result.step.reason)
         text = (
-            f'{100.0 * share:.0f} % of the poses to judge on are outliers: what is measured there '
-            'and what is predicted do not belong together'
+            f'{100.0 * share:.0f} % of the judged poses are outliers: their measurements and '
+            'predictions do not belong together'
         )
         return (*failed, Reason(Rule.OUTLIERS, text))
     gained = _of_the_gain(problem, result, validation, sized)
@@ -85,7 +85,7 @@ def _of_the_fit(
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
-        text = f'{", ".join(far)} off, more than a faulty robot of this kind can be'
+        text = f'{", ".join(far)} off, more than even a faulty robot of this kind'
         yield Reason(Rule.COMMON_SENSE, text)
 
 
@@ -105,7 +105,7 @@ def _of_the_gain(
     if after.rms_mm > 1e3 * problem.largest_error:
         yield Reason(
             Rule.LARGEST_ERROR,
-            f'RMS {after.rms_mm:.1f} mm is left on held-out poses, more than '
+            f'RMS {after.rms_mm:.1f} mm remains on held-out poses, more than '
             f'{1e3 * problem.largest_error:g} mm (largest_error)',
         )
     judged = validation.deciding
@@ -132,8 +132,8 @@ def _of_the_gain(
         )
         if not sized:
             text += (
-                '; measure what tells how large the arm is: positions, or two sockets a known '
-                'distance apart'
+                '; measure something that fixes the size of the arm: positions, or two sockets a '
+                'known distance apart'
             )
         yield Reason(Rule.REGION, text)
 
@@ -152,7 +152,7 @@ def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
                 f'{second.mean_mm:.3f} mm)',
             )
     if may_be_rounding:
-        text = 'the improvement may only come from rounded joint values, alike in many poses'
+        text = 'the improvement may only come from rounded joint values that repeat in many poses'
         yield Reason(Rule.ROUNDING, text)
     before, after = validation.figures
     if after.rms_mrad is not None:

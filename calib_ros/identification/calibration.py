@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A calibration, saved and loaded whole: a chain file with a record of where it comes from.
+"""A calibration, saved and loaded whole: a chain file with a record of its origin.
 
 What it removes at q is the distance between the nominal arm, in fitted frames, and the calibrated
 one. What remains is predicted by the expected squares C of the parameters' errors, with J the rows
@@ -50,7 +50,7 @@ HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expect
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Shown):
-    """A corrected chain, what it was before, and how well it is known; None for what is not."""
+    """A corrected chain, its nominal chain, and how well it is known; None where unknown."""
 
     chain: Chain
     before: Chain
@@ -70,9 +70,9 @@ class Calibration(Shown):
     world_frame: str = ''
     """Frame in which the poses were measured."""
     owners: Mapping[str, records.Owner] = field(default_factory=dict)
-    """Which session, device or target each frame is of (`sampling.sample.Frames`)."""
+    """Session, device or target of each frame (`sampling.sample.Frames`)."""
     record: Mapping[str, Any] = field(default_factory=dict)
-    """Where the numbers come from, as the file says it, but for the covariance and the rows."""
+    """Where the numbers come from, as in the file, without covariance and rows."""
     rows: records.Fingerprint | None = None
     """Of the measurements that were fitted."""
 
@@ -84,7 +84,7 @@ class Calibration(Shown):
         owners: Mapping[str, records.Owner] | None = None,
         fitted: Sequence[Observations] = (),
     ) -> Calibration:
-        """Return that of an identification; `origin` tells of its samples, those `fitted`."""
+        """Return the calibration of an identification; `origin` describes the `fitted` samples."""
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # one that was loaded knows the same
@@ -119,7 +119,7 @@ class Calibration(Shown):
         )
 
     def dump(self) -> str:
-        """Return it as the text of a chain file, which can be an input again."""
+        """Return the text of a chain file, which can be used as input."""
         record = dict(self.record)
         if self.covariance is not None:
             record['covariance'] = {
@@ -139,16 +139,16 @@ class Calibration(Shown):
         return norms(shift), norms(turn)
 
     def sigma(self, joints: FloatArray) -> FloatArray:
-        """Return the standard deviation (N,) [m] of predicted positions; NaN if not known.
+        """Return the standard deviation (N,) [m] of predicted positions; NaN if unknown.
 
-        With the region it is the expected error, effects that are not modelled included.
+        With a region it is the expected error, unmodelled effects included.
         """
         if self.region is not None:
             return self.region.sigma(joints)
         return self._sigma(joints, slice(3))
 
     def sigma_turned(self, joints: FloatArray) -> FloatArray:
-        """Return the standard deviation (N,) [rad] of orientations; NaN if not known."""
+        """Return the standard deviation (N,) [rad] of orientations; NaN if unknown."""
         return self._sigma(joints, slice(3, 6))
 
     def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
@@ -157,7 +157,7 @@ class Calibration(Shown):
         return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
 
     def remaining(self, joints: FloatArray) -> FloatArray:
-        """Return the error (N,) [m] expected to remain at (N, n); NaN if not known."""
+        """Return the error (N,) [m] expected to remain at (N, n); NaN if unknown."""
         return np.hypot(self.sigma(joints), self.residual or 0.0)
 
     def expected(self, joints: FloatArray, model: Model) -> FloatArray:
@@ -169,8 +169,8 @@ class Calibration(Shown):
             return np.hypot(np.nan_to_num(left, nan=self.residual or 0.0), self.removed(joints)[0])
         if np.isnan(left).any():
             raise ConfigError(
-                'what remains after the correction cannot be predicted from a chain alone: give '
-                'the calibration.yaml of an identification, or ask for the nominal model'
+                'a chain alone does not predict the error after correction: give the '
+                'calibration.yaml of an identification, or use the nominal model'
             )
         return left
 
@@ -179,7 +179,7 @@ class Calibration(Shown):
         return None if self.residual is None else rms <= ALIKE * self.residual
 
     def reused(self, sets: Sequence[Observations]) -> float:
-        """Return the share of measurements that it was fitted to, as far as that is known."""
+        """Return the share of measurements to which it was fitted, as far as known."""
         return 0.0 if self.rows is None else self.rows.share(sets)
 
     def commanded_by(self, model: Model) -> Chain:
@@ -187,7 +187,7 @@ class Calibration(Shown):
         return self.chain if model == 'corrected' else self.before
 
     def knowledge(self, joints: FloatArray, turned: FloatArray) -> tuple[str, str]:
-        """Return how well a program at (N, n) is known, and a warning where that is not enough.
+        """Return how well the poses of a program at (N, n) are known, and a warning if not enough.
 
         `turned` (N,) [rad] are the errors of orientation to correct. Both are empty where the
         covariance is not known, or nothing is to be warned about.
@@ -203,8 +203,8 @@ class Calibration(Shown):
             return words, ''
         return words, (
             'the calibration does not know the orientation well enough to correct it; positions '
-            'hold near the measured target only. Measure orientations as well, or a target '
-            'further off the last axis'
+            'hold only near the measured target. Measure orientations too, or a target further '
+            'from the last axis'
         )
 
 
@@ -232,7 +232,7 @@ def calibration_file(path: str | os.PathLike[str]) -> Path:
 def load_calibration(
     path: str | os.PathLike[str], nominal: Chain | None = None, settings: Settings | None = None
 ) -> Calibration:
-    """Read a calibration: its file, or the folder of an identification (`parse_calibration`)."""
+    """Read a calibration from its file or an identification's folder (`parse_calibration`)."""
     file = calibration_file(path)
     return parse_calibration(read_text(file), str(file), nominal, settings)
 
@@ -242,18 +242,18 @@ def parse_calibration(
 ) -> Calibration:
     """Turn the text of a calibration into what it says; `where` names it in errors.
 
-    A correction by the wrong chain moves the arm anywhere. So the record must be there, as in
-    all that calib_ros writes, and must not speak against a nominal chain that is given; nor may
-    the numbers be further from it than `largest_length` and `largest_angle` of the settings allow.
-    Without settings the identification has judged that, if it records the numbers of this chain.
-    Without a nominal chain that of the record is taken; without its frames those that bring it
-    closest to the corrected one.
+    A correction by the wrong chain moves the arm anywhere. So the record must be present, as in
+    all files of calib_ros, and must agree with a given nominal chain; nor may the numbers differ
+    from it by more than `largest_length` and `largest_angle` of the settings. Without settings the
+    identification has judged that, if it records the numbers of this chain. Without a nominal
+    chain the recorded one is used; without its frames, those that bring it closest to the
+    corrected one.
 
     Raises
     ------
     ConfigError
-        When the text is no chain file, a chain without a record, or a calibration that was not
-        accepted, or that was identified from another nominal chain.
+        If the text is not a chain file, has no record, or is a calibration that was not accepted
+        or was identified from another nominal chain.
 
     """
     chain = parse_chain(text, where)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which few parameters of an arm have changed.
+"""Search for the few parameters of an arm that have changed.
 
 The information about the change x of all parameters is a normal likelihood with the information
 matrix A and the vector b = A x^ (A may be singular: some poses determine only some parameters).
@@ -89,7 +89,7 @@ def reason_in_words(reasons: Sequence[Explanation]) -> str:
     text = f'changed: {first.in_words()}'
     if others:
         named = ' or '.join(each.in_words() for each in others)
-        text += f', which cannot be told apart from {named}'
+        text += f', indistinguishable from {named}'
     return text
 
 

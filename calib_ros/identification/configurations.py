@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which joint values are one stop, and which are one configuration."""
+"""Grouping of joint values into stops and configurations."""
 
 from __future__ import annotations
 

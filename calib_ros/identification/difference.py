@@ -42,14 +42,14 @@ from calib_ros.shown import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Difference(Shown):
-    """The second of two calibrations less the first.
+    """The second of two calibrations minus the first.
 
     P parameters of the arm, `names`, differ by `change` (P,) with standard deviations `sigma` (P,)
-    [m, rad]. `chance` is the probability of so large a difference by the noise of both, `beyond`
-    with what devices do and models lack as well. Predicted positions differ by `rms` [m] over the
-    joint range in the best frames, by `limit` [m] at most (95 %); no parameters of the first model
-    can follow `left` [m] of it. `changed` is what has changed, each with what cannot be told apart
-    from it, `unexplained` the probability of what these leave.
+    [m, rad]. `chance` is the probability of such a difference from the noise of both, `beyond`
+    also from device errors and unmodelled effects. Predicted positions differ by `rms` [m] over
+    the joint range in the best frames, by `limit` [m] at most (95 %); no parameters of the first
+    model can follow `left` [m] of it. `changed` lists the changes, each with those
+    indistinguishable from it; `unexplained` is the probability of the remaining difference.
     """
 
     names: tuple[Parameter, ...]
@@ -65,25 +65,24 @@ class Difference(Shown):
 
     @property
     def same(self) -> bool:
-        """Tell whether nothing has changed as far as is known."""
+        """Tell whether no change was detected."""
         return self.chance > changes.FALSE and not self.changed
 
     def in_words(self) -> str:
-        """Return what is different."""
+        """Return the difference in words."""
         if self.same:
             return f'unchanged within {1e3 * self.limit:.3f} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
         size = f'{rms:.3f} mm RMS over the joint range (at most {limit:.3f} mm)'
         if self.beyond > changes.FALSE:
             return (
-                f'different by {size}, which noise does not explain, but smooth errors of the '
-                'device or what the models lack may: measure the same poses from the same place '
-                'to tell'
+                f'different by {size}: not noise, but perhaps smooth device errors or what the '
+                'models lack; to find out, measure the same poses from the same place'
             )
         if self.changed and self.unexplained > changes.FALSE:
             reasons = '; '.join(changes.reason_in_words(each) for each in self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
-        return f'many parameters are different, by {size}: identify anew, and look at the robot'
+        return f'many parameters differ, by {size}: identify again, and inspect the robot'
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values; lengths of predictions in mm."""
@@ -117,27 +116,27 @@ def _rows_in_words(chain: Chain) -> str:
 
 
 def difference(first: Calibration, second: Calibration) -> Difference:
-    """Return what is different in the second of two calibrations of one robot.
+    """Compare two calibrations of one robot.
 
     Raises
     ------
     InputError
-        When they are of other joints, or hold no covariance.
+        If they have different joints, or no covariance.
 
     """
     arms = first.chain, second.chain
     ours, theirs = map(_rows_in_words, arms)
     if ours != theirs:
-        raise InputError(f'the joints {ours} and {theirs} are of other robots')
+        raise InputError(f'the joints {ours} and {theirs} belong to different robots')
     names, chain, change, left = _in_parameters_of(first, second)
     if not names:
-        raise InputError('the calibrations have fitted no parameter of the arm')
+        raise InputError('neither calibration fitted a parameter of the arm')
     square, lacking = np.zeros((2, len(names), len(names)))
     for number, each in enumerate((first, second), 1):
         if each.covariance is None:
             raise InputError(
-                f'calibration {number} does not hold the covariance of its parameters: '
-                'identify it again with this version'
+                f'calibration {number} has no parameter covariance: identify it again with this '
+                'version'
             )
         own = whole = _in_names(each.chain, names, each.names, each.covariance)
         region = each.region

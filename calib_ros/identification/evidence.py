@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The typical size of the errors of this arm, estimated from its own data (empirical Bayes).
+"""The typical size of this arm's errors, estimated from its own data (empirical Bayes).
 
 Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there, and
 the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm have normal

@@ -267,7 +267,7 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
     rows = configurations = 0
     for each, kind in zip(problem.sets, problem.kinds, strict=True):
         if not len(each):
-            raise InputError(f'there are no pairs to fit between {each.base} and {each.tool}')
+            raise InputError(f'no pairs to fit between {each.base} and {each.tool}')
         count = int(each.configurations.max()) + 1
         rows += count * kind.rows
         configurations += count

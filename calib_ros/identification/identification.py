@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From matched pairs to the errors of the chain's parameters: Problem -> Identification.
 
-The steps of `identify` are those of Vacarescu et al., section 3: measure, write the pose errors
-as a linear model of the parameter errors, solve by least squares, correct the parameters, and
-repeat until the step vanishes. Around it stand what makes the result trustworthy: frames that
-need no guess, gauge freedoms found and named, and a judgement on poses that were not fitted.
+The steps of `identify` are those of Vacarescu et al., section 3: measure, write the pose errors as
+a linear model of the parameter errors, solve by least squares, correct the parameters, and repeat
+until the step vanishes. The rest makes the result trustworthy: frames without an initial guess,
+gauge freedoms found and named, and a judgement on poses that were not fitted.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ def identify(
 ) -> Identification:
     """Identify the parameters of a chain from matched pairs.
 
-    With the result of a `simpler` model, without effects, no sample that it explains is taken for
-    a gross error: else a rich model could leave out what contradicts it.
+    Given the result of a `simpler` model, without effects, no sample that it explains is set aside
+    as a gross error: otherwise a rich model could leave out what contradicts it.
 
     Raises
     ------
     TooFewObservationsError
         With fewer equations than parameters.
     InputError
-        When the fit runs away, with the mistake that explains it, if one does.
+        If the fit diverges; the message names the mistake that explains it, if any.
 
     """
     try:
@@ -58,8 +58,8 @@ def identify(
         if found := mistakes.explained(problem):
             raise InputError(f'the measurements do not fit the arm at all: {found}') from err
         raise InputError(
-            'the fit found no stable answer: check the arm, its joint values and the units, or '
-            'measure more poses all over the workspace'
+            'the fit found no stable solution: check the arm, joint values and units, or measure '
+            'more poses all over the workspace'
         ) from err
 
 

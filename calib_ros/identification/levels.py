@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How sure claims are, in three steps, and what chance explains."""
+"""Confidence of claims, in three levels, and what chance explains."""
 
 from __future__ import annotations
 

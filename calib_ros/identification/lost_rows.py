@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A row that is missing in one of two tables put side by side: from there on no pair is one.
+"""A row missing from one of two tables put side by side: later rows are mismatched.
 
 Base and tool are known from the pairs of a third of the session, the first or the last. By these
 each measurement i is held against the joint values i + s, for small shifts s: before a row k the
@@ -55,8 +55,8 @@ class Loss:
         count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
         where = f'from pose {self.row + 1} on' if late else f'before pose {self.row + 1}'
         return (
-            f'{where} the joint values stand {count} {"below" if rows > 0 else "above"} the '
-            'measurement that they belong to'
+            f'{where} the joint values stand {count} {"below" if rows > 0 else "above"} their '
+            'measurement'
         )
 
 
@@ -102,7 +102,7 @@ def _paired(seen: Observations, rows: NDArray[np.intp], shift: int) -> Observati
 
 
 def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> FloatArray:
-    """Return (N,) the errors [m] of each measurement at joint values so many rows below."""
+    """Return (N,) the errors [m] of each measurement at joint values some rows below."""
     rows = np.arange(len(seen))
     inside = (rows + shift >= 0) & (rows + shift < len(seen))
     found = np.full(len(seen), np.inf)

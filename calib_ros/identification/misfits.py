@@ -29,8 +29,8 @@ LEAST_STOPS = SOME_POSES // 4
 """Stops from which on outliers are compared with the values of joints: along a path
 half as many make a false alarm twice as likely, 1.5 instead of 0.7 %."""
 ADVICE = (
-    'what a device does wrong knows nothing of the joints, the arm does what the model lacks. Look'
-    ' for effects (model auto), or fit them with the others (loss none)'
+    'device errors do not depend on joint values, so the arm has an effect that the model lacks. '
+    'Look for effects (model auto), or fit these poses too (loss none)'
 )
 
 
@@ -66,14 +66,14 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
     left = np.ptp(joints[kept], axis=0) if kept.any() else 0.0 * whole
     for name, part, all_of_it in zip(problem.chain.joint_names, left, whole, strict=True):
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
-            return f'{name} moves only in poses that were taken for gross errors: {ADVICE}'
+            return f'{name} moves only in poses set aside as gross errors: {ADVICE}'
     shared, by_chance = _shared(problem, robust)
     if shared > 1 and by_chance < 1.0 - CERTAIN:
-        return f'at {shared} stops all targets were taken for gross errors: {ADVICE}'
+        return f'at {shared} stops all targets were set aside as gross errors: {ADVICE}'
     order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
     joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
     if by_chance < 1.0 - SURE:
-        return f'poses that were taken for gross errors go with the values of {joint}: {ADVICE}'
+        return f'the poses set aside as gross errors depend on {joint}: {ADVICE}'
     return None
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rotations that were read by another convention than they were written in.
+"""Rotations read in another convention than they were written in.
 
 A rotation matrix gives back the angles that it was made of, in each order of axes that may have
 been read; from these follows the rotation that was meant. Two triples of angles make the same

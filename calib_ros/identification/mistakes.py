@@ -189,7 +189,7 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) ->
     found = lost(_moved(problem, sets[0], 0), framed, _errors, _largest(problem))
     if found is None or found.error > NEARER * given.error:
         return None
-    remedy = 'is a row missing, or there twice, in one of two tables? Mend that'
+    remedy = 'is a row missing or duplicated in one of two tables? Correct it'
     return Explained((Suspect(found.what, remedy),), given.error, found.error)
 
 
@@ -215,7 +215,7 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
 
 
 def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
-    """Return mistakes that were made at once, each of which explains a part of the errors.
+    """Return mistakes made at once, each of which explains part of the errors.
 
     The best few are kept and another one is added to each, until the arm explains the rest, or
     one more is no better. One alone may be no better: two can hide each other.
@@ -358,7 +358,7 @@ def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
-    """Return each measurement with the joint values so many rows below, held-out rows included."""
+    """Return each measurement with the joint values some rows below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
     parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')

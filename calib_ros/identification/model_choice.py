@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which non-geometric effects pay for themselves, by cross-validation (`linear_model.py`).
+"""Choice of non-geometric effects by cross-validation (`linear_model.py`).
 
 Groups of effects are added one by one, the best first, as long as the position error on left-out
 configurations falls by more than chance explains, and as long as they explain more of the
 residuals than of time-shifted ones (`drift.py`), which rules out drift. Then the spectrum of the
 remaining residuals is searched, joint by joint, for gear harmonics: the strongest one is added
-while it pays, and all of them if many explain something.
+while it reduces the error, and all of them if many explain something.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ from calib_ros.progress import Told, nobody, share_of
 
 
 def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:
-    """Identify with the errors that `model` names; `auto` chooses by cross-validation.
+    """Identify with the errors named by `model`; `auto` chooses them by cross-validation.
 
-    A choice that cannot be fitted, or is refused where the geometric result is not, leaves that
-    one, with the verdicts and a remark. What `progress` raises ends the work.
+    If the choice cannot be fitted, or is refused although the geometric result is not, the
+    geometric result is returned with the verdicts and a remark. An exception from `progress` ends
+    the work.
     """
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
@@ -62,7 +63,7 @@ def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Ide
 def _chosen(
     problem: Problem, geometric: Identification, progress: Told
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
-    """Return the effects that pay for themselves, and the verdicts on all that were tried."""
+    """Return the effects that reduce the held-out error, and the verdicts on all tried."""
     progress('effects')
     model = LinearModel(problem, geometric)
     chosen: list[str] = []

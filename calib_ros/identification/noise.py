@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How large the noise is, which pairs share it, and what follows for the parameters."""
+"""The size of the noise, which pairs share it, and the effect on the parameters."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ A convention, of which other counts are multiples."""
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Observations(Shown):
-    """N matched pairs of joint values and measured poses, in the order of their stamps.
+    """N matched pairs of joint values and measured poses, in stamp order.
 
     Parameters
     ----------
@@ -48,32 +48,32 @@ class Observations(Shown):
         True where the orientation was measured; elsewhere the rotation is the identity.
     covariance : (N, 6, 6), optional
         Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
-        PoseWithCovariance; NaN rows where the measurement brought none.
+        PoseWithCovariance; NaN rows where there is none.
     approach : (N, n), optional
-        Signs of the velocities with which the joints came to their values, for backlash.
+        Signs of the velocities with which the joints reached their values, for backlash.
     distances : (N,), optional
         Distances [m] from the origin of the world to the target, for draw-wires and ball-bars.
-        Positions and rotations count for nothing then.
+        Positions and rotations are then ignored.
     plane : bool
-        The distances are heights over the plane z = 0 of the world: zero where it was touched.
+        The distances are heights over the plane z = 0 of the world, zero where touched.
     velocity, acceleration : (N, n), optional
         Of the joints, where the arm was moving when it was measured.
     delay : (N,), optional
         How much earlier than the stamps the joints had these values [s].
     base, tool : str
-        Frames of the chain that hold for these pairs.
+        Frames of the chain for these pairs.
     socket : bool
-        The target, a ball, sat in a socket of unknown place: it was at the origin of the world all
-        the time, and the world's axes are those of the arm's base.
+        The target, a ball, sat in a socket at an unknown place: it stayed at the origin of the
+        world, whose axes are parallel to the arm's base.
     inverse : bool
-        The poses were the other way round before: of a fixed target in a camera on the flange.
+        The poses were inverted: they were of a fixed target in a camera on the flange.
     pixels, points : (N, 2), (N, 3), optional
-        Points of a board as a camera saw them: a row for each point, with its place in the image
-        and in the frame of the board [m]. Rows of one image follow each other and share stamp and
-        joint values. Positions and rotations count for nothing then.
+        Points of a board in images: one row per point, with its place in the image and in the
+        board frame [m]. Rows of one image are consecutive and share stamp and joint values.
+        Positions and rotations are then ignored.
     on_flange : bool
-        The camera is on the flange, at `tool`, and the board is the world. Else the camera is the
-        world and the board is at `tool`.
+        The camera is on the flange, at `tool`, and the board is the world. Otherwise the camera is
+        the world and the board is at `tool`.
 
     """
 
@@ -102,7 +102,7 @@ class Observations(Shown):
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):
-            raise InputError('pixels need the points of the board that they show, and points them')
+            raise InputError('pixels and the board points they show must be given together')
         count, joints = len(self.stamps_ns), self.joints.shape[-1]
         for name, array in self._arrays().items():
             shape = (count, *(joints if size is None else size for size in _SHAPES[name]))
@@ -129,12 +129,13 @@ class Observations(Shown):
     ) -> Observations:
         """Make observations of joint values (N, n) [rad or m] and positions (N, 3) [m].
 
-        And of `rotations` (N, 3, 3); without them of positions only.
+        With `rotations` (N, 3, 3) they are poses, without them positions only.
 
         Raises
         ------
         InputError
-            For what is no numbers, has another shape, or no rotations; masked values are missing.
+            For arrays that are not numeric, have another shape, or are not rotations; masked
+            values count as missing.
 
         """
         joints, positions = _numbers('joints', joints), _numbers('positions', positions)
@@ -162,8 +163,8 @@ class Observations(Shown):
     ) -> Observations:
         """Make observations of a board: `images` (N,) numbers the image of each row.
 
-        The joint values (N, n) are those of the image, the `points` (N, 3) [m] those of the board
-        that are seen at `pixels` (N, 2).
+        `joints` (N, n) are the joint values at that image; the board's `points` (N, 3) [m] are
+        seen at `pixels` (N, 2).
         """
         plain = cls.from_arrays(joints, np.broadcast_to(np.zeros(3), (len(joints), 3)))
         stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
@@ -197,22 +198,22 @@ class Observations(Shown):
         return chosen
 
     def spread(self, most: int = SOME_POSES) -> Observations:
-        """Return every so many pairs, at most so many."""
+        """Return evenly spread pairs, at most so many."""
         step = -(-len(self) // most)
         return self if step <= 1 else self.select(np.arange(0, len(self), step))
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
-        """Return the poses the other way round: a camera on the flange sees a fixed target.
+        """Return the inverted poses, for a camera on the flange that sees a fixed target.
 
-        The measured pose of the target in the camera becomes that of the camera in the target's
-        frame, which takes the place of the world. Covariances go along; `sigmas` (position [m],
-        orientation [rad]) make them where the measurement brought none, because the inverse is
-        uncertain by the orientation's sigma times the distance.
+        The measured pose of the target in the camera becomes the pose of the camera in the target
+        frame, which becomes the world. Covariances are transformed too; where there is none,
+        `sigmas` (position [m], orientation [rad]) give one, because the uncertainty of the inverse
+        includes the orientation's sigma times the distance.
         """
         if not self.oriented.all():
             raise InputError(
-                'poses of a camera on the flange need their orientation (qx qy qz qw): without it '
-                'they cannot be turned round'
+                'poses of a camera on the flange need an orientation (qx qy qz qw): without it '
+                'they cannot be inverted'
             )
         turned = np.swapaxes(self.rotations, 1, 2)
         positions = -np.einsum('nij,nj->ni', turned, self.positions)
@@ -244,13 +245,13 @@ class Observations(Shown):
         return found
 
     def at(self, stamps_ns: NDArray[np.int64]) -> Observations:
-        """Return the same pairs with other stamps (N,)."""
+        """Return the pairs with other stamps (N,)."""
         return replace(self, stamps_ns=stamps_ns)
 
     def earlier(self, delay: float | None) -> Observations:
         """Return the same measurements with the joint values of a delay [s] before the stamps.
 
-        By velocity and acceleration; without them the arm stood and nothing changes.
+        By velocity and acceleration; without them the arm was at rest and nothing changes.
         """
         if self.velocity is None or delay is None:
             return self
@@ -303,7 +304,7 @@ def _numbers(name: str, values: object) -> FloatArray:
 
 
 def _refuse_other_than_rotations(turns: FloatArray) -> None:
-    """Refuse matrices (N, 3, 3) of which one is far from any rotation."""
+    """Refuse matrices (N, 3, 3) if one is far from any rotation."""
     square = np.einsum('nij,nik->njk', turns, turns)
     wrong = np.abs(square - np.eye(3)).max(axis=(1, 2), initial=0.0) > NO_ROTATION
     wrong |= np.linalg.det(turns) < 0.0
@@ -312,7 +313,7 @@ def _refuse_other_than_rotations(turns: FloatArray) -> None:
         what = 'left-handed' if np.linalg.det(turns[k]) < 0.0 else 'not orthogonal'
         raise InputError(
             f'the rotation of pair {k} (counted from 0) is {what}: {np.count_nonzero(wrong)} of '
-            f'{len(turns)} are no rotation matrices'
+            f'{len(turns)} are not rotation matrices'
         )
 
 

@@ -54,45 +54,43 @@ class Problem(Shown):
     chain : Chain
         The nominal chain. Frames that it does not fix are fitted.
     observations, more : Observations, sequence of Observations
-        Pairs to fit; further sets in the same fit: other sessions or targets with frames of their
-        own, other kinds of measurement.
+        Pairs to fit; further sets in the same fit: other sessions or targets with their own
+        frames, other kinds of measurement.
     separations : sequence of (str, str, float)
-        Pairs of base frames whose origins are a known distance [m] apart: sockets in which a ball
-        on the flange sat. Their worlds are parallel to the arm's base.
+        Pairs of base frames whose origins are a known distance [m] apart: sockets that held a ball
+        on the flange. Their worlds are parallel to the arm's base.
     world_frame : str
         Frame in which the poses were measured, for the record.
     held_out : Observations or several, optional
-        Pairs that are never fitted and judge the result. Without them the result is judged by
+        Pairs that judge the result and are never fitted. Without them it is judged by
         cross-validation over whole configurations.
     sigma_position, sigma_orientation : float
-        Standard deviations [m, rad] of measurements without a covariance of their own. Their
-        ratio weighs position against orientation; the size of the noise is estimated.
+        Standard deviations [m, rad] of measurements without a covariance. Their ratio weights
+        position against orientation; the size of the noise is estimated.
     sigma_pixel, sigma_touch : float
-        The same [px] of each coordinate of a point of a board in an image, and [m] of heights over
-        a plane.
+        The same [px] for each image coordinate of a board point, and [m] for heights over a plane.
     sigma_scale : float
-        Standard deviation of the scale of the measuring device [1], once it was checked with a
-        known length; 0 if it was not.
+        Standard deviation of the scale of the measuring device [1], if checked with a known
+        length; otherwise 0.
     loss : 'redescending', 'huber' or 'none'
-        How gross errors are kept from ruining the fit (`robust.py`).
+        Treatment of gross errors (`robust.py`).
     priors : mapping of str to float
         Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
-        such as `*.a`; the first pattern that fits holds. None by default.
+        such as `*.a`; the first match applies. None by default.
     effects : sequence of str
         Non-geometric effects to fit, by name or by group (`effects.py`).
     fixed : sequence of str
         Parameters to hold at their nominal values; `*` and `?` match as in file names.
     folds : int
-        Parts of the cross-validation.
+        Number of cross-validation folds.
     largest_length, largest_angle : float
-        Offsets [m, rad] that no faulty but right robot has; with a larger one the result is not
-        accepted.
+        Offsets [m, rad] beyond any fault of the right robot; a larger one is not accepted.
     largest_error : float
-        RMS position error [m] on held-out poses beyond which nothing is accepted.
+        Largest RMS position error [m] on held-out poses that is accepted.
     learned : Learned, optional
-        Priors that the data themselves have told, for parameters without one (`evidence.py`).
+        Priors estimated from the data, for parameters without one (`evidence.py`).
     of_messages : bool
-        True if the samples were messages, which have no options of a table.
+        True if the samples were messages, to which table options do not apply.
 
     """
 
@@ -176,7 +174,7 @@ class Problem(Shown):
         if spread > 2.0 * reach:
             raise InputError(
                 f'the distances vary by {spread:.3g} m, more than an arm of {reach - TOOL:.3g} m '
-                'can move anything: are they in metres (--length)?'
+                'can cause: are they in metres (--length)?'
             )
 
     def _check_patterns(self) -> None:
@@ -186,11 +184,13 @@ class Problem(Shown):
                 raise UnknownNameError('parameter', pattern, names)
         for pattern in self.priors:
             if self._places(pattern):
-                raise ConfigError(f'frames are unknown or known, not with a prior: "{pattern}"')
+                raise ConfigError(
+                    f'a frame is either known or unknown, and takes no prior: "{pattern}"'
+                )
         for pattern in self.fixed:
             if self._places(pattern):
                 raise ConfigError(
-                    f'a frame is held as a whole: give it in the chain file with "fixed: true", '
+                    'a frame is fixed as a whole: give it in the chain file with "fixed: true" '
                     f'instead of fixing "{pattern}"'
                 )
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What comes of bringing a calibration up to date: accepted or not, and in words."""
+"""The outcome of a recalibration: accepted or not, and in words."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Recalibration(Shown):
             'new poses (each left out in turn)'
         )
         if self.accepted:
-            said = 'unchanged within what is known, brought up to date'
+            said = 'unchanged within the uncertainty, updated'
             if self.changed:
                 said = self._causes()
             return f'accepted: {said}; {text}'
@@ -92,17 +92,17 @@ class Recalibration(Shown):
         elif self.scale is not None:
             size, sigma = 1e6 * self.scale.change[0], 1e6 * self.scale.sigma[0]
             why = (
-                f'the measuring device has another scale than before, by {size:+.0f} ± '
+                f'the scale of the measuring device changed, by {size:+.0f} ± '
                 f'{sigma:.0f} ppm; check it with a known length, and the temperature and pressure '
                 'set in it'
             )
         elif self.odd:
             why = (
-                f'{self.odd} contradicts all others, which would be accepted without it; measure '
-                'it again, or leave it out'
+                f'{self.odd} contradicts all others, which would pass without it; measure it '
+                'again, or leave it out'
             )
         elif self.unexplained <= changes.FALSE:
-            why = 'no few parameters explain what has changed; identify anew'
+            why = 'no change of a few parameters explains the new poses; identify again'
         elif not self.determined:
             before, after = 1e3 * self.known_before, 1e3 * self.known_after
             why = (
@@ -113,7 +113,7 @@ class Recalibration(Shown):
         elif self.anew:
             why = (
                 'the earlier calibration, in new frames, fits the new poses better; keep it, or '
-                'identify anew from more poses'
+                'identify again from more poses'
             )
         else:
             why = 'the new poses contradict each other; measure more'

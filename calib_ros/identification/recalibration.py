@@ -59,7 +59,7 @@ def recalibrate(
     growth: float = GROWTH,
     new: Sequence[str] = (),
 ) -> Recalibration:
-    """Bring a calibration up to date by the poses of a problem.
+    """Update a calibration with the poses of a problem.
 
     Parameters
     ----------
@@ -70,14 +70,14 @@ def recalibrate(
     years : float
         Since then.
     growth : float
-        Standard deviation [m] by which lengths wander in a year; angles by twice that [rad].
+        Standard deviation [m] of the drift of lengths in a year; of angles twice that [rad].
     new : sequence of str
-        Frames of devices that stand elsewhere, and of targets mounted anew.
+        Frames of moved devices and of remounted targets.
 
     Raises
     ------
     InputError
-        When the calibration holds no covariance, or does not know a frame.
+        If the calibration has no covariance, or does not know a frame.
 
     """
     found, arm = _recalibrated(previous, problem, years, growth, new)
@@ -219,8 +219,8 @@ class _Arm:
         """Return that of a calibration that has a covariance and knows the frames of the sets."""
         if previous.covariance is None:
             raise InputError(
-                'the earlier calibration does not hold the covariance of its parameters: identify '
-                'it again with this version, from the poses of then'
+                'the earlier calibration has no parameter covariance: identify it again with '
+                'this version, from its own poses'
             )
         known = previous.chain.frame_names
         for each in sets:

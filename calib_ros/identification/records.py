@@ -126,8 +126,8 @@ class Record:
         record = calibration_record(text)
         if not record:
             raise ConfigError(
-                f'{where} is a chain, but no calibration: it does not say where its numbers come '
-                'from (key "calibration"); give the calibration.yaml of calib_ros identify'
+                f'{where} is a chain, but not a calibration: it does not say where its numbers '
+                'come from (key "calibration"); give the calibration.yaml from calib_ros identify'
             )
         if not isinstance(record.get('accepted', True), bool):
             told = record['accepted']
@@ -168,7 +168,9 @@ class Record:
         """Return the nominal chain of a corrected one."""
         known, where = self._part('nominal'), self.where
         if known.get('convention') != chain.convention:
-            raise ConfigError(f'{where} does not hold its nominal chain: give that with --chain')
+            raise ConfigError(
+                f'{where} does not contain its nominal chain: give that with --chain'
+            )
         rows = self._rows(chain)
         joints = tuple(replace(joint, **rows[joint.name]) for joint in chain.joints)
         effects = dictionary(known.get('effects'), f'{where}: calibration.nominal.effects')
@@ -192,10 +194,10 @@ class Record:
         ):
             return
         raise ConfigError(
-            f'{self.where} does not hold the table and effects that were identified '
-            '(calibration.table_sha256): it was edited or damaged, or exported without its '
-            'effects; give the file that calib_ros identify wrote. If the change is meant, write '
-            'a record of your own: calibration: {source: ...}'
+            f'{self.where} does not contain the table and effects identified '
+            '(calibration.table_sha256): it was edited, damaged, or exported without its '
+            'effects; give the file written by calib_ros identify. If the change is intended, '
+            'write your own record: calibration: {source: ...}'
         )
 
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
@@ -378,11 +380,11 @@ class Fingerprint:
 
 
 def reused_in_words(share: float) -> str:
-    """Return a warning about measurements of which such a share was fitted; empty for none."""
+    """Return a warning about the share of measurements already fitted; empty for none."""
     if not share:
         return ''
     which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'
     return (
-        f'{which} are the measurements that the calibration was fitted to, so they prove nothing '
+        f'{which} are measurements to which the calibration was fitted, so they prove nothing '
         'about other poses: measure new ones'
     )

@@ -37,8 +37,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     told = _tell_a_pose(observations, observations.images)
     if not told.any():
         raise InputError(
-            'no image shows 4 points of the board that are not in line: nothing tells '
-            'where the camera is'
+            'no image shows 4 board points that are not in line: the camera cannot be located'
         )
     rows = observations.select(told[observations.images])
     poses, rms = resect(rows, lens)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What an identification has found."""
+"""The result of an identification."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from calib_ros.shown import Shown, as_frame, as_html
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Shown):
-    """The result; a poor fit is data in it, not an error."""
+    """The result of an identification; a poor fit is data in it, not an error."""
 
     chain: Chain
     before: Chain
@@ -44,19 +44,19 @@ class Identification(Shown):
     fitted: Comparison
     """Residuals on the fitted pairs."""
     validation: Comparison | None
-    """Residuals on pairs that were not fitted; None where there are too few poses for that."""
+    """Residuals on pairs that were not fitted; None if there are too few poses for that."""
     validated_by: str
     """How these pairs were held out."""
     noise: Noise
     distances: tuple[FloatArray, ...]
     """Size (N,) of the residuals of each set's samples, in the usual one (`robust.py`)."""
     outliers: tuple[Outlier, ...]
-    """Samples of gross error; they carry no or little weight in the fit."""
+    """Samples with gross errors; they carry little or no weight in the fit."""
     gauges: dict[str, list[str]]
-    """For each parameter that was left out, the fitted ones that it trades against."""
+    """For each omitted parameter, the fitted ones it trades off against."""
     observability: identifiability.Observability
     priors: dict[str, float]
-    """Standard deviations [m, rad] that were known before."""
+    """Standard deviations [m, rad] known beforehand."""
     world_frame: str
     iterations: int
     converged: bool
@@ -64,24 +64,24 @@ class Identification(Shown):
     """Probability that errors shared by what was measured in succession, as of a drifting tracker,
     would let the arm's parameters explain as much. None for a target in sockets."""
     refusals: tuple[Reason, ...]
-    """Rules of acceptance that failed, in words; none when the result is accepted."""
+    """Failed acceptance rules, in words; empty if the result is accepted."""
     posterior: Posterior
-    """What is known of the arm, effects that the model leaves out included."""
+    """What is known of the arm, unmodelled effects included."""
     region: Region | None
-    """Where the calibration may be used; None where it may not be used anywhere."""
+    """Where the calibration may be used; None if nowhere."""
     weak: tuple[str, ...] = ()
-    """Parameters that the poses hardly determine, held near their nominal values by a prior of the
-    size that this arm's errors have."""
+    """Parameters that the poses hardly determine, held near nominal by a prior of the size of this
+    arm's errors."""
     verdicts: tuple[effects.Verdict, ...] = ()
-    """Where the model was chosen: what paid for itself and what did not."""
+    """If the model was chosen: what reduced the error and what did not."""
     step: Step | None = None
-    """What moved while it was measured (`steps.py`)."""
+    """What moved during the measurement (`steps.py`)."""
     remarks: tuple[str, ...] = ()
-    """What is suspicious though the figures are good, and what to do (`suspicions.py`)."""
+    """What is suspicious despite good figures, and what to do (`suspicions.py`)."""
     coupled: bool = False
-    """Whether couplings of the wrist that are not fitted explain most of what is left."""
+    """Whether unfitted couplings of the wrist explain most of the residuals."""
     images: int = 0
-    """How many images of a board were fitted."""
+    """Number of board images fitted."""
 
     @property
     def accepted(self) -> bool:
@@ -105,22 +105,22 @@ class Identification(Shown):
 
     @property
     def not_excited(self) -> tuple[Parameter, ...]:
-        """Return those of them that other poses would determine."""
+        """Return the unidentifiable parameters that other poses would determine."""
         return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
     def pose_covariance(self, q: FloatArray) -> FloatArray:
         """Return the expected squares (N, 6, 6) [m, rad] of errors of the pose at q (N, n).
 
-        From the uncertainty of the parameters, and of effects that the model leaves out; position
-        and rotation in world axes.
+        They include the uncertainty of the parameters and of unmodelled effects; position and
+        rotation in world axes.
         """
         return self.posterior.expected(q)
 
     def confidence_ellipsoid(self, q: FloatArray, level: float = CONFIDENT) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
 
-        By the F distribution where the size of the noise was estimated from the residuals, by
-        chi-squared (its limit) where the sigmas given are right.
+        By the F distribution if the noise was estimated from the residuals, by chi-squared (its
+        limit) if the given sigmas are right.
         """
         if not 0.0 < level < 1.0:
             raise ConfigError(f'level must be between 0 and 1, as 0.95, not {level}')
@@ -135,7 +135,7 @@ class Identification(Shown):
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 
     def predicted_sigma(self, count: int = 300) -> FloatArray:
-        """Return standard deviations (count,) [m] of positions predicted all over the joint range.
+        """Return standard deviations (count,) [m] of positions predicted over the joint range.
 
         The root of the trace of the position's covariance, at seeded random configurations.
         """

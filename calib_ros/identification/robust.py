@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Least squares that gross errors do not ruin, and their names.
+"""Robust least squares, and the names of gross errors.
 
 A sample's distance is the length of its residual in units of a scale estimated from the data (the
 median of all lengths): the larger of position and orientation, or of a corner and the sum over its

@@ -77,7 +77,7 @@ def may_be_rounding(
     """Tell whether rounding of joint values explains what the nominal chain leaves as well.
 
     `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
-    of rounded joints, and `good` (N,) tells which samples of each set are no outliers.
+    of rounded joints, and `good` (N,) tells which samples of each set are not outliers.
     """
     sets = [each.select(which).spread() for each, which in zip(problem.sets, good, strict=True)]
     joints = np.concatenate([each.joints for each in sets])

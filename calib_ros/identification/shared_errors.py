@@ -46,7 +46,7 @@ does not tell them from 1."""
 MOST_STOPS = 2 * SOME_POSES
 """Stops on which sizes are estimated; of more, every so many runs of a twentieth."""
 ELSEWHERE = 4.0 * LARGEST
-"""Distance of the stops of different sets, which are no neighbours."""
+"""Distance between stops of different sets, which are not neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +160,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
 
 
 class _Forms:
-    """Quadratic forms of residuals, and their moments, for stops of which the rows are known."""
+    """Quadratic forms of residuals, and their moments, for stops with known rows."""
 
     def __init__(self, units: _Stops, extra: FloatArray) -> None:
         self._units = units

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How large errors of one kind are: the sizes that make the data most probable (`evidence.py`)."""
+"""Sizes of the errors of each kind: those that make the data most probable (`evidence.py`)."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class Evidence:
         """Return how much more probable a group of size `std` is, and the precision (P,) then.
 
         As the logarithm of the ratio to what was `told`, of sizes (G,); those of the other groups
-        are looked for anew.
+        are searched for again.
         """
         own = self._names.index(group)
         rest = [k for k in range(len(self._names)) if k != own]

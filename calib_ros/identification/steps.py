@@ -14,7 +14,7 @@ unless they are fewer than a step has on the shorter side (`few_gross`). Known d
 sockets are not, for they say nothing about time.
 
 Unmodelled effects follow the joints, and no step in time explains more than half of their
-residuals. A drift is no step: a few cosines over the session explain it better.
+residuals. A drift is not a step: a few cosines over the session explain it better.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class Step:
         thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
         text += f'{thing} ({self.what}, {size})'
         if self.unused:
-            text += f'; what was measured {self.unused} carries no weight'
+            text += f'; measurements {self.unused} carry no weight'
         return text
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The usual mistakes in what is given for an arm: how each is undone, and what to do."""
+"""The usual mistakes in the input: how each is undone, and what to do."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
     for rows in (1, -1, 2, -2):
         where = 'below' if rows > 0 else 'above'
         count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
-        what = f'the joint values stand {count} {where} the measurement that they belong to'
+        what = f'the joint values stand {count} {where} their measurement'
         published = 'check the stamps, and delay'
         yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
 
@@ -282,7 +282,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
             columns = ', '.join('xyz'[k] for k in held)
             return Suspect(
                 f'all positions have the same {columns}, though the arm moves in all directions',
-                f'was the column {columns} recorded, and read from the right place?',
+                f'was the column {columns} recorded, and read correctly?',
                 published='check the positions where they are published',
             )
     return None

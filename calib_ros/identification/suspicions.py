@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What looks wrong in a result with good figures: one sentence each, and what to do.
+"""Suspicious results with good figures: one sentence each, and what to do.
 
 Scale. A device with a scale error s makes all lengths of the arm seem to grow alike; so does its
 temperature. With L the derivative of the fitted lengths by s (the frames take their share), x
@@ -167,7 +167,8 @@ def _sister(problem: Problem, result: Identification) -> str:
     if distance > NEARER * nominal:
         return ''
     return (
-        f'the arm found is nearer to the shipped {name} ({1e3 * distance:.2f} mm) than to the '
+        f'the identified arm is closer to the supplied {name} ({1e3 * distance:.2f} mm) than to '
+        'the '
         f'nominal {problem.chain.name} ({1e3 * nominal:.2f} mm): is it the right chain file?'
     )
 
@@ -249,7 +250,7 @@ def _coupling(result: Identification) -> str:
         return ''
     return (
         'couplings of the last joints explain most of the residuals: are the joint values those '
-        'of the joints, not of the motors? Else add the effects "coupling"'
+        'of the motors? If so, add the effects "coupling"'
     )
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A start that gross errors cannot lead astray, even if they agree with each other.
+"""A start that gross errors cannot mislead, even if they agree with each other.
 
 Least trimmed squares: the fit to the half of the samples that fits best (Rousseeuw 1984), found as
 in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few randomly drawn

@@ -27,8 +27,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame
 
 COUNTS = 0.005
-"""Change of an RMS error that counts, of itself; less is how it happens to fall
-(benchmarks/real_robots.py)."""
+"""Change of an RMS error that counts, of itself; less is chance (benchmarks/real_robots.py)."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +230,7 @@ def _cross_validate(
     )
     folds = _folds(problem, names, count, rows)
     if folds < 2:
-        return None, 'nothing: too few poses to leave any out'
+        return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     chains = zip(

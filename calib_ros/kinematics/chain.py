@@ -9,7 +9,7 @@
 
     revolute   theta = joint.theta + sign q        prismatic   d = joint.d + sign q
 
-The joint value q is the one reported plus the non-geometric effects of the chain (`effects.py`).
+The joint value q is the reported one plus the non-geometric effects of the chain (`effects.py`).
 
 A chain is a sequence of elementary motions, each along or about one axis of the moving frame. A
 walk along it (`walk.py`) ends in the pose, and the axes met on the way are all that the error
@@ -57,7 +57,7 @@ PARALLEL_TOLERANCE = np.radians(5.0)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Chain(Shown):
-    """A serial chain; immutable, offsets make a new one.
+    """A serial chain; immutable: offsets return a new one.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class Chain(Shown):
         Joints whose row joins two parallel revolute axes: beta is fitted there and d is not.
         Found from the nominal table when None.
     base, tool : Frame, optional
-        T_world_base and T_flange_target; None when nothing is known about them.
+        T_world_base and T_flange_target; None if unknown.
     frames : tuple of (str, Frame or None)
         Further bases (`base_...`) and tools (`tool_...`), for several sessions or targets.
     effects : tuple of (str, float)
@@ -156,7 +156,7 @@ class Chain(Shown):
 
     @cached_property
     def walk(self) -> Walk:
-        """Return what the forward kinematics needs of the links."""
+        """Return the link data for the forward kinematics."""
         signs = np.array([float(joint.sign) for joint in self.joints])
         turning = np.array([joint.type == 'revolute' for joint in self.joints])
         return Walk(self.table, signs, turning, self.convention == 'standard')
@@ -173,7 +173,7 @@ class Chain(Shown):
         return float(owner.offsets()[FRAME_KINDS.index(kind)])
 
     def offset(self, name: str, nominal: Chain) -> float:
-        """Return what `with_offsets` adds to the nominal chain's parameter to come here."""
+        """Return the offset from the nominal chain's parameter, as for `with_offsets`."""
         owner, kind = self._split(name)
         if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
             return self.value(name) - nominal.value(name)
@@ -181,7 +181,7 @@ class Chain(Shown):
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
-        """Return a base or tool frame by its name, the identity when nothing is known."""
+        """Return a base or tool frame by its name; the identity if unknown."""
         return self.all_frames[name] or ANYWHERE
 
     def owns_frame(self, parameter: str) -> bool:
@@ -189,13 +189,13 @@ class Chain(Shown):
         return parameter.partition('.')[0] in self.all_frames
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
-        """Return the chain with another base or tool frame, which may be a new one."""
+        """Return the chain with a replaced or added base or tool frame."""
         if name in ('base', 'tool'):
             return replace(self, base=frame) if name == 'base' else replace(self, tool=frame)
         return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
 
     def with_effects(self, names: Sequence[str]) -> Chain:
-        """Return the chain with further effects, of no size yet."""
+        """Return the chain with further effects, all zero."""
         known = dict(self.effects)
         added = tuple((name, 0.0) for name in dict.fromkeys(names) if name not in known)
         for name, _ in added:
@@ -252,8 +252,8 @@ class Chain(Shown):
     ) -> FloatArray:
         """Return T_world_target (N, 4, 4) for joint values (N, n) [rad or m].
 
-        `approach` (N, n) holds the signs of the velocities before, for backlash; `base` and `tool`
-        choose among the frames.
+        `approach` (N, n) holds the signs of the preceding velocities, for backlash; `base` and
+        `tool` select frames.
         """
         rows = np.ascontiguousarray(self.joint_values(q).T)
         came = None if approach is None else np.ascontiguousarray(approach.T)
@@ -261,7 +261,7 @@ class Chain(Shown):
         return se3.transform(axes.transpose(2, 1, 0), origin.T)
 
     def joint_values(self, q: FloatArray) -> FloatArray:
-        """Return joint values (N, n) as an array; refuse those of another shape."""
+        """Return joint values (N, n) as an array; refuse any other shape."""
         q = np.asarray(q, dtype=np.float64)
         if q.ndim != 2 or q.shape[1] != len(self.joints):
             raise ConfigError(
@@ -271,7 +271,7 @@ class Chain(Shown):
         return q
 
     def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
-        """Return the joint values (n, B) that the effects make of those reported (n, B)."""
+        """Return the effective joint values (n, B) for reported ones (n, B)."""
         names = tuple(name for name, value in self.effects if value)
         return effects.moved(self, names, effects.basis(self, names, q, approach), q)
 
@@ -315,7 +315,7 @@ class Chain(Shown):
 
     @cached_property
     def all_frames(self) -> Mapping[str, Frame | None]:
-        """Return base, tool and further frames by name; None where nothing is known."""
+        """Return base, tool and further frames by name; None where unknown."""
         return {'base': self.base, 'tool': self.tool, **dict(self.frames)}
 
     @cached_property

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Chain files and calibrations: YAML to chain and back.
 
-One schema for nominal and corrected chains, so that an output is an input. `docs/formats.md`
+Nominal and corrected chains share one schema, so an output can be an input. `docs/formats.md`
 describes it. A URDF is read as a nominal chain.
 """
 
@@ -51,10 +51,10 @@ URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 
 
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
-    """Read a chain file, a URDF, or a robot that calib_ros ships by its name, such as "ur10e".
+    """Read a chain file, a URDF, or a supplied robot by its name, such as "ur10e".
 
-    Base and tool frame of a URDF are left out: they lead to its links, and neither the world of a
-    measuring device nor its target is one.
+    The base and tool frames of a URDF are omitted: they lead to its links, not to the measuring
+    device and its target.
     """
     path = Path(name_or_path)
     if path.suffix in URDF_SUFFIXES:
@@ -114,7 +114,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     content = parse_mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
     rows = content['joints']
     if not isinstance(rows, list) or not rows:
-        raise ConfigError(f'{where}: "joints" must be a list with one entry a joint')
+        raise ConfigError(f'{where}: "joints" must be a list with one entry per joint')
     if len(rows) > MOST_NAMES:
         raise ConfigError(f'{where}: {len(rows)} joints are more than {MOST_NAMES}')
     parallel = content.get('parallel')
@@ -159,7 +159,7 @@ def parse_frames(content: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def calibration_record(text: str) -> dict[str, Any]:
-    """Return what a chain file says about where its numbers come from."""
+    """Return the record of a chain file: where its numbers come from."""
     record = parse_yaml(text, 'chain file').get('calibration')
     return record if isinstance(record, dict) else {}
 

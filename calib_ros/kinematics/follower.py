@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values with which one arm reaches the poses of another.
+"""Joint values at which one arm reaches the poses of another.
 
 A `Follower` minimises, with x the change of the joints in units of the largest that is allowed and
 e, J the error and its derivative as in `inverse.py`,

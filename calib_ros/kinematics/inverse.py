@@ -108,7 +108,7 @@ def _within(chain: Chain, q: FloatArray) -> FloatArray:
 
 
 class Aim:
-    """How far the target of an arm is from wanted poses, and what the joints change of it."""
+    """Errors of an arm's target from wanted poses, and their derivatives by the joints."""
 
     def __init__(self, chain: Chain, base: str = 'base', tool: str = 'tool') -> None:
         self._chain = chain

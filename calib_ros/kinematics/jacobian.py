@@ -281,7 +281,7 @@ def _layout(
 def _twist(
     walk: Walk, velocity: FloatArray, frames: FloatArray, origin: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what a delay of one second would change: turn and shift (3, B) of a target there."""
+    """Return the effect of a delay of one second: turn and shift (3, B) of a target there."""
     rates, turning = -walk.signs * velocity, walk.turning
     driven, points = frames[: len(rates), 2], frames[: len(rates), 3]
     moved = se3.cross(driven, origin - points)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a chain is made of: rows of the DH table, and constant frames at its ends."""
+"""The parts of a chain: rows of the DH table, and constant frames at its ends."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def minimise(
     `move` the points after steps (n, K). A problem settles when its step vanishes, or its cost
     changes by a smaller share than `fall`; where a cost is `enough`, that settles it instead, and
     damping is by the identity, for the shortest steps, from the first one on. It is given up when
-    no damping lowers its cost, x is longer than the `longest`, or after so many `rounds`.
+    no damping lowers its cost, x is longer than the `longest`, or after `rounds` rounds.
     """
     x, active = start, np.arange(start.shape[-1])
     found, settled = start.copy(), np.zeros(active.size, dtype=bool)

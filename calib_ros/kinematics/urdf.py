@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The chain from a robot's own description (URDF), and the corrected arm back into it.
+"""The chain from a robot description (URDF), and the corrected arm back into it.
 
     URDF     T_base_tip(q) = O_1 M_1(q_1) ... O_n M_n(q_n) O_tip
     chain    T_base_tip(q) = base A_1(q_1) ... A_n(q_n) tool
@@ -50,13 +50,13 @@ def chain_from_urdf(
     tip_link: str | None = None,
     convention: Convention = 'standard',
 ) -> Chain:
-    """Return the chain between two links of a URDF, whose forward kinematics it has.
+    """Return the chain between two links of a URDF, with the same forward kinematics.
 
-    Base: from base_link to z along the first axis, the origin at the foot of base_link's origin on
-    it, x as that of the first joint. Tool: from the last frame, whose origin is the foot of
-    tip_link's origin on the last axis, to tip_link. Neither is fixed. Limits are taken over, and
-    the masses of all that is attached to a link; side branches that move count as they stand at
-    zero. Gravity is taken to point against z of base_link.
+    Base: from base_link to a frame with z along the first axis, the origin at the foot of
+    base_link's origin on it, and x as in the first joint. Tool: from the last frame, whose origin
+    is the foot of tip_link's origin on the last axis, to tip_link. Neither is fixed. Limits are
+    kept, and the masses of everything attached to a link; moving side branches count in their zero
+    position. Gravity points along -z of base_link.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def chain_from_urdf(
     Raises
     ------
     ConfigError
-        When the text is no URDF, or there is no serial chain between the links.
+        If the text is not a URDF, or no serial chain connects the links.
 
     """
     robot = parse_urdf(text)
@@ -109,26 +109,26 @@ def chain_from_urdf(
 def corrected_urdf(
     text: str, chain: Chain, base_link: str | None = None, tip_link: str | None = None
 ) -> str:
-    """Return a URDF whose forward kinematics between two links is that of a corrected arm.
+    """Return a URDF with the forward kinematics of a corrected arm between two links.
 
-    Only `<origin>` of joints on the path is changed. Base and tool of the chain lead to the
-    measuring device and to its target, which are no parts of the robot: before the first axis and
-    behind the last frame the URDF's own transforms are kept. Errors of theta and d go into the
-    origin of their joint; what lies behind follows.
+    Only `<origin>` of joints on the path changes. Base and tool of the chain lead to the measuring
+    device and its target, which are not parts of the robot, so the URDF's own transforms before
+    the first axis and behind the last frame are kept. Errors of theta and d go into the origin of
+    their joint; everything behind it follows.
 
     Parameters
     ----------
     text : str
         The nominal URDF.
     chain : Chain
-        The corrected chain, identified from that of this URDF and these links or an equal one.
+        The corrected chain, identified from this URDF and these links or from an equal chain.
     base_link, tip_link : str, optional
         As for `chain_from_urdf`.
 
     Raises
     ------
     ConfigError
-        When the chain is not one of this arm, or has effects, which no URDF can hold.
+        If the chain is not of this arm, or has effects, which a URDF cannot represent.
 
     """
     nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
@@ -157,8 +157,8 @@ def corrected_urdf(
     q = arm.random_joints(1000, np.random.default_rng(0))
     if np.abs(found.forward(q) - arm.forward(q)).max() > SAME:
         raise ConfigError(
-            f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can take '
-            'that: let the tool frame be fitted instead, or add a fixed joint and a link'
+            f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can '
+            'absorb that: let the tool frame be fitted instead, or add a fixed joint and a link'
         )
     return edited
 
@@ -174,8 +174,8 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
     effects = [name for name, value in arm.effects if value]
     if effects:
         raise ConfigError(
-            f'a URDF cannot hold the effects {", ".join(effects)}, and without them the rest of '
-            'the chain is not accurate: identify with the model "geometric"'
+            f'a URDF cannot represent the effects {", ".join(effects)}, and the chain is not '
+            'accurate without them: identify with the model "geometric"'
         )
     q = nominal.random_joints(50, np.random.default_rng(0))
     found, expected = arm.forward(q), nominal.forward(q)

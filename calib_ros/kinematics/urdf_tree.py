@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A robot's description (URDF) as a tree of links and joints, and origins back into its text.
+"""A robot description (URDF) as a tree of links and joints, and origins back into its text.
 
 Origins are written into the text itself: everything else stays as it is, byte for byte.
 """
@@ -69,7 +69,7 @@ class Description:
         Raises
         ------
         ConfigError
-            When there is no serial chain of joints between them.
+            If no serial chain of joints connects them.
 
         """
         base = self.root if base is None else base
@@ -95,13 +95,13 @@ class Description:
             if joint.mimics or joint.type in ('floating', 'planar'):
                 raise ConfigError(
                     f'joint "{joint.name}" {does}: a serial chain has revolute, continuous, '
-                    'prismatic and fixed joints only, each driven alone; choose base_link and '
+                    'prismatic and fixed joints only, each driven by itself; choose base_link and '
                     'tip_link on one side of it'
                 )
         return tuple(path)
 
     def _usual_tip(self, base: str) -> str:
-        """Return the link at the end of the arm, if there is no doubt."""
+        """Return the link at the end of the arm, if it is unambiguous."""
         behind, moved = {base}, set()
         for joint in self.joints:
             if joint.parent in behind:
@@ -155,7 +155,9 @@ def parse_urdf(text: str) -> Description:
     roots = [name for name in links if name not in children]
     if len(roots) != 1:
         found = ', '.join(roots) or 'none'
-        raise ConfigError(f'the links of a URDF are a tree with one root; roots here: {found}')
+        raise ConfigError(
+            f'the links of a URDF must form a tree with one root; roots here: {found}'
+        )
     name = parse_name(root.get('name') or 'robot', 'the name of the robot')
     return Description(name, roots[0], links, _outwards(joints, roots[0]))
 
@@ -163,7 +165,7 @@ def parse_urdf(text: str) -> Description:
 def _robot(text: str) -> ET.Element:
     if _DOCTYPE.search(text):
         raise ConfigError(
-            'the URDF has a <!DOCTYPE>, in which entities can stand for anything: remove it, no '
+            'the URDF has a <!DOCTYPE>, whose entities can stand for anything: remove it; no '
             'URDF needs one'
         )
     if len(text) > LARGEST_TEXT:
@@ -190,7 +192,9 @@ def _outwards(joints: Sequence[DescribedJoint], root: str) -> tuple[DescribedJoi
     if len(outwards) < len(joints):
         reached = {joint.child for joint in outwards}
         loop = ', '.join(joint.name for joint in joints if joint.child not in reached)
-        raise ConfigError(f'the links of a URDF are a tree; there is a loop among joints {loop}')
+        raise ConfigError(
+            f'the links of a URDF must form a tree, but there is a loop among joints {loop}'
+        )
     return tuple(outwards)
 
 

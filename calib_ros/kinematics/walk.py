@@ -89,7 +89,7 @@ class Walk:
         base : (4, 4)
             T_world_base.
         found : (n + 1, 4, 3, B)
-            Gets the frames, of which it is returned.
+            Receives the frames, and is returned.
         ends : (n, 4, 3, B), optional
             Gets the frames at the ends of the links of the modified convention; of the standard
             one they are those that follow.

@@ -18,8 +18,8 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.settings import EXCEPTION
 
 AGAIN = (
-    'Then identify again. Use the measurements so far with the new ones; if something was loose, '
-    'only the new ones.'
+    'Then identify again with old and new measurements, or with the new ones alone if something '
+    'was loose.'
 )
 
 
@@ -78,12 +78,12 @@ WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 """Where the description does not fit the arm."""
 WRONG = {*WRONG_ARM, Rule.CONVERGENCE, Rule.DRIFT, Rule.GAIN}
 WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
-"""What a description that does not fit brings by itself."""
+"""Consequences of a description that does not fit."""
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
     rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
 }
 BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
-"""What each cause brings by itself; the first cause that is there counts."""
+"""Consequences of each cause; the first cause present counts."""
 
 FAR = 1.0 / EXCEPTION
 """Ratio of what is left to the noise stated that an arm's own errors rarely reach."""
@@ -94,21 +94,21 @@ COARSE = (
 """What to check first where the measurements are far too coarse."""
 FEW = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
-    'What is left is as if the device had a noise of {:.2g} mm in each direction; {:.2g} mm are '
-    'set (sigma_position).'
+    'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
+    'sigma_position is {:.2g} mm.'
 )
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What was measured: different poses, what is left over the noise stated, that noise [m]."""
+    """The measurement: different poses, residual over stated noise, that noise [m]."""
 
     poses: int = ENOUGH
     left: float = 1.0
     sigma: float | None = None
 
     def said_of(self, one: Advice) -> Advice:
-        """Return the advice on a correction that does not show to help, as is right here."""
+        """Return the advice on a correction without a proven gain, as is right here."""
         if self.left >= FAR:
             steps = (each for each in one.steps if 'stood still' not in each)
             return replace(one, steps=(COARSE.format(self.left), *steps))
@@ -122,7 +122,7 @@ class Situation:
 
 
 def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Advice, ...]:
-    """Return the refusals in plain words, those of one rule together, and last what follows."""
+    """Return the refusals in plain words, grouped by rule, and last their consequences."""
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
@@ -136,6 +136,6 @@ def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Ad
         one = replace(rules()[rule], refusal='; '.join(texts))
         told.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
     for cause, texts in following.items():
-        heading = f'What probably follows from "{rules()[cause].heading}"'
+        heading = f'Likely consequences of "{rules()[cause].heading}"'
         told.append(Advice(heading, '', (), '; '.join(texts)))
     return tuple(told)

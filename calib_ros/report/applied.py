@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the pages of a verification, of a workspace and of a plan say."""
+"""The pages of a verification, a workspace and a plan."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from calib_ros.report.poses import Poses, explorer, numbers, unit_of
 from calib_ros.report.verdicts import hints, limits
 
 SOMETHING_MOVED = (
-    'Check that the measuring device, the target and the robot stand as they did for the '
-    'calibration; if not, use --new-base or --new-tool.'
+    'Check that measuring device, target and robot have not moved since the calibration; if one '
+    'has, use --new-base or --new-tool.'
 )
-TOLERANCE = 'Give --tolerance with the RMS error [mm] that your task allows: PASS or FAIL.'
+TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
 STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     'PASS': (
         Verdict('good', 'PASS: the arm is within the tolerance'),
         ('Keep this page with the calibration. Verify again after a collision or repair.',),
     ),
     'FAIL': (
-        Verdict('bad', 'FAIL: the arm is beyond the tolerance'),
+        Verdict('bad', 'FAIL: the arm exceeds the tolerance'),
         (
             SOMETHING_MOVED,
-            'Check that the correction is active in the controller (--commanded tells).',
+            'Check that the correction is active in the controller (--commanded shows it).',
             'Calibrate again with new poses; try --model auto.',
         ),
     ),
@@ -45,10 +45,16 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
         (f'Measure more poses, {SPREAD_OUT}, and verify again with all of them.',),
     ),
     'does not hold': (
-        Verdict('bad', 'The calibration does not hold any more'),
-        (SOMETHING_MOVED, 'Calibrate again with new poses, or with --previous by a few.'),
+        Verdict('bad', 'The calibration no longer holds'),
+        (
+            SOMETHING_MOVED,
+            'Calibrate again with new poses, or update it with --previous and a few.',
+        ),
     ),
-    'holds': (Verdict('good', 'The calibration holds: the error is as it was'), (TOLERANCE,)),
+    'holds': (
+        Verdict('good', 'The calibration still holds: the error has not grown'),
+        (TOLERANCE,),
+    ),
     'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
 """Verdicts, and what to do next."""
@@ -60,11 +66,11 @@ def workspace_report(
     """Return the report of a survey, and of the placements of a task if there are any."""
     spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
     first, last = spreads[0][1], spreads[-1][1]
-    text = [f'The calibration removes {first.rms:.3f} mm RMS, {first.max:.3f} mm at most.']
-    rest = 'What remains is not known: the file does not say how well its numbers are known.'
+    text = [f'The calibration removes {first.rms:.3f} mm RMS, {first.max:.3f} mm maximum.']
+    rest = 'The remaining error is unknown: the file has no uncertainties.'
     if len(spreads) > 1:
-        text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm at most.')
-        rest = 'Expected to remain: that uncertainty and the RMS error on poses not fitted.'
+        text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm maximum.')
+        rest = 'Expected to remain: this uncertainty and the RMS error on poses not fitted.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
     about = 'Radius: distance from the axis of the base. Height: above its origin.'
@@ -87,14 +93,14 @@ def workspace_report(
 
 
 def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
-    titles = ('Where the most is removed by the calibration', 'Where that is most uncertain')
+    titles = ('Where the calibration removes most', 'Where it is most uncertain')
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
         shown = sectors if len(sectors) <= most else (*sectors[:most], sectors[-1])
         yield Section(
             f'regions-{label.split()[0]}',
             title,
-            (f'The {most} regions of the largest errors, and that of the least.',),
+            (f'The {most} regions with the largest errors, and the one with the smallest.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
             rows=tuple(map(_region, shown)),
         )
@@ -144,15 +150,15 @@ def plan_report(
         sections.coverage(chain, joints, 'How far each joint will move'),
         _listed(chain, joints),
     ]
-    verdict = Verdict('info', 'Poses to go', (f'{len(joints)} poses.',))
+    verdict = Verdict('info', 'Test poses', (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
-        'Go to P1 to P5 in turn, 30 times, and measure each time.',
+        'Visit P1 to P5 in turn, 30 times, and measure each time.',
         'Then judge: calib_ros verify.',
     )
     if found is not None:
         curve = figures.predictions(found.accuracy, found.at_random, wanted_mm)
-        about = 'From measurement noise alone; errors of the model come on top.'
-        shown.insert(0, Section('promise', 'What the poses promise', (about,), curve))
+        about = 'From measurement noise alone; model errors add to it.'
+        shown.insert(0, Section('promise', 'Predicted accuracy', (about,), curve))
         known = bool(np.isfinite(found.accuracy[-1]))
         if known:
             predicted = f'Predicted RMS position error: {1e3 * found.accuracy[-1]:.4f} mm.'
@@ -162,12 +168,12 @@ def plan_report(
             'Then identify: calib_ros identify.',
         )
         if found.lacking or not known:
-            heading = 'Too little: these poses do not determine all parameters'
+            heading = 'Not enough: these poses do not determine all parameters'
             verdict = replace(verdict, state='open', heading=heading)
             more = 'Plan again with more poses (--poses), or candidates in which all joints move.'
             steps = (more, *(steps if known else ()))
     return Report(
-        kind='Plan of a measurement',
+        kind='Measurement plan',
         robot=chain.name,
         verdict=verdict,
         remarks=tuple(x for x in words.splitlines() if not x.startswith((' ', 'predicted'))),
@@ -189,7 +195,7 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
         text=[f'pose {k}' for k in order],
         hoverinfo='text',
     )
-    about = "In the arm's base. Check for collisions before you drive there."
+    about = 'In the base frame. Check for collisions before you drive there.'
     return Section('visit', 'Where the target will be', (about,), figures.space(path), height=560)
 
 
@@ -248,7 +254,7 @@ def _by_configuration(found: Verification) -> Section:
     return section(
         'configurations',
         'Pose by pose (ISO 9283)',
-        'AP: position accuracy, of the mean of all cycles. RP: repeatability, mean + 3 sigma.',
+        'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma.',
         head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
         rows=tuple(
             (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in values))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of a report as plotly reads them: plain dictionaries of `data` and `layout`."""
+"""Figures of a report for plotly: plain dictionaries of `data` and `layout`."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
 DOTTED = {'color': LIMIT, 'dash': 'dot'}
 QUANTILES = 2 * SOME_POSES
-"""Points of a curve that stands for any number of poses."""
+"""Points of a curve for any number of poses."""
 REVERSED = {'autorange': 'reversed', 'automargin': True}
 """A vertical axis with the first row on top."""
 ROUND = ('eccentricity', 'gear')
@@ -93,7 +93,7 @@ def against_noise(poses: Poses) -> Figure:
         data.append(_curve('markers', name, x, y, marker=marker))
     ends = np.array([-3.0, 3.0])
     data.append(_curve('lines', 'noise as stated', ends, ends, line=DOTTED))
-    across, up = axis('expected of pure noise [sigma]'), axis('measured [stated sigma]')
+    across, up = axis('expected from pure noise [sigma]'), axis('measured [stated sigma]')
     return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
 
@@ -164,13 +164,13 @@ def coverage(
     x = numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4)
     z = numbers(np.where(counts > 0, counts, np.nan))
     mesh = _heat_map(x, labels, z, '%{y}<br>%{z} poses', scale_of('poses'))
-    across = axis('place in the range of the joint [%]', range=[0, 100])
+    across = axis('position in the joint range [%]', range=[0, 100])
     layout = {'xaxis': across, 'yaxis': REVERSED, 'margin': _margin(130, 20, 50)}
     return {'data': [mesh], 'layout': layout}, tuple(rows)
 
 
 def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
-    """Return what the drives add to the joint values, where these (N, n) lie; None for nothing."""
+    """Return what the drives add to joint values (N, n), over their range; None if nothing."""
     waves = [each for each in chain.effects if effects.group_of(each[0]) in ROUND]
     owners = np.array([Parameter(name).owner for name, _ in waves])
     driven = [k for k, name in enumerate(chain.joint_names) if name in owners]
@@ -193,7 +193,7 @@ def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
 
 
 def error_map(survey: Survey) -> Figure:
-    """Return the RMS of what a calibration removes and of what remains by radius and height."""
+    """Return the RMS of removed and remaining errors by radius and height."""
     x, y, z = survey.positions.T
     parts = dict(list(survey.parts.items())[::2])  # without sigma
     largest = 1e3 * max(float(np.quantile(errors, 0.99)) for errors in parts.values())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A report as HTML, as PDF and in Markdown: each one file that needs nothing else, no network.
+"""A report as HTML, PDF and Markdown: each a single file that needs no network.
 
 jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
 None where they are not installed. All text of others is escaped.
@@ -48,7 +48,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Section:
-    """Words, a figure of plotly, a table, or some; what is `said` holds without the figure."""
+    """Text, a plotly figure, a table, or several of them; `said` also holds without the figure."""
 
     name: str
     title: str
@@ -76,7 +76,7 @@ class Input:
 
 @dataclass(frozen=True)
 class Origin:
-    """Whence a result comes: what only the one who started it knows; empty where not told."""
+    """Origin of a result, as known only to whoever started it; empty where not given."""
 
     inputs: tuple[Input, ...] = ()
     operator: str = ''
@@ -110,12 +110,12 @@ class Report:
 
     @property
     def of(self) -> str:
-        """Return the name of what was measured, the first that was read."""
+        """Return the name of the first input file read."""
         return next((each.name.split('/')[0] for each in self.origin.inputs), '')
 
     @property
     def shown(self) -> tuple[Section, ...]:
-        """Return the sections of which any may have a figure."""
+        """Return the sections that may have a figure."""
         return (*filter(None, (self.picture,)), *self.sections)
 
 
@@ -178,19 +178,19 @@ def _template(name: str) -> str:
 
 
 def _typed(text: str) -> str:
-    """Return a text as HTML, its commands and options as what is typed, unbroken by hyphens."""
+    """Return a text as HTML, with commands and options marked as code, unbroken at hyphens."""
     return TYPED.sub(r'<code>\g<0></code>', html.escape(str(_shown(text))))
 
 
 def _shown(value: object) -> object:
-    """Return a text of others without characters that hide or turn round what follows."""
+    """Return a foreign text without characters that hide or reverse what follows."""
     if isinstance(value, str) and not hasattr(value, '__html__'):
         return '\n'.join(map(one_line, value.split('\n')))
     return value
 
 
 def markdown(report: Report, samples: Mapping[str, Any]) -> str:
-    """Return the words and tables of a report; `samples` are what became of the input."""
+    """Return the text and tables of a report; `samples` is the account of the input."""
     verdict = report.verdict
     lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.robot)}', '']
     lines += [f'**{in_markdown(verdict.heading)}**', '']

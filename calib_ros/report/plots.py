@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures: each function draws arrays into the Axes that it is given."""
+"""Figures: each function draws arrays into given Axes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What was measured, pose by pose: where, how far off before and after, and whence.
+"""The measurements pose by pose: place, errors before and after, and source.
 
 It becomes a table, and what a page shows: single poses, above SINGLE bins, cells and quantiles.
 
@@ -35,7 +35,7 @@ from calib_ros.texts import one_line
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted; left out to judge; left out at a fitted configuration."""
 SINGLE = MANY
-"""Poses that are shown one by one; of more so many, evenly spread, give the quantiles."""
+"""Poses shown one by one; of more, this many evenly spread ones give the quantiles."""
 WORST = 2 * SOME_POSES
 """Poses of the largest errors, and outliers, that are listed of more."""
 BANDS = 60
@@ -92,7 +92,7 @@ class Poses:
 
     @property
     def things(self) -> str:
-        """Return what a row is, in the plural."""
+        """Return the name of the rows, in the plural."""
         if not self.corner.any():
             return 'poses'
         return 'corners' if self.corner.all() else 'measurements'
@@ -191,7 +191,7 @@ def poses_of(
     lines: bool = False,
     images: Mapping[int, str] = NAMELESS,
 ) -> Poses:
-    """Return all poses of an identification, those to judge on by what did not know them."""
+    """Return all poses of an identification, the judged ones by a fit without them."""
     sizes = np.concatenate(result.distances)
     judged = result.validation
     if judged is None or judged.repeated is not None:

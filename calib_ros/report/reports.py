@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the page of an identification says."""
+"""The page of an identification."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer
 from calib_ros.shown import some
 
-NOT_YET = 'The robot itself is not changed yet'
+NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
-    "calib_ros export (~/export of the node) brings the correction to the robot's controller, "
-    'calib_ros compensate to its programs'
+    'calib_ros export (~/export of the node) writes the correction for its controller, calib_ros '
+    'compensate corrects its programs'
 )
 UNPROVEN = (
-    'These poses were all used to compute the correction: a small error "after" proves nothing.'
+    'All these poses were used to compute the correction: a small error "after" proves nothing.'
 )
 SURVEYED = 20 * SOME_POSES
 """Random poses of the error map: some for each of its cells."""
@@ -66,12 +66,12 @@ def identification_report(
         verdict=_verdict(result, reasons, tolerance),
         advice=reasons,
         accuracy=sections.accuracy_section(
-            'Accuracy before and after' if result.accepted else 'Accuracy of what was tried',
+            'Accuracy before and after' if result.accepted else 'Accuracy of the correction tried',
             judged,
             poses.things,
             '' if result.validation else UNPROVEN,
-            f'"Before" is {words.BEFORE}, so the gain is that of the arm alone.',
-            'RMS (root mean square) is the usual size of the error over poses like these.',
+            f'"Before" is {words.BEFORE}, so the gain comes from the arm alone.',
+            'RMS (root mean square) is the typical error over poses like these.',
             with_outliers=judged.figures_of_all[1] if judged.outliers else None,
         ),
         picture=sections.distribution(poses),
@@ -91,7 +91,7 @@ def _verdict(
 ) -> Verdict:
     if not result.accepted:
         return _refused(reasons)
-    how = 'Before and after, on poses not used to compute it; in brackets the 95 % interval.'
+    how = 'Before and after, on poses not used to compute it; 95 % interval in brackets.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
@@ -108,7 +108,7 @@ def somewhere(result: Identification) -> str:
 
 
 def doubts(result: Identification) -> tuple[str, ...]:
-    """Return what to check before an accepted result is used."""
+    """Return the checks to make before using an accepted result."""
     return tuple(f'Check before you use it: {each}.' for each in result.remarks)
 
 
@@ -149,8 +149,8 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
 
 
 def _refused(reasons: Sequence[Advice]) -> Verdict:
-    """Return why nothing is corrected: an arm with no error that the device sees is no bad one."""
-    tried = 'No correction was saved or sent to the robot. The figures show what was tried.'
+    """Return why nothing is corrected: an arm without visible errors is not a bad one."""
+    tried = 'No correction was saved or sent to the robot. The figures show the correction tried.'
     if reasons[0].heading == GOOD_ARM.heading:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
         return Verdict('info', heading, (tried,))
@@ -159,7 +159,7 @@ def _refused(reasons: Sequence[Advice]) -> Verdict:
 
 
 def _notes(result: Identification) -> Iterator[str]:
-    """Yield what to know besides: of an accepted result, doubts stand in the verdict."""
+    """Yield further remarks; doubts about an accepted result are in the verdict."""
     if not result.accepted:
         yield from words.remarks(result)
     elif drift := words.drift_in_words(result.noise):
@@ -179,12 +179,12 @@ def _steps(
     beyond = tolerance is not None and limits[0] > tolerance
     undecided = tolerance is not None and limits[0] <= tolerance < limits[1]
     found = {
-        'To come nearer to the tolerance, identify with --model auto: it corrects what gears, '
-        'gravity and play add, where that helps.': beyond and not result.chain.effects,
-        'Compare what is left with the accuracy of the measuring device: no calibration gets '
-        'below that.': beyond,
-        f'Measure more poses to decide about the tolerance, {SPREAD_OUT}.': undecided,
-        'To use it beyond the measured poses, measure there as well: calib_ros compensate refuses '
+        'To get closer to the tolerance, identify with --model auto: it also corrects gears, '
+        'gravity and backlash where that helps.': beyond and not result.chain.effects,
+        'Compare the remaining error with the accuracy of the measuring device: no calibration '
+        'gets below that.': beyond,
+        f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
+        'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '
         'poses where it is not valid.': result.region is not None and not result.region.whole,
         f'{BRING}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
@@ -197,9 +197,9 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
     drift = result.accepted and words.drift_in_words(result.noise)
     yield section(
         'noise',
-        'What is left against the noise of the device',
-        'If nothing but the stated noise of the measuring device were left, all dots would lie on '
-        'the dotted line. A steeper line: more is left, or the stated noise is too small.',
+        'Remaining errors against device noise',
+        'If only the stated noise of the measuring device remained, all dots would lie on the '
+        'dotted line. A steeper line means more error, or understated noise.',
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
@@ -220,9 +220,9 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
     if drives is not None:
         yield section(
             'drives',
-            'Errors of the drives',
-            'What eccentricities and gears add to each joint value, over the values that were '
-            'measured. Narrow stripes come from gears, wide ones from eccentricities.',
+            'Drive errors',
+            'What eccentricities and gears add to each joint value, over the measured values. '
+            'Narrow stripes come from gears, wide ones from eccentricities.',
             figure=drives,
             height=100 + 45 * len(drives['data'][0]['y']),
         )
@@ -231,8 +231,8 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         yield section(
             'map',
             'The error over the workspace',
-            f'At {SURVEYED:,} random poses, by the distance from the axis of the base and the '
-            'height above it. More is expected to remain far from the poses measured.',
+            f'At {SURVEYED:,} random poses, by distance from the base axis and height above the '
+            'base. More is expected to remain far from the measured poses.',
             figure=figures.error_map(found),
         )
 
@@ -241,11 +241,11 @@ def _effects(result: Identification) -> Section:
     used = {True: 'yes', False: 'no'}
     return section(
         'effects',
-        'Errors beyond geometry',
-        'By how much each effect, on top of those used above it, changes the RMS position error '
-        'of poses left out. Used are those that help by more than chance.',
-        f'They are compared on {COMPARED:,} poses at most. The model chosen is fitted to all '
-        'poses and does better: its error stands at the top.',
+        'Non-geometric errors',
+        'How much each effect, added to those used above it, changes the RMS position error on '
+        'held-out poses. Effects that help by more than chance are used.',
+        f'The comparison uses up to {COMPARED:,} poses. The chosen model is fitted to all poses '
+        'and does better; its error is at the top.',
         head=('effect', 'changes the error by', 'used'),
         rows=tuple(
             (v.what, f'{100.0 * (v.rms_mm_after / v.rms_mm_before - 1.0):+.1f} %', used[v.pays])
@@ -261,9 +261,9 @@ def _outliers(poses: Poses, most: int = 50) -> Section:
     more = f' The {most} largest are shown.' if len(rows) > most else ''
     return section(
         'outliers',
-        f'Outliers: {len(rows)} {poses.things} carry no or little weight',
-        'They differ from all the others by more than errors of this arm and device do. '
-        f'Measure them again, or look what happened there.{more}',
+        f'Outliers: {len(rows)} {poses.things} carry little or no weight',
+        'They differ from the others by more than this arm and device explain. Measure them '
+        f'again, or find out what happened.{more}',
         head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
@@ -286,8 +286,8 @@ def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
             yield section(
                 name,
                 f'{name.capitalize()} found',
-                'Offsets from the nominal table with their 95 % intervals. An interval that holds '
-                'zero: the nominal value may be right. Limit of common sense: '
+                'Offsets from the nominal table with their 95 % intervals. If an interval '
+                'contains zero, the nominal value may be right. Plausibility limit: '
                 f'±{1e3 * limit:g} {unit}.',
                 figure=figure,
                 height=110 + 24 * len(figure['data'][0]['y']),
@@ -295,7 +295,7 @@ def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
 
 
 def _parameters(result: Identification) -> Section:
-    """Return the table of all parameters but the harmonics of gears, of which there are many."""
+    """Return the table of all parameters except the many gear harmonics."""
     rows = []
     listed = [p for p in result.parameters if group_of(p.name) != 'gear']
     unlisted = len(result.parameters) - len(listed)
@@ -311,9 +311,9 @@ def _parameters(result: Identification) -> Section:
     return section(
         'parameters',
         'All parameters',
-        'Kept nominal are those of status "gauge" (by the build of the arm they show only '
-        'together with others), "not excited" (the poses do not determine them) and "fixed" '
-        '(held on request). Base and tool are placed by the fit: they have no offset.',
+        'Kept nominal: status "gauge" (visible only together with other parameters), "not '
+        'excited" (not determined by the poses) and "fixed" (held on request). Base and tool are '
+        'fitted and have no offset.',
         f'{result.rank} are fitted{more}.',
         *words.priors_in_words(result),
         head=('parameter', 'value', 'offset', 'std', '± (95 %)', 'unit', 'status'),
@@ -322,13 +322,13 @@ def _parameters(result: Identification) -> Section:
 
 
 def _determined(result: Identification) -> Section:
-    """Return how well the arm is known, and what no measurement at these poses can tell."""
+    """Return how well the arm is known, and what these poses cannot determine."""
     sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
     return section(
         'determined',
         'What the poses determine',
         'Expected error of positions predicted over the whole joint range: '
-        f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm at most.',
+        f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm (largest).',
         f'Observability: {words.observability_in_words(result)}.',
         weak and f'Weakly determined (std above {1e3 * words.WEAK:g} mm or mrad): {weak}.',
         head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
@@ -346,11 +346,11 @@ def _correlations(result: Identification) -> Section:
     names, covariance = [result.names[k] for k in shown], result.covariance[np.ix_(shown, shown)]
     return section(
         'correlations',
-        'Which parameters stand in for each other',
-        'Two parameters of strong colour change together: the poses tell their combination '
-        'better than each alone. Predictions of the arm are not harmed.',
+        'Correlated parameters',
+        'Strong colours mark parameters that change together: the poses determine their '
+        'combination better than each alone. Predictions of the arm are not affected.',
         f'Strongest: {", ".join(some(strong))}.' if strong else 'None is above 0.9.',
-        'Effects beyond geometry are not drawn.' if beyond else '',
+        'Non-geometric effects are not drawn.' if beyond else '',
         figure=figures.correlations(names, covariance),
         height=max(360, 140 + 15 * len(shown)),
     )

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What pages of several kinds show alike: accuracy, identity, and figures of poses."""
+"""Sections shared by several pages: accuracy, identity, and figures of poses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from calib_ros.report.page import Origin, Section, section
 from calib_ros.report.poses import Poses
 
 ISO_9283 = (
-    'The error of a pose is its position accuracy AP of ISO 9283: from the pose commanded to the '
-    'mean of the poses attained. Measured once, its repeatability is part of it.'
+    'The error of a pose is its position accuracy AP of ISO 9283: from the commanded pose to the '
+    'mean of the attained poses. If measured once, it includes the repeatability.'
 )
 LABELS = (
-    *('RMS [mm]', '95 % interval of it', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
+    *('RMS [mm]', '95 % interval', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
     *('RMS orientation [mrad]', 'RMS [px]'),
 )
 """Rows of the table of accuracy below its head and count."""
@@ -52,7 +52,7 @@ def accuracy_section(
     with_outliers: ErrorFigures | None = None,
     intervals: bool = True,
 ) -> Section:
-    """Return the table of accuracy, before and after; `things` are what is counted."""
+    """Return the accuracy table, before and after; `things` are counted."""
     columns = [
         _column(name, found, interval_of(judged, when, INTERVAL) if intervals else None)
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
@@ -82,7 +82,7 @@ def identity_of(
     judged: tuple[str, str] = ('', ''),
     corrected: str = '',
 ) -> tuple[tuple[str, str], ...]:
-    """Return what the result is of, by whom and when; what is not told is left out."""
+    """Return the identity of the result: robot, people, times; unknown entries are omitted."""
     software = f'calib_ros {calib_ros.__version__}, Python {platform.python_version()}, '
     software += f'numpy {np.__version__}'
     rows = [
@@ -119,7 +119,7 @@ def distribution(poses: Poses) -> Section:
     )
     return section(
         'cumulated',
-        f'How many {poses.things} are within an error',
+        f'Share of {poses.things} within an error',
         'Outliers are left out.' if poses.outlier.any() else '',
         'The further left a curve, the better.',
         figure=figures.cumulated(before, after, poses.things),
@@ -133,7 +133,8 @@ def coverage(chain: Chain, joints: FloatArray, title: str) -> Section:
     return section(
         'coverage',
         title,
-        'Errors show only where a joint was: blank parts of its range hold no poses.',
+        'A joint shows its errors only where it was measured: blank parts of its range have no '
+        'poses.',
         figure=figure,
         head=('joint', 'range', 'poses from, to', 'parts with poses'),
         rows=rows,

@@ -26,7 +26,7 @@ def in_words(found: Verification) -> str:
         )
     lines += each_in_words(found)
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
-    wanted = '' if found.tolerance is None else f'; wanted is {1e3 * found.tolerance:g} mm'
+    wanted = '' if found.tolerance is None else f'; wanted: {1e3 * found.tolerance:g} mm'
     lines.append(
         f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
         f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
@@ -35,7 +35,7 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the poses [mm], of which there may be none."""
+    """Return the lines of a table of the poses [mm]; none without poses."""
     again = any(pose.repeatability is not None for pose in found.each)
     lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
@@ -45,42 +45,42 @@ def each_in_words(found: Verification) -> list[str]:
 
 
 def limits(found: Verification) -> list[str]:
-    """Return what the verdict does not tell."""
+    """Return what the verdict leaves open."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if not found.by_program:
         lines.append(
-            'this judges the calibration, not the robot with it: --commanded, the program before '
-            'its correction, tells whether the correction reaches the arm'
+            'this judges the calibration, not the corrected robot: give the uncorrected program '
+            '(--commanded) to test whether the correction reaches the arm'
         )
     turned = found.comparison.figures[1].rms_mrad
     moved = found.common < NEARER  # which explains it
     if turned is not None and turned > 1e3 * Settings.largest_angle and not moved:
         lines.append(
-            f'the orientations are {turned:.0f} mrad off, and only positions are judged: see how '
-            'they are written (order of the quaternion or angles, degrees), and the target'
+            f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
+            'their format (order of the quaternion or angles, degrees) and the target'
         )
     return lines
 
 
 def remarks(found: Verification) -> list[str]:
-    """Return what to know besides the figures, and what to do."""
+    """Return remarks on the figures, and what to do."""
     return [*limits(found), *hints(found)]
 
 
 def hints(found: Verification) -> list[str]:
-    """Return what was fitted anew, and where the error may come from."""
+    """Return what was refitted, and where the error may come from."""
     lines = []
     if found.fitted:
-        lines.append(f'fitted anew, before and after alike: {" and ".join(found.fitted)}')
+        lines.append(f'refitted, before and after alike: {" and ".join(found.fitted)}')
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide')
     if found.verdict == 'does not hold':
-        lines.append('the error is larger than it was when the calibration was made')
+        lines.append('the error has grown since the calibration was made')
     if found.common < NEARER:
         lines.append(
-            f'without one common shift and turn of all positions {100.0 * found.common:.0f} % of '
-            'the error would be left: was the measuring device moved? If it stands elsewhere on '
-            'purpose, --new-base fits its frame, and --new-tool that of another target'
+            'without one common shift and turn of all positions, only '
+            f'{100.0 * found.common:.0f} % of the error would remain: was the measuring device '
+            'moved? If on purpose, --new-base fits its frame, and --new-tool that of a new target'
         )
     return lines

@@ -82,7 +82,7 @@ def remarks(result: Identification) -> list[str]:
 
 
 def notes(result: Identification) -> list[str]:
-    """Return what there is to know of the parameters fitted, one thing each."""
+    """Return the remarks on the fitted parameters, one each."""
     found = []
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
@@ -131,17 +131,17 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
     if found.changed:
         reasons = '; '.join(reason_in_words(each) for each in found.changed)
         return False, (
-            f'the calibration in use does not fit any more, {reasons}: was it bumped? {text}; '
-            'measure 8 poses or more and call ~/identify, or calib_ros identify --previous'
+            f'the calibration in use no longer fits, {reasons}: was it bumped? {text}; measure '
+            'at least 8 poses and call ~/identify, or run calib_ros identify --previous'
         )
     if found.unexplained <= FALSE:
         return False, (
-            f'{text}, more than the calibration in use and noise explain, and no few parameters '
-            'do: measure new poses and call ~/identify'
+            f'{text}, more than the calibration in use and noise explain; no change of a few '
+            'parameters explains it: measure new poses and call ~/identify'
         )
     if previous.holds(1e-3 * found.before.rms_mm) is False:
         return False, _lost(previous, text)
-    return True, f'the calibration in use agrees with what was measured: {text}'
+    return True, f'the calibration in use agrees with the measurements: {text}'
 
 
 def verdict(
@@ -161,14 +161,13 @@ def verdict(
 
 def _lost(calibration: Calibration, text: str) -> str:
     return (
-        f'the calibration does not hold any more: {text}; it had '
-        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, the target or the robot '
-        'moved?'
+        f'the calibration no longer holds: {text}; it had '
+        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, target or robot moved?'
     )
 
 
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
-    """Return the result as one JSON document; `samples` is what became of the input."""
+    """Return the result as one JSON document; `samples` is the account of the input."""
 
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
@@ -243,19 +242,19 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
 
 def scatter_in_words(noise: Noise) -> str:
     """Return how much more is left than the device should leave."""
-    text = f'The error left is {noise.position:.2f} times the noise stated for the device'
+    text = f'The remaining error is {noise.position:.2f} times the stated device noise'
     if noise.orientation is not None:
         text += f', {noise.orientation:.2f} times in orientation'
     if noise.consistent:
-        return f'{text}: nothing but that noise (chi-squared test).'
+        return f'{text}: consistent with pure noise (chi-squared test).'
     if noise.position < 1.0:
         return f'{text}: the device is better than stated.'
     text += ': the device is worse than stated, or the arm has errors that this model lacks.'
-    return f'{text} The intervals are wider for it.'
+    return f'{text} The intervals are widened accordingly.'
 
 
 def drift_in_words(noise: Noise) -> str:
-    """Return what speaks for a drift of the device: errors shared in succession alone."""
+    """Return the evidence for drift of the device: errors shared in succession only."""
     return neighbours_in_words(noise) if noise.shared == ('successive',) else ''
 
 
@@ -265,11 +264,11 @@ NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other i
 def neighbours_in_words(noise: Noise) -> str:
     """Return which neighbours share errors, by how much, and what follows."""
     if not noise.shared:
-        return 'Neighbouring poses share no error that a test would find.'
+        return 'No test finds errors shared by neighbouring poses.'
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
     text = (
-        f'The errors of poses {" and ".join(parts)} are alike (correlation in brackets): the '
-        'device drifts, or the arm has errors that this model lacks.'
+        f'The errors of poses {" and ".join(parts)} are correlated (coefficient in brackets): '
+        'the device drifts, or the arm has errors that this model lacks.'
     )
     if (times := f'{noise.widened:.2f}') != '1.00':
         text += f' So standard deviations are {times} times those of independent errors.'
@@ -277,7 +276,7 @@ def neighbours_in_words(noise: Noise) -> str:
 
 
 def chance_in_words(chance: float) -> str:
-    """Return how well the gain stands against errors in succession."""
+    """Return how well the gain stands up to errors in succession."""
     share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'below 0.1'
     return (
         f'The chance that the improvement is only drift of the device is {share} % (share of '

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node offers around an identification: where to go next, how good where, corrections.
+"""The node's help around an identification: next pose, errors over the workspace, corrections.
 
     ~/next_pose          where to measure next, after every sample
     ~/workspace_error    the errors over the workspace, after every accepted identification
@@ -60,7 +60,7 @@ MOST_QUEUED = qos_profile_services_default.depth
 
 
 class Guide:
-    """Publishes what helps before and after an identification.
+    """Publish help before and after an identification.
 
     `guarded` makes a function of one that logs what it raises. The next pose is chosen among
     `candidates` (N, n), or among random ones within the limits.
@@ -95,13 +95,13 @@ class Guide:
         )
 
     def join(self, timeout: float) -> bool:
-        """Begin nothing more and wait [s] for what runs; return whether it has ended."""
+        """Begin nothing more and wait [s] for running work; return whether it has ended."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         running = [each for each in self._pending if not each.cancelled()]
         return not wait(running, timeout).not_done
 
     def figures(self) -> dict[str, Any]:
-        """Return for the diagnostics how far it has come, and what became of trajectories."""
+        """Return the diagnostics: progress of sampling, and the last trajectory."""
         estimate = self._session.estimate
         wanted = self._session.settings.wanted_accuracy
         known = {} if estimate is None else {'expected [mm]': f'{1e3 * estimate.sigma:.4f}'}
@@ -164,7 +164,7 @@ class Guide:
 
     def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_QUEUED:
-            self._refuse(f'{MOST_QUEUED} others wait already, send them more slowly')
+            self._refuse(f'{MOST_QUEUED} others are already waiting; send them more slowly')
         elif too_large := _too_large(data):
             self._refuse(too_large)
         else:
@@ -187,7 +187,7 @@ class Guide:
     def _corrected_by(self, message: Any, calibration: Calibration | None) -> tuple[Any, str]:
         if calibration is None:
             raise InputError(
-                'there is no accepted calibration to correct it by: call ~/identify or ~/load'
+                'there is no accepted calibration to correct it with: call ~/identify or ~/load'
             )
         compensator = _compensator(self._session.chain, calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
@@ -234,5 +234,5 @@ def _too_large(data: bytes) -> str:
         (points, MOST_POINTS, 'points'),
     ):
         if count > most:
-            return f'{count} {what}, at most {most} are taken'
+            return f'{count} {what}; the limit is {most}'
     return ''

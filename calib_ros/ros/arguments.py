@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node can be told at its start: its parameters, and launch arguments made of them.
+"""The node's parameters, and the launch arguments made from them.
 
 Launch arguments are strings. `ros_arguments` makes command line arguments of a node of them, each
 by the type of its parameter: `serial:=0012` stays text. No ROS is imported here: the launch files
@@ -39,64 +39,62 @@ BESIDE_SETTINGS = (
     Parameter(
         'chain',
         '',
-        'chain file or URDF of the robot, the name of one that calib_ros ships, or '
-        'robot_description: the URDF on that topic',
+        'chain file, URDF or name (calib_ros robots) of the robot, or robot_description: the '
+        'URDF on that topic',
     ),
-    Parameter('base_link', '', 'of a URDF: where the arm starts; default: its root'),
+    Parameter('base_link', '', 'first link of the arm in a URDF; default: its root'),
     Parameter(
-        'tip_link', '', 'of a URDF: where the arm ends; default: tool0, flange or its only end'
+        'tip_link', '', 'last link of the arm in a URDF; default: tool0, flange or its only end'
     ),
-    Parameter('serial', '', 'serial number of the robot, for the record'),
+    Parameter('serial', '', 'serial number of the robot'),
     Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
     Parameter(
         'history',
         '',
-        'folder in which results of ~/identify and ~/validate are filed by serial; default: none',
+        'folder or URL for the results of ~/identify and ~/validate, by serial; default: none',
     ),
-    Parameter('resume', False, 'go on with the newest journal of this robot'),
+    Parameter('resume', False, 'continue the newest journal of this robot'),
     Parameter(
         'allowed_folders',
         (),
-        'folders in which ~/save and ~/load may use files besides data_dir; default: none',
+        'folders besides data_dir that ~/save and ~/load may use; default: none',
     ),
-    Parameter(
-        'autoload', False, 'publish the newest saved calibration of this robot at the start'
-    ),
+    Parameter('autoload', False, 'publish the newest saved calibration of this robot at startup'),
     Parameter(
         'target_filename', '', 'file in data_dir that ~/save writes; default: a new one', False
     ),
     Parameter(
         'calibration_filename',
         '',
-        'file in data_dir that is published at the start and that ~/load reads; default: the '
-        'newest, by autoload or ~/load',
+        'file in data_dir to publish at startup and on ~/load; default: the newest, by autoload '
+        'or ~/load',
         False,
     ),
     Parameter(
         'socket',
         '',
-        'LOCATION/SOCKET, such as A/1, in which the ball on the flange sits when ~/capture is '
-        'called; default: none, a measurement is taken',
+        'LOCATION/SOCKET, such as A/1, that holds the ball when ~/capture is called; default: '
+        'none, a measurement is taken',
         False,
     ),
+    Parameter('marker_scale', 200.0, 'enlargement of the residual vectors', False, 0.0),
     Parameter(
-        'marker_scale', 200.0, 'residual vectors are drawn so many times as long', False, 0.0
-    ),
-    Parameter(
-        'candidates', '', 'table of poses (q1 ... qn) for ~/next_pose to choose; default: any'
+        'candidates',
+        '',
+        'table of poses (q1 ... qn) that ~/next_pose chooses from; default: any pose',
     ),
     Parameter(
         'base_frame',
         '',
-        "frame of the arm's base that is published on /tf_static in the frame of the "
-        'measurements; default: none',
+        "name under which the arm's base is published on /tf_static, in the frame of the "
+        'measurements; default: not published',
     ),
     Parameter(
         'flange_frame',
         '',
-        "frame of the arm's flange in which the target is published on /tf_static; default: none",
+        'flange frame in which the target is published on /tf_static; default: not published',
     ),
-    Parameter('target_frame', 'target', 'name of the target on /tf_static'),
+    Parameter('target_frame', 'target', 'frame name of the target on /tf_static'),
 )
 PARAMETERS = {
     each.name: each
@@ -106,23 +104,23 @@ PARAMETERS = {
             Parameter(each.name, each.default, fixed=each.name in STARTUP, **each.metadata)
             for each in fields(Settings)
         ),
-        Parameter('use_sim_time', False, 'time is that of /clock', False),
+        Parameter('use_sim_time', False, 'use the time of /clock', False),
     )
 }
 """All parameters of the node by name, in the order in which they are declared."""
 REMAPPED = {
-    'joint_states': 'topic of the joint states; default: joint_states',
-    'measured_pose': 'topic of the measured poses; default: measured_pose',
+    'joint_states': 'joint state topic; default: joint_states',
+    'measured_pose': 'measured pose topic; default: measured_pose',
 }
 """Launch arguments that remap a topic of the same name."""
 PLACED = {
     'namespace': 'namespace of the node and of its topics',
-    'params_file': 'parameter file of the node; what is given here as well comes before it',
+    'params_file': 'parameter file of the node; arguments given here override it',
 }
 
 
 def launch_arguments() -> dict[str, str]:
-    """Return the launch arguments of the node with what they are for.
+    """Return the launch arguments of the node with their descriptions.
 
     All are empty by default: what is not given is not passed, so that the parameter file, and
     the node's own defaults, hold.
@@ -132,7 +130,7 @@ def launch_arguments() -> dict[str, str]:
 
 
 def usage(program: str) -> argparse.ArgumentParser:
-    """Return a parser of what is not for ROS: of --help alone, which lists the parameters."""
+    """Return a parser of the arguments not for ROS: only --help, which lists the parameters."""
     lines = ['parameters:']
     for each in PARAMETERS.values():
         text = textwrap.fill(
@@ -143,7 +141,7 @@ def usage(program: str) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(
         prog=program,
         usage='%(prog)s --ros-args -p chain:=ur10e [-p NAME:=VALUE ...] [--params-file FILE]',
-        description='Calibrates a robot from its joint states and measured poses. Services, '
+        description='Calibrate a robot from its joint states and measured poses. Services, '
         'topics and files: docs/node.md',
         epilog='\n'.join(lines),
         formatter_class=argparse.RawDescriptionHelpFormatter,

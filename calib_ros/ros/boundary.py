@@ -32,7 +32,7 @@ Answer = tuple[bool, str]
 
 
 class Boundary:
-    """Logs by the node's logger what callbacks and services raise, and goes on."""
+    """Log exceptions of callbacks and services, and continue."""
 
     def __init__(self, logger: Any) -> None:
         self._logger = logger
@@ -54,7 +54,7 @@ class Boundary:
         return guarded
 
     def tried(self, what: str, work: Callable[[], Any]) -> Any:
-        """Return what a part of the work returns; None when it fails, which is told then."""
+        """Return the result of a part of the work; report a failure and return None."""
         try:
             return work()
         except Exception as err:
@@ -125,7 +125,7 @@ class DeferredTrigger:
     def _on_call(self, request: Any, response: Any) -> Any:
         def prepare() -> Answer:
             if self._running.is_set():
-                return False, 'refused: the call before is still running, wait for its answer'
+                return False, 'refused: the previous call is still running; wait for its answer'
             self._snapshot = [self._prepare()]
             return True, ''
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node says of itself once a second, whatever fails meanwhile."""
+"""The node's diagnostics, once a second, whatever else fails."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calib_ros.sampling.session import CalibrationSession
 
 
 class Diagnostics:
-    """Judges what goes on and publishes it."""
+    """Judge the state of the node and publish it."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def publish(self, status: str, answers: Callable[[], Mapping[str, Any]]) -> None:
-        """Publish how it goes, with the status in words, and what failed since the last time.
+        """Publish the state, with the status in words, and failures since the last time.
 
         `answers` returns what came of calls and requests.
         """
@@ -66,7 +66,7 @@ class Diagnostics:
         self._publisher.publish(message)
 
     def _judged(self, account: Account) -> tuple[bytes, str]:
-        """Return how grave what is wrong is, and what it is in words."""
+        """Return the diagnostic level and message."""
         wrong = [*self._namesakes(), *self._inputs.troubles()]
         fresh = {
             cause: count
@@ -82,7 +82,7 @@ class Diagnostics:
         return level, ''.join([self._archive.trouble, *(f'{text}; ' for text in wrong)])
 
     def _namesakes(self) -> list[str]:
-        """Return in words that there are other nodes of the same name; log it when they come."""
+        """Return a warning about other nodes of the same name; log it when they appear."""
         node = self._node
         me = (node.get_name(), node.get_namespace())
         count = node.get_node_names_and_namespaces().count(me)
@@ -90,11 +90,11 @@ class Diagnostics:
         if count < 2:
             return []
         words = (
-            f'{count} nodes are called {node.get_fully_qualified_name()}, and all of them answer '
-            'services: end one, or rename it (-r __node:=NAME)'
+            f'{count} nodes are named {node.get_fully_qualified_name()}, and all of them answer '
+            'services: stop one, or rename it (-r __node:=NAME)'
         )
         if before < 2:
-            node.get_logger().warning(f'{words}. One that was killed counts for some seconds')
+            node.get_logger().warning(f'{words}. A killed node still counts for some seconds')
         return [words]
 
     def _figures(self, account: Account) -> dict[str, Any]:

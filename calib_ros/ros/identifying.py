@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""An identification of the node's samples, on a snapshot of them and a thread of its own."""
+"""An identification on a snapshot of the node's samples, in its own thread."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ ANSWER_LENGTH = LONGEST // 2
 
 
 class Snapshot(NamedTuple):
-    """What an identification works on, and what it was called with."""
+    """The input of an identification, and its settings."""
 
     problem: Problem
     model: str
@@ -122,7 +122,7 @@ class Snapshot(NamedTuple):
 
 
 class Identifying:
-    """Identifies, tells the result in words, and hands over what is `accepted`.
+    """Identify, report the result in words, and hand over an `accepted` one.
 
     `configuration` returns what the node is set to as a parameter file.
     """
@@ -197,7 +197,7 @@ class Identifying:
             )
         else:
             if self._session.calibration is not None:
-                self.last += '; the last good calibration stays'
+                self.last += '; the last good calibration stays in use'
             self._keep_report(page)
         self.last += self._filer.identified(given.problem, result, self._session.settings)
         return result.accepted, self.last
@@ -221,14 +221,14 @@ class Identifying:
         if len(text) > ANSWER_LENGTH:
             path = self._archive.note(f'{text}\n')
             path = self._report or path
-            more = f' ... all of it: {path.name if path else "in the log"}'
+            more = f' ... full text: {path.name if path else "in the log"}'
             before, advice, _ = text.partition(self._advice or text)
             text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
         return success, text
 
 
 def _without_middle(text: str, longest: int) -> str:
-    """Return a text whose last clause, the advice, is whole; what stands before it is cut."""
+    """Return a text with its last clause, the advice, whole; the text before it is cut."""
     end = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
     room = longest - len(text) + end - 1
     if len(text) <= longest or not longest // 4 < room < end:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The topics that the node hears, and how well it hears them.
+"""The node's subscriptions, and how well they work.
 
 Messages wait in the queues of their subscriptions, serialised, until they are taken by the batch:
 no executor may serve these subscriptions. Nor may it wait for their events, of lost messages say:
@@ -42,15 +42,15 @@ class Hearing:
     rate: float = 0.0
     last: float | None = None
     deaf: str = ''
-    """What a publisher offers that is not what is asked for, in words."""
+    """The publisher's QoS that does not match the requested one, in words."""
     latched: bool = False
-    """True when it comes once and not again."""
+    """True if it comes only once."""
     lost: int = 0
-    """Messages that got lost on the way, as DDS tells by their numbers."""
+    """Messages lost in transit, as DDS counts them."""
     told: int = 0
-    """The total of which DDS told last."""
+    """The last total reported by DDS."""
     full: int = 0
-    """How often the queue was found full, so that messages may be lost."""
+    """How often the queue was full, so that messages may be lost."""
     lost_before: int = 0
     losing: bool = False
     """True when either has grown between the last two looks."""
@@ -84,7 +84,7 @@ class Hearing:
 
 
 class _Due:
-    """The wait set of one event that is looked at, whether it has come or not."""
+    """The wait set of one event that is polled."""
 
     def add_event(self, event: object) -> int:
         """Take the event; return its number."""
@@ -115,7 +115,7 @@ class Inputs:
         return entity in self._inputs or entity in self._events
 
     def take(self) -> list[tuple[Stream, bytes]]:
-        """Return what has come since the last call, in the order in which it came."""
+        """Return the messages since the last call, in order of arrival."""
         come = []
         for subscription, (stream, heard) in self._inputs.items():
             found = _waiting(subscription)
@@ -131,7 +131,7 @@ class Inputs:
         return [topic for topic, heard in self._heard.items() if heard.count]
 
     def look(self) -> None:
-        """Note what was lost or not heard since the last look, and at which rates it came."""
+        """Note losses, silence and rates since the last look."""
         for event, known in self._events.items():
             event.add_to_wait_set(_Due())
             event.is_ready(_Due())
@@ -147,9 +147,7 @@ class Inputs:
     def troubles(self) -> list[str]:
         """Return in words which topics are not heard as they should be."""
         wrong = [
-            f'nothing is heard on {topic} any more'
-            for topic, heard in self._heard.items()
-            if heard.silent
+            f'no more messages on {topic}' for topic, heard in self._heard.items() if heard.silent
         ]
         wrong += [
             f'{topic} is published {heard.deaf} is asked for'
@@ -161,11 +159,11 @@ class Inputs:
         wrong += [words for links in links_of(streams) for words in links.problems()]
         losing = [topic for topic, heard in self._heard.items() if heard.losing]
         if losing:
-            wrong.append(f'messages get lost on {", ".join(losing)}')
+            wrong.append(f'messages are lost on {", ".join(losing)}')
         return wrong
 
     def figures(self) -> dict[str, Any]:
-        """Return for the diagnostics what was heard on each topic."""
+        """Return the diagnostics of each topic."""
         now = time.monotonic()
         found: dict[str, Any] = {}
         for topic, each in self._heard.items():
@@ -213,7 +211,7 @@ class Inputs:
         )
 
     def _of_other_types(self) -> list[str]:
-        """Return in words what is published as another type on topics that are not heard."""
+        """Return in words the topics published with another type, and so not heard."""
         found = {}
         for subscription, (stream, heard) in self._inputs.items():
             topic = subscription.topic_name

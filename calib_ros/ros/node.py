@@ -57,7 +57,7 @@ TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
 """Time [s] between two times at which the messages that have come are taken, all at once: one at
 a time, each in a cold cache, they cost three times as much."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD
-"""Time [s] for which the end waits for what was begun."""
+"""Time [s] for which the shutdown waits for running work."""
 STATUS_LENGTH = 120
 """Most characters of the status: `ros2 topic echo` cuts texts at 128."""
 
@@ -245,14 +245,14 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self.get_logger().info(f'resumed {len(samples)} poses of {self._archive.journal}')
 
     def _load_at_start(self) -> None:
-        """Publish the calibration of before if that is wanted, or say that there is one."""
+        """Publish an earlier calibration if wanted, or report that there is one."""
         path, wanted = self._keeper.at_start()
         log = self.get_logger()
         if wanted:
             try:
                 log.info(f'{self._on_load(None)[1]}: it is published')
             except Exception as err:  # whatever is wrong with a file, samples can be taken
-                self._identifying.last = f'no calibration is published at the start: {err}'
+                self._identifying.last = f'no calibration is published at startup: {err}'
                 log.error(self._identifying.last)
         elif path is not None:
             log.info(
@@ -265,7 +265,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     # Services
 
     def _up_to_now(self, begin: Callable[..., Any], *arguments: Any) -> Any:
-        """Begin what a call asks for, with all that has come before it."""
+        """Begin the work of a call, with all messages received before it."""
         self._take_messages()
         return begin(*arguments)
 
@@ -306,7 +306,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         count = len(self.session.samples)
         old = self._archive.begin_anew()
         self.session.clear()
-        kept = f'; they stay in {old}' if old else ''
+        kept = f'; they remain in {old}' if old else ''
         return True, f'{count} poses cleared{kept}; the calibration stays'
 
     def _on_record(self, request: Any) -> Answer:
@@ -329,7 +329,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._boundary.tried('the corrected pose', self._keeper.publish_pose)
 
     def _on_second(self) -> None:
-        """Do what is due once a second; a part that fails does not keep the others from it."""
+        """Do the work of each second; a failing part does not stop the others."""
         tried = self._boundary.tried
         tried('taking messages', self._take_messages)
         tried('the journal', self._archive.write)

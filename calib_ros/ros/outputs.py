@@ -161,7 +161,7 @@ class Keeper:
         return written
 
     def at_start(self) -> tuple[Path | None, bool]:
-        """Return which calibration there is to load, and whether it shall be at the start."""
+        """Return the calibration to load, and whether to load it at startup."""
         named = self._named('calibration_filename')
         path = named or self._archive.newest_calibration()
         return path, path is not None and (named is not None or self._given.autoload)
@@ -180,7 +180,8 @@ class Keeper:
         serial, ours = calibration.record.get('robot_serial'), self._given.serial
         if serial and ours and serial != ours:
             raise InputError(
-                f'{path} is the calibration of the robot with serial "{serial}", this is "{ours}"'
+                f'{path} is the calibration of the robot with serial "{serial}"; this one is '
+                f'"{ours}"'
             )
         self.adopt(calibration, Published(text, ''))
         return path

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the node is set to: parameters with their ranges, and the robot that they name.
+"""The node's settings: parameters with their ranges, and the robot they name.
 
 Every field of `Settings` is a parameter of the same name, with its text and its smallest value;
 `arguments.py` lists the others.
@@ -44,15 +44,15 @@ class Given(SimpleNamespace):
 
     @property
     def links(self) -> dict[str, Any]:
-        """Return the links of a URDF between which the arm is; None for those that are found."""
+        """Return the first and last link of the arm in a URDF; None for those to be found."""
         return {'base_link': self.base_link or None, 'tip_link': self.tip_link or None}
 
 
 def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     """Declare all parameters of the node; return what they were set to, and the names that were.
 
-    The node was told to declare what is set by itself, for rclpy tells no other way what that is.
-    Each is declared anew here, with what it is for. A value that cannot be is a ConfigError.
+    The node declares all parameters that are set, because rclpy lists them in no other way. Each
+    is declared again here, with its description. An impossible value is a ConfigError.
     """
     overrides = {
         name: each.value
@@ -77,7 +77,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
-    """Return settings with what changes of parameters make of them."""
+    """Return settings with changed parameters applied."""
     values = {
         each.name: parse_like(getattr(Settings, each.name), each.value, each.name)
         for each in changes
@@ -87,25 +87,25 @@ def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
 
 
 def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
-    """Return the nominal chain, and the URDF that it comes from if it does."""
+    """Return the nominal chain, and its URDF if it comes from one."""
     name, links = given.chain, given.links
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         topic = node.resolve_topic_name('robot_description')
-        node.get_logger().info(f'waiting for {topic}, {DESCRIPTION_WAIT:g} s at most')
+        node.get_logger().info(f'waiting up to {DESCRIPTION_WAIT:g} s for {topic}')
         found, message = wait_for_message(
             String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
         )
         if not found:
             raise ConfigError(
-                f'no robot_description has come within {DESCRIPTION_WAIT:g} s: start '
+                f'no robot_description arrived within {DESCRIPTION_WAIT:g} s: start '
                 'robot_state_publisher first, or set chain to a file'
             )
         text = message.data
     elif Path(name).suffix in URDF_SUFFIXES:
         text = read_text(Path(name))
     elif any(links.values()):
-        raise ConfigError('base_link and tip_link are of use with a URDF only')
+        raise ConfigError('base_link and tip_link apply only to a URDF')
     else:
         return load_chain(name), ''
     return replace(chain_from_urdf(text, **links), base=None, tool=None), text

@@ -90,7 +90,7 @@ def cloud(fields: Sequence[str], rows: FloatArray, frame_id: str, stamp: Any) ->
 def residual_markers(
     result: Identification, sets: Sequence[Observations], scale: float, stamp: Any
 ) -> MarkerArray:
-    """Return what is left at each measured position, drawn `scale` times as long as it is.
+    """Return the residual at each measured position, enlarged `scale` times.
 
     A line from the measured position towards the predicted one: green for a small residual, red
     for one of three times the RMS and beyond.

@@ -40,13 +40,13 @@ from calib_ros.settings import Settings
 REST_S = 0.5 * Settings.shortest_stop
 """Time [s] during which joints must have stayed where they are to be standing."""
 TWICE = 'same stamp twice'
-CONTRARY = 'other values with the same stamp (of two publishers, or stamps too coarse?)'
+CONTRARY = 'different values with the same stamp (two publishers, or stamps too coarse?)'
 ADVANCE_NS = round(5e9 * REST_S)
 """Time of the newest joint sample between two rounds of taking samples."""
 
 
 class Collector:
-    """Bounded buffers of joint samples and measurements, and what they are made into.
+    """Bounded buffers of joint samples and measurements, and the samples made from them.
 
     Joints that are `revolute` (n,) have angles for values.
     """
@@ -64,7 +64,7 @@ class Collector:
         self.rests = Rests(settings.pose_buffer)
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
-        """How much later than the joints' the stamps of measurements are."""
+        """The delay of measurement stamps after joint stamps."""
         self.holding = False
         """True while the delay is being looked for, so that nothing may be taken."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
@@ -100,7 +100,7 @@ class Collector:
         if self.track.full:  # the older half is let go: nothing may be held any longer
             self._round(self._complete_ns)
         if self.track.full:
-            self.notes['joint states let go, the joint buffer was full'] += self.track.halve()
+            self.notes['joint states dropped, the joint buffer was full'] += self.track.halve()
         count = len(given)
         joints = given.where(JOINTS)
         stamps = given.times[joints]
@@ -210,13 +210,13 @@ class Collector:
                 rows.release(rows.count)
 
     def state(self) -> str:
-        """Return in words what the arm does, as far as samples are concerned."""
+        """Return in words the state of the arm, as far as samples are concerned."""
         self._sort()
         newest = self.track.newest_ns
         if not newest or self.track.missing:
             return 'waiting for joint states'
         if self.holding:
-            return 'looking for the delay of the measurements: keep the arm moving'
+            return 'estimating the measurement delay: keep the arm moving'
         if self.settings.mode == 'continuous':
             return 'every measurement is taken'
         stands = self.track.standing(self.settings.still, REST_S)
@@ -237,13 +237,13 @@ class Collector:
         stands = self.track.standing(self.settings.still, REST_S)
         newest = self.track.newest_ns
         if not newest:
-            return 0, 'no joint states have come'
+            return 0, 'no joint states received'
         if not (self.waiting.count or place):
-            return 0, 'no measurements have come since the last pose'
+            return 0, 'no measurements since the last pose'
         shortest = round(self.settings.shortest_stop * 1e9)
         if not len(stands) or stands[-1, 1] < newest or newest - stands[-1, 0] < shortest:
             return 0, (
-                f'the arm has not stood for {self.settings.shortest_stop:g} s yet '
+                f'the arm has not been still for {self.settings.shortest_stop:g} s yet '
                 f'(no joint further than {self.settings.still:g} rad or m)'
             )
         begin = int(stands[-1, 0])
@@ -350,7 +350,7 @@ class Collector:
             if len(good):
                 more = len(good) - len(np.unique(numbers[good]))
                 if key.images and more:
-                    self.unused['measurements: of a stop of which one image is used'] += more
+                    self.unused['measurements: another image of a stop that has one'] += more
                 motion = self.track.at(stamps[good], standing=not moving)
                 piece = Piece(key, numbers[good], rows.stamps[good], rows.values[good])
                 begins = np.flatnonzero(np.diff(piece.places, prepend=-1))

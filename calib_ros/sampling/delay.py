@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How late a measuring device stamps, from the motion itself.
+"""The delay of a measuring device's stamps, from the motion itself.
 
 The speed of the target by the joints and the chain, and the speed by the measurements, are the
 same signal twice. Angular speed depends on no frame; linear speed is that of the flange, near
@@ -44,7 +44,7 @@ MOST_TIME = 100.0 * LEAST_MOTION
 
 @dataclass(frozen=True)
 class Delay:
-    """How much later than the joints' the stamps of measurements are, and how sure it is."""
+    """The delay of measurement stamps after joint stamps, and its certainty."""
 
     seconds: float
     correlation: float
@@ -258,7 +258,7 @@ class Clocks:
         return begun - WATCH_NS, begun + WATCH_NS
 
     def look(self, now_ns: int) -> None:
-        """Look what the motion shows if it is time to, and begin anew."""
+        """Evaluate the motion if it is time to, and start again."""
         if not (self._awake and self._begun_ns and abs(now_ns - self._begun_ns) > WATCH_NS):
             return
         joints, poses = self._joints, self._poses.values()

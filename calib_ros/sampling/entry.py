@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is let in by the names in messages: joints, frames, targets; and the samples kept."""
+"""Admission by the names in messages (joints, frames, targets), and the samples kept."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class JointNames:
         self._names = names
         self._layouts: dict[tuple[str, ...], Layout] = {}
         self.foreign: tuple[str, ...] = ()
-        """Names that come while some of the chain's joints are never named."""
+        """Names received while some of the chain's joints are never named."""
 
     def layout(self, key: tuple[str, ...]) -> Layout:
         """Return which joints of the chain messages name, and the columns of their values."""
@@ -51,7 +51,7 @@ class JointNames:
         if not (missing and self.foreign):
             return ''
         return (
-            f'waiting for joint states, set joint_names? Those that come name '
+            f'waiting for joint states, set joint_names? Those received name '
             f'{", ".join(self.foreign)}, not {", ".join(self._names[k] for k in missing)}'
         )
 
@@ -112,7 +112,7 @@ class FrameNames:
 
 def strange(frame_id: str, usual: str) -> str:
     """Return in words that a measurement is not in the frame in which others are."""
-    return f'in frame "{frame_id}", not in "{usual}" as others'
+    return f'in frame "{frame_id}", not in "{usual}" like the others'
 
 
 class Part(NamedTuple):
@@ -124,7 +124,7 @@ class Part(NamedTuple):
 
 
 class Entry:
-    """Lets in what can be used and counts what cannot, by its cause."""
+    """Admit usable messages and count the others by cause."""
 
     def __init__(self, names: JointNames, frames: FrameNames, joint_count: int) -> None:
         self._names, self._frames, self._joint_count = names, frames, joint_count
@@ -206,7 +206,7 @@ class Entry:
                 yield Piece(key, places, readings.stamps_ns, readings.numbers)
 
     def _by_frame(self, parts: Sequence[Part]) -> list[Part]:
-        """Return measurements one by one while it is open which of several frames is the usual."""
+        """Return measurements one by one while the usual one of several frames is undecided."""
         frames: dict[str, set[str]] = {}
         for each in parts:
             assert each.source is not None

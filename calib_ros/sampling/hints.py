@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What became of the messages, what looks wrong, and how far the samples are, in words."""
+"""The account of the messages, what looks wrong, and the progress of sampling, in words."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
 from calib_ros.settings import EXCEPTION, Settings
 
-LOST = 'were dropped for their stamps or for want of room'
+LOST = 'were dropped (stamps or full buffers)'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
-_TWICE = re.compile(r'same stamp twice|is there already')
+_TWICE = re.compile(r'same stamp twice|already exists')
 
 
 @dataclass(frozen=True)
 class Account:
-    """What became of the messages: how many came, how many samples, what was dropped and why."""
+    """Account of the messages: how many arrived, how many samples, what was dropped and why."""
 
     joint_states: int
     poses: int
@@ -49,7 +49,7 @@ class Account:
         if self.configurations < self.samples:
             text += f', {self.configurations} of them different'
         if self.waiting:
-            text += f', {self.waiting} measurements wait'
+            text += f', {self.waiting} measurements waiting'
         for label, counts in (
             ('not used', self.unused),
             ('dropped', self.dropped),
@@ -60,8 +60,8 @@ class Account:
                 text += f'; {label}: {parts}'
         if self.foreign_names:
             text += (
-                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints of '
-                'the chain by other names, set joint_names (--joint-names)'
+                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints '
+                'of the chain under other names, set joint_names (--joint-names)'
             )
         return text
 
@@ -80,14 +80,15 @@ def restless(needed: float, still: float) -> Hint:
     """
     if needed > SCATTER:
         return Hint(
-            'joint values jump to and fro: do two robots publish them?',
-            f'the joint values jump to and fro by {needed:.2g}: do two robots publish joints of '
-            'the same names? Give each a topic of its own, and set joint_topics to that of this',
+            'joint values jump back and forth: do two robots publish them?',
+            f'the joint values jump back and forth by {needed:.2g}: do two robots publish the '
+            'same joint names? Give each its own topic, and set joint_topics to that of this '
+            'robot',
         )
     return Hint(
         f'joints hardly ever rest within still: set still to {needed:.2g}',
-        f'the joints hardly ever rest within still ({still:g}), though the arm stands: their '
-        f'values are noisy, set still to {needed:.2g}, 6 x their noise',
+        f'the joints hardly ever rest within still ({still:g}), though the arm is at rest: their '
+        f'values are noisy; set still to {needed:.2g}, 6 x their noise',
     )
 
 
@@ -110,20 +111,20 @@ def apart(ahead: float) -> Hint:
     """
     words = (
         f'the newest measurement is stamped {abs(ahead):.0f} s '
-        f'{"after" if ahead > 0.0 else "before"} the newest joint state: make the clocks of '
-        'both agree (NTP, PTP), if both still come'
+        f'{"after" if ahead > 0.0 else "before"} the newest joint state: synchronise the clocks '
+        '(NTP, PTP), if both still arrive'
     )
-    return Hint(f'stamps disagree by {abs(ahead):.0f} s: make the clocks agree', words)
+    return Hint(f'stamps disagree by {abs(ahead):.0f} s: synchronise the clocks', words)
 
 
 def unsettled(refused: int, stops: int) -> list[Hint]:
-    """Tell that many of the stops are refused because what is measured moves at them."""
+    """Report that many stops are refused because the target moves at them."""
     if refused < START or refused <= EXCEPTION * stops:
         return []
     words = (
-        f'{refused} of {stops} stops are refused: what is measured still moves while the joints '
-        'stand. Stand longer and set settle to the time until it rests, do not let the device '
-        'smooth, and check that the target is firm and that the arm does not creep'
+        f'{refused} of {stops} stops are refused: the target still moves while the joints are at '
+        'rest. Stop for longer and set settle to the settling time, turn smoothing in the device '
+        'off, and check that the target is firm and the arm does not creep'
     )
     return [Hint(f'{refused} of {stops} stops still move where measured: set settle', words)]
 
@@ -161,8 +162,8 @@ def disagreement(delay: float, known: float) -> Hint:
     words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
     return Hint(
         f'stamps disagree: set delay to {delay:.3f}',
-        f'measurements are stamped {words} than the joint states of their time: '
-        f'set delay to {delay:.3f}, or make the clocks agree',
+        f'measurements are stamped {words} than joint states of the same time: set delay to '
+        f'{delay:.3f}, or synchronise the clocks',
     )
 
 
@@ -171,8 +172,8 @@ def ambiguous(delays: Sequence[float]) -> Hint:
     words = ' or '.join(f'{round(delay, 2) + 0.0:.2f}' for delay in sorted(delays))
     return Hint(
         f'delay not clear, {words} s: move less regularly',
-        f'the delay of the measurements may be {words} s, for the motion repeats itself: none is '
-        'used. Move less regularly for 15 s, or set delay',
+        f'the measurement delay is ambiguous ({words} s) because the motion repeats itself: none '
+        'is used. Move less regularly for 15 s, or set delay',
     )
 
 
@@ -180,9 +181,9 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
     """Tell by how much [s] the clocks moved against each other, and after how many samples."""
     words = ', '.join(f'by {seconds:+.3f} s after about {count}' for seconds, count in steps)
     return Hint(
-        f'clocks moved after about {max(count for _, count in steps)} poses: make them agree',
-        f'the stamps of the measurements moved against those of the joint states {words} poses: '
-        'make the clocks agree, and measure again what came after',
+        f'clocks shifted after about {max(count for _, count in steps)} poses: synchronise them',
+        f'measurement stamps shifted against joint stamps {words} poses: synchronise the clocks, '
+        'and repeat the later measurements',
     )
 
 
@@ -198,17 +199,16 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
         return None
     where = ', '.join(f'{value:g}' for value in place[3:])
     return Hint(
-        f'{len(joints)} poses are one and the same: is the device frozen?',
+        f'{len(joints)} poses are identical: is the device frozen?',
         f'{len(joints)} poses are at {where} m, though the arm was elsewhere each time: does the '
-        'device see the target, and does its driver send what it measures now? Clear and measure '
-        'again',
+        'device see the target, and does its driver send live data? Clear and measure again',
     )
 
 
 def progress(
     chain: Chain, fitted: Sequence[FloatArray], estimate: Estimate | None, settings: Settings
 ) -> list[str]:
-    """Return how many samples there are to fit, what they promise, and which joints hardly moved.
+    """Return the number of samples to fit, their expected accuracy, and joints that hardly moved.
 
     `fitted` holds the joint values (n,) of each.
     """
@@ -220,13 +220,13 @@ def progress(
 
 
 def _forecast(estimate: Estimate, settings: Settings) -> str:
-    """Return in words what it takes until positions are known as well as wanted."""
+    """Return in words what is still needed for the wanted accuracy."""
     wanted = settings.wanted_accuracy
     more = estimate.more_for(wanted)
     if not more:
         return 'enough for the accuracy wanted'
     if estimate.excess is None:
-        return 'too few to tell how many it takes'
+        return 'too few to predict how many are needed'
     if estimate.excess * NEARER > 1.0:  # not by chance, even with the fewest samples
         advice = 'is the target firm? More'
         if settings.model == 'geometric':

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values between samples, and from which side each joint came there."""
+"""Joint values between samples, and the direction in which each joint arrived."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The estimate while samples are being taken: what is known so far, and how many more it takes.
+"""The estimate during sampling: what is known so far, and how many more samples are needed.
 
 At a chain that is near enough, every sample adds its share J^T W J and J^T W r to the information
 matrix and vector, so the estimate and its covariance follow each sample at the cost of that sample
@@ -9,7 +9,7 @@ that has gone further than the linear model holds. Wide priors stand for what no
 yet; at the end they weigh nothing, and the estimate is that of the batch.
 
 A sample that lies too far from where the others predict it is left out as suspicious. The first
-ones cannot be judged so, because the estimate bends to them. So it begins anew, from the nominal
+ones cannot be judged so, because the estimate bends to them. So it starts again, from the nominal
 chain and by the robust fit of the identification (`robust.py`), each time the number of samples
 has grown by a quarter: an early gross error is found, and what was left out wrongly comes back.
 
@@ -107,7 +107,7 @@ class LiveEstimate:
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
-        """Samples that lie too far from what the others predict; they are left out here."""
+        """Samples too far from the prediction of the others; they are ignored here."""
         self.refused = ''
         """Why the samples can be no problem, in words; empty if they can."""
 
@@ -192,7 +192,7 @@ class LiveEstimate:
             self._linearise(self._estimate())
 
     def _linearise(self, chain: Chain) -> None:
-        """Begin the information anew at a chain, with the samples taken so far."""
+        """Restart the information at a chain, with the samples taken so far."""
         inverse, residual = self._prior.rows(chain, self._names)
         self._chain = chain
         self._information = np.diag(inverse**2)
@@ -295,7 +295,7 @@ class LiveEstimate:
         )
 
     def _excess(self, chain: Chain) -> float:
-        """Return the RMS residual of positions in units of what measurements scatter by."""
+        """Return the RMS residual of positions in units of the measurement scatter."""
         chosen = np.linspace(0, len(self._added) - 1, SOME).round().astype(int)
         some = [self._added[k] for k in np.unique(chosen)]
         total = 0.0

@@ -26,7 +26,7 @@ ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]
 """A sample with the number of the round or the stop in which it was taken."""
 VIBRATING = 'measurements: still vibrating, or a spike'
-RESTLESS = 'measurements: a stop that spreads more than the noise'
+RESTLESS = 'measurements: a stop with more spread than noise'
 
 
 class Maker:
@@ -105,7 +105,7 @@ class Maker:
     def _of_images(
         self, found: Piece, motion: Motion, begins: Index, came: FloatArray, delay: float
     ) -> Iterator[Numbered]:
-        """Yield a sample of the images of each stop, of which one will be looked at."""
+        """Yield a sample of the images of each stop, one of which will be processed."""
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
         ends = np.append(begins[1:], len(values))
@@ -158,7 +158,7 @@ class Maker:
         """Yield a sample of measurements (N, ROW_WIDTH), unless there is one or no room."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
-            self.dropped['measurements: a pose with this stamp is there already'] += len(rows)
+            self.dropped['measurements: a pose with this stamp already exists'] += len(rows)
             return
         if len(known) >= self._capacity:
             self.dropped['measurements: the memory for poses is full'] += len(rows)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to numbers, and the sources that they come from.
+"""ROS messages to numbers, and their sources.
 
 Messages are read by their attributes only: rclpy's and rosbags' messages alike. What cannot be
 used is told by its cause, under which it is counted. A source says what comes on a topic, and
@@ -210,7 +210,7 @@ class Source:
     lens: str = 'given'  # by that topic, or `fitted` from there on
 
     def __post_init__(self) -> None:
-        """Refuse what no bag or node could use."""
+        """Refuse what neither bag nor node could use."""
         if self.type and self.type not in TYPES:
             raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
         frames = {self.parent, self.child} - {''}
@@ -251,7 +251,7 @@ STANDARD = (
     Source('validation_pose', 'geometry_msgs/msg/PoseStamped', validation=True),
     Source('validation_point', 'geometry_msgs/msg/PointStamped', validation=True),
 )
-"""What the node listens to unless it is told otherwise."""
+"""Default subscriptions of the node."""
 
 
 def parse_source(text: str) -> Source:

@@ -28,11 +28,11 @@ from calib_ros.texts import LARGEST_TABLE
 MOST_BYTES = 5 * LARGEST_TABLE
 """Size of the images that are kept: six seconds of 30 Hz at 2 megapixels in grey."""
 MOST_WAITING = 4
-"""Images that may wait to be looked at; an arm that stops so often that more come loses some."""
+"""Images that may wait for processing; if more arrive, some are dropped."""
 
 
 class Refusal(NamedTuple):
-    """Why an image is not used: by its kind, and with what was found in it."""
+    """Why an image is not used: its kind, and what was found in it."""
 
     cause: str
     reason: str
@@ -49,7 +49,7 @@ class Camera(Protocol):
 
 
 class Pictures:
-    """Keeps images, and makes samples of those that are looked at.
+    """Keep images, and make samples of the processed ones.
 
     `sigma` returns the standard deviation of a corner [px].
     """
@@ -88,7 +88,7 @@ class Pictures:
             del self._kept[number]
 
     def through(self, made: Sequence[Sample]) -> None:
-        """Begin to look at the images of samples; they come out of `ready`."""
+        """Begin to process the images of samples; `ready` returns them."""
         for sample in made:
             if not sample.images:
                 self._queue.append((sample, None))
@@ -118,13 +118,13 @@ class Pictures:
         busy = [looked for looked in waiting if not looked.done()]
         if len(busy) >= MOST_WAITING:
             if not self.patient:
-                self.dropped['measurements: image while others were looked at'] += sample.count
+                self.dropped['measurements: image while others were processed'] += sample.count
                 return None
             busy[0].exception()
         middle = len(sample.images) // 2
         kept = [k for k, number in enumerate(sample.images) if number in self._kept]
         if not kept:
-            self.dropped['measurements: image let go, the memory for them was full'] += (
+            self.dropped['measurements: image dropped, the memory for them was full'] += (
                 sample.count
             )
             return None

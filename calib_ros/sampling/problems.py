@@ -37,7 +37,7 @@ def check_settings(chain: Chain, settings: Settings) -> None:
     if settings.mode == 'continuous' and any(
         each.board for each in parse_sources(settings.sources)
     ):
-        raise ConfigError('images are looked at where the arm stands: mode must not be continuous')
+        raise ConfigError('images are used only at stops of the arm: mode must not be continuous')
     nothing = np.zeros((0, len(chain.joints)))
     empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
     Problem(chain, empty, **settings.for_problem())
@@ -111,8 +111,7 @@ def in_frames_of(
     known = calibration.chain.frame_names
     if not all(each.base in known and each.tool in known for each in sets):
         raise InputError(
-            'the poses since were measured by a device or on a target that the '
-            'calibration does not know'
+            'the new poses come from a device or target that the calibration does not know'
         )
     return sets
 

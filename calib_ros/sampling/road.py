@@ -57,7 +57,7 @@ class Gate:
             begin += count
 
     def release(self) -> list[Slice]:
-        """Return what is held back: nothing more comes that could tell."""
+        """Return what is held back: no later message can decide."""
         found, self._held = self._held, []
         return [item for _, _, item in found]
 
@@ -111,7 +111,7 @@ class Gate:
         return not lasts or any(abs(time_ns - last) <= self._far_ns for last in lasts)
 
     def _now_near(self) -> list[Slice]:
-        """Let through what is held back and not far from others any more."""
+        """Release held messages that are no longer far from others."""
         found = []
         for each in tuple(self._held):
             if self._is_near(each[1]):

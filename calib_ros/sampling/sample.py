@@ -106,7 +106,7 @@ class Frames:
         )
 
     def _own(self, name: str, owner: Owner) -> str:
-        """Return a name that is no one else's: a device may be called like a session."""
+        """Return a unique name: a device may have the name of a session."""
         while self._owners.setdefault(name, owner) != owner:
             name += '_'
         return name

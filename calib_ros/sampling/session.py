@@ -39,17 +39,16 @@ from calib_ros.settings import Settings
 
 NOT_RECORDING = 'not recording: call ~/record with true'
 ONE_FRAME = (
-    'one is needed: set frame_id (--frame-id) to the one to use, or start again with a device of '
-    'its own for each source'
+    'only one may be used: set frame_id (--frame-id) to it, or start again with a separate '
+    'device for each source'
 )
 
 
 class CalibrationSession:
-    """Takes messages, keeps the samples, identifies, and keeps the last good result.
+    """Take messages, keep the samples, identify, and keep the last good result.
 
-    `on_sample` is called with every sample as soon as it is taken, `on_removed` with every one
-    that is taken back. What cannot be done is an InputError, settings that cannot be a
-    ConfigError.
+    `on_sample` is called with every sample as soon as it is taken, `on_removed` with every removed
+    one. Impossible requests raise InputError, impossible settings ConfigError.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class CalibrationSession:
         )
 
     def change(self, settings: Settings) -> None:
-        """Go on with other settings; the buffers and samples stay.
+        """Continue with other settings; the buffers and samples stay.
 
         Settings that no identification could use change nothing.
         """
@@ -113,18 +112,18 @@ class CalibrationSession:
             self._settle()
 
     def miss(self, kind: str, count: int, cause: str) -> None:
-        """Count messages that came and cannot be used."""
+        """Count received messages that cannot be used."""
         self._entry.miss(kind, count, cause)
 
     def finish(self) -> None:
-        """Make samples of everything that still waits; nothing more will come."""
+        """Make samples of all waiting messages; no more will arrive."""
         self._road.finish()
         self._settle(wait=True)
         self._kept.leave_out_strange()
 
     @property
     def received(self) -> Counter[str]:
-        """Return how many messages came so far, by kind."""
+        """Return the number of messages received so far, by kind."""
         return self._entry.received
 
     @property
@@ -135,9 +134,9 @@ class CalibrationSession:
     # Samples
 
     def capture(self, socket: str = '') -> tuple[int, str]:
-        """Take one sample of each source now; return how many, and why none if so.
+        """Take one sample of each source now; return how many, and the reason if none.
 
-        With a `socket` LOCATION/SOCKET the ball at the target sits in it, and only that is taken.
+        With a `socket` LOCATION/SOCKET the ball sits in it, and only that sample is taken.
         """
         if not self.recording:
             return 0, NOT_RECORDING
@@ -151,21 +150,21 @@ class CalibrationSession:
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
     def remove_last(self) -> Sample:
-        """Take back the last sample."""
+        """Remove the last sample."""
         if not self.samples:
             raise InputError('there is no pose to remove')
         sample = self.samples.pop()
-        self._entry.unused['measurements: of a pose that was taken back'] += sample.count
+        self._entry.unused['measurements: of a removed pose'] += sample.count
         self._collector.forget(sample)
         self.on_removed(sample)
         return sample
 
     def restore(self, samples: Sequence[Sample]) -> None:
-        """Go on with samples taken before."""
+        """Continue with earlier samples."""
         for sample in samples:
             if sample.joints.shape != (len(self.chain.joints),):
                 raise InputError(
-                    f'poses to go on with have {len(sample.joints)} joint values, chain '
+                    f'poses to resume have {len(sample.joints)} joint values, chain '
                     f'"{self.chain.name}" has {len(self.chain.joints)} joints'
                 )
             if sample.frame_id:
@@ -181,7 +180,7 @@ class CalibrationSession:
 
     @property
     def usable(self) -> list[Sample]:
-        """Return the samples that are identified on (`Kept.usable`)."""
+        """Return the samples used for identification (`Kept.usable`)."""
         return self._kept.usable()
 
     @property
@@ -192,7 +191,7 @@ class CalibrationSession:
         track = self._collector.track
         silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
         if silent:
-            return f'nothing can be sampled: no joint states of {", ".join(silent)} come any more'
+            return f'nothing can be sampled: no more joint states of {", ".join(silent)}'
         if others := self._names.foreign_ones(track.missing):
             return others
         if why := self._entry.refused.get(JOINTS):
@@ -200,7 +199,7 @@ class CalibrationSession:
         return self._collector.state()
 
     def account(self) -> Account:
-        """Return what became of the messages so far."""
+        """Return the account of the messages so far."""
         fitted = [sample.joints for sample in self.samples if not sample.validation]
         usable, distinct = self.usable, len(fitted)
         if self.settings.mode != 'continuous' and fitted:
@@ -229,12 +228,12 @@ class CalibrationSession:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return what an engineer should know about the measurements."""
+        """Return warnings about the measurements."""
         return tuple(hint.text for hint in self.hints)
 
     @property
     def hints(self) -> list[Hint]:
-        """Return what looks wrong in what is heard."""
+        """Return what looks wrong in the received messages."""
         found: list[Hint] = []
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
@@ -245,24 +244,24 @@ class CalibrationSession:
 
     @property
     def delay(self) -> Delay | None:
-        """Return how late the measurements are stamped, as far as the motion shows."""
+        """Return the delay of the measurement stamps, as far as the motion shows it."""
         return self._clocks.delay
 
     @property
     def came(self) -> str:
-        """Return in words what became of the messages, and what looks wrong."""
+        """Return in words the account of the messages, and what looks wrong."""
         return '; '.join((str(self.account()), *self.warnings))
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return what the samples so far tell; None while they are too few."""
+        """Return the estimate from the samples so far; None while they are too few."""
         return self._live.update(self.usable)
 
     def status(self, work: str = '') -> str:
-        """Return in words what the arm does, what else goes on, and how far the samples are.
+        """Return in words the state of the arm, other activity, and the progress of sampling.
 
-        What an operator must know or do comes first: who has room for a line only cuts the rest.
-        `work` is what goes on besides.
+        What an operator must know or do comes first, so a truncated line keeps it. `work` is the
+        other activity.
         """
         told = [self.state, work]
         if why := self._entry.refused.get(POSES):
@@ -298,7 +297,7 @@ class CalibrationSession:
         return found
 
     def identify(self) -> Identification:
-        """Identify on the samples so far and keep the result if it is accepted."""
+        """Identify from the samples so far and keep the result if it is accepted."""
         problem = self.problem()
         try:
             result = identify_model(problem, self.settings.model)
@@ -310,9 +309,9 @@ class CalibrationSession:
         return result
 
     def adopt(self, calibration: Calibration, samples: Sequence[Sample] | None = None) -> None:
-        """Take a calibration as the present one.
+        """Use a calibration from now on.
 
-        `samples` are those that it may not be judged on, all of now by default.
+        `samples` must not be used to judge it; default: all current ones.
         """
         refuse_other_joints(calibration, self.chain)
         self._known = frozenset(self.samples if samples is None else samples)
@@ -328,7 +327,7 @@ class CalibrationSession:
         return now, nominal
 
     def reused(self) -> float:
-        """Return the share of the samples since that the calibration was fitted to."""
+        """Return the share of the later samples to which the calibration was fitted."""
         calibration, sets = self._since()
         return calibration.reused(sets)
 
@@ -373,6 +372,6 @@ class CalibrationSession:
 
 
 def too_few(err: TooFewObservationsError, came: str) -> InputError:
-    """Return an error of too few samples that tells what `came` of the messages, in words."""
+    """Return an error of too few samples that also says what `came` of the messages."""
     few, _, advice = str(err).rpartition('; ')
     return InputError(f'{few} ({came}); {advice}')

@@ -100,7 +100,7 @@ JOINTS, POSES = 'joints', 'measurements'
 NO_ACCIDENT = round(1.0 / (1.0 - CONFIDENT))
 """So many messages that differ from the others are no accident: one in so many may be."""
 SILENCE = 5.0 * Settings.lateness
-"""A joint or topic that was heard before and is silent for so long [s] is told."""
+"""A joint or topic that was active and is silent for this long [s] is reported."""
 
 
 class StreamKey(NamedTuple):
@@ -187,7 +187,7 @@ def _by_arrival(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
 
 
 TOO_LATE = 'measurements: later than lateness allows'
-TOO_MANY = f'measurements: of one more than {MOST_NAMES} targets, or frames'
+TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
 
 
 class Waiting(dict[StreamKey, Rows]):

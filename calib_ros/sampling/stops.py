@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stops of the arm: which become samples, which pass unseen, and the means measured at them.
+"""Stops of the arm: which become samples, which are ignored, and the means measured at them.
 
 An arm vibrates after its joints have stopped. So the mean begins where the measurements have come
 as close to the later ones as their noise allows, and a stop whose measurements still spread more
@@ -89,12 +89,12 @@ def _settled(values: FloatArray, reach: float) -> int:
     return int(last[-1]) + 2 if last.size else 0
 
 
-SAMPLED = 'of a stop that has its pose already'
+SAMPLED = 'of a stop that already has its pose'
 
 
 @dataclass
 class Plan:
-    """What becomes of measurements up to stamps, each from the end of the one before.
+    """The fate of measurements up to stamps, each from the end of the one before.
 
     Those up to each of the `ends` are not used for a reason, or it is empty and they are, from
     where their stop begins.
@@ -107,7 +107,7 @@ class Plan:
     begins: list[int] = field(default_factory=list)
 
     def add(self, until: int, why: str, begin: int = 0) -> None:
-        """Deal with what was measured up to a stamp."""
+        """Handle the measurements up to a stamp."""
         if until > self.done_ns:
             self.done_ns = until
             self.ends.append(until)
@@ -126,7 +126,7 @@ class Plan:
 
     @property
     def stops(self) -> list[int]:
-        """Return the numbers of the stops of which samples are made."""
+        """Return the numbers of the stops that give samples."""
         return [k for k, why in enumerate(self.why) if not why]
 
     def of_stands(
@@ -148,7 +148,7 @@ class Plan:
                 self.sampled(min(end, until))
                 continue
             if settings.mode == 'triggered':
-                self.add(min(end, until), 'nobody asked for them')
+                self.add(min(end, until), 'not requested')
                 continue
             last = min(end, begin + longest)
             if last > until or (goes_on and last == end):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which topics of a recording are read, and what must not be read as a measurement."""
+"""Choice of the topics of a recording to read."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 def check_joints(
     messages: Iterator[tuple[Stream, bytes]], joint_names: Sequence[str], deserialise: Deserialise
 ) -> None:
-    """Refuse joint states of a recording of which several topics name the same joints.
+    """Refuse joint states of a recording in which several topics name the same joints.
 
     The InputError has the topics, and how far their values are apart.
     """

@@ -96,7 +96,7 @@ class Motion(NamedTuple):
 
 
 class Track:
-    """Recent samples of all joints, of which the `revolute` (n,) have angles for values.
+    """Recent samples of all joints; the `revolute` (n,) ones have angles as values.
 
     It interpolates over `max_gap` [s] at most, and keeps up to a capacity of one publisher.
     """
@@ -108,9 +108,9 @@ class Track:
         self._parts: dict[tuple[int, ...], Rows] = {}
         self._came = np.zeros(len(revolute))  # signs of the last moves before the samples held
         self.contrary = 0
-        """Samples let go for another one of the same stamp with other values."""
+        """Samples dropped for another of the same stamp with different values."""
         self.horizon_ns = 0
-        """Samples before this stamp have been let go."""
+        """Samples before this stamp have been dropped."""
 
     @property
     def newest_ns(self) -> int:
@@ -128,7 +128,7 @@ class Track:
         return heard
 
     def room(self, columns: tuple[int, ...]) -> int:
-        """Return for how many more samples of some joints there is room."""
+        """Return the number of further samples of some joints that fit."""
         rows = self._parts.get(columns)
         return self._capacity if rows is None else self._capacity - rows.count
 

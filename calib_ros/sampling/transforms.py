@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements out of the transforms between frames that come on /tf and /tf_static.
+"""Measurements from the transforms between frames on /tf and /tf_static.
 
 A source names two frames. Between them there must be one link that moves; what stands still
 before and after it, in either direction, is composed with it at its stamps. Several moving links
@@ -59,7 +59,7 @@ class Route(NamedTuple):
 
 @dataclass
 class Seen:
-    """How often a moving link has come, and its first and last stamp."""
+    """Count of a moving link, and its first and last stamp."""
 
     count: int
     first_ns: int
@@ -73,7 +73,7 @@ class Seen:
 
 
 class Links:
-    """The links between frames, and what sources make of them.
+    """The links between frames, and the measurements of sources from them.
 
     Those that stand still come on the topic of those that move with _static behind it.
     """
@@ -133,7 +133,7 @@ class Links:
         return found, faults
 
     def _fix(self, come: Linked) -> None:
-        """Learn a link that stands still; what does may have no stamp."""
+        """Learn a static link; it may have no stamp."""
         found = come.read()
         good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(come.places)))
         for numbers in found.numbers[good]:
@@ -171,7 +171,7 @@ class Links:
         return found
 
     def __str__(self) -> str:
-        """Return in words which links move and how often they come, those that stand out first."""
+        """Return in words the moving links and their rates, the most likely ones first."""
         if not self._moving:
             return f'nothing moves on {self.topic}'
         self._update()

@@ -68,7 +68,7 @@ def test_degrees_are_refused_also_of_joints_without_limits(run, tmp_path, suffix
     (tmp_path / f'out{suffix}').unlink()
     status, _, err = run(write(np.degrees(q)), suffix=suffix, chain='free.yaml')
     assert status == 1
-    assert 'must be in radians; if these are, give the joint limits' in err
+    assert 'must be in radians; if they are, give the joint limits' in err
     assert not (tmp_path / f'out{suffix}').exists()
 
 
@@ -108,7 +108,7 @@ def test_other_calibrations_are_refused(run, tmp_path):
     (tmp_path / 'nominal.yaml').write_text(dump_chain(UR))
     status, _, err = run(TABLE, '--calibration', 'nominal.yaml', chain='calibration.yaml')
     assert status == 1
-    assert 'is a chain, but no calibration' in err
+    assert 'is a chain, but not a calibration' in err
     record = {'accepted': True, 'nominal': nominal_document(ROBOTS['ur10'])}
     (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
     status, _, err = run(TABLE)
@@ -121,7 +121,7 @@ def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
     status, said, err = run(TABLE)
     assert (status, err) == (0, '')
     assert said.startswith('wrote out.csv: 2 of 2 points corrected, by ')
-    assert 'largest error' in said
+    assert 'largest predicted error' in said
     before, after = (
         list(csv.DictReader((tmp_path / name).read_text().splitlines()))
         for name in ('program.csv', 'out.csv')
@@ -257,7 +257,7 @@ def test_an_existing_file_is_kept_unless_forced(run, tmp_path):
 def test_a_program_is_not_compensated_in_place(run, tmp_path):
     status, _, err = run(TABLE, '--force', out='program')
     assert status == 1
-    assert 'compensated twice is wrong' in err
+    assert 'compensating it twice is wrong' in err
     assert (tmp_path / 'program.csv').read_text() == TABLE
 
 

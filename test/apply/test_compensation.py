@@ -337,7 +337,7 @@ def test_settings_out_of_range_are_refused(setting, complaint):
 
 
 def test_chains_of_other_joints_are_refused():
-    with pytest.raises(ConfigError, match='same joints in one order'):
+    with pytest.raises(ConfigError, match='same joints in the same order'):
         Compensator(UR, ROBOTS['puma560'])
 
 

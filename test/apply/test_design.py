@@ -167,7 +167,7 @@ def test_distances_are_refused():
     chain = arm()
     observations = simulation.measure(chain, some(chain, 40), np.random.default_rng(0))
     lengths = np.linalg.norm(observations.positions, axis=1)
-    with pytest.raises(InputError, match='not for distances'):
+    with pytest.raises(InputError, match='not distances'):
         Design.of(Problem(chain, replace(observations, distances=lengths)))
 
 

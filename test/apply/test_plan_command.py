@@ -134,8 +134,8 @@ def test_plan_with_too_few_poses_says_so(run, tmp_path):
         (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
         (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
         (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
-        (('--iso9283', '--poses', 20), '--poses is of no use with --iso9283'),
-        (('--iso9283', '--candidates', 'q.csv'), '--candidates is of no use'),
+        (('--iso9283', '--poses', 20), '--poses does not apply to --iso9283'),
+        (('--iso9283', '--candidates', 'q.csv'), '--candidates does not apply'),
         (('--box', 0, 0, 0, 1, 1, 1, '--world'), 'where the base is'),
     ],
 )
@@ -150,7 +150,7 @@ def test_plan_from_candidates_that_nothing_sees(run, tmp_path):
     arguments = ('--candidates', 'q.csv', '--box', 5, 5, 5, 6, 6, 6)
     status, _, err = run('plan', '--chain', 'ur10e', *arguments)
     assert status == 1
-    assert 'measured at no pose of q.csv' in err
+    assert 'the target at no pose of q.csv' in err
 
 
 @pytest.mark.parametrize('option', ['--task', '--taken'])

@@ -169,7 +169,7 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     found = {path.name for path in (tmp_path / 'map').iterdir()}
     assert found == set(WORKSPACE_FILES)
     text = (tmp_path / 'map' / 'workspace.md').read_text()
-    assert 'Where the most is removed by the calibration' in text
+    assert 'Where the calibration removes most' in text
     assert text.count('| expected to remain |') == 1
     with (tmp_path / 'map' / 'workspace.csv').open() as file:
         rows = list(csv.DictReader(file))

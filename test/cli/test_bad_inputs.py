@@ -12,8 +12,8 @@ def bad_inputs():
     bag_of = ('identify', '--chain', 'ur5e')
     good = (*csv_of, 'good.csv')
     chain_of = ('identify', '--csv', 'good.csv', '--chain')
-    yield 'no input', bag_of, 'either a bag, or a table'
-    yield 'two inputs', (*good, 'bag'), 'either a bag, or a table'
+    yield 'no input', bag_of, 'give a bag, or a table'
+    yield 'two inputs', (*good, 'bag'), 'give a bag, or a table'
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
     yield 'a table almost of this name', (*csv_of, 'godo.csv'), 'did you mean "good.csv"'
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
@@ -40,13 +40,13 @@ def bad_inputs():
     yield (
         'useless option',
         (*good, '--sources', '/pose'),
-        '--sources is of no use with a table',
+        '--sources does not apply to a table',
     )
-    yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'of no use with a bag'
+    yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag'
     names = ('--joint-names', 'a,a,b,c,d,e,f')
     yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'
-    yield 'out is the root', (*good, '--out', '/'), '/ is the root of all folders: choose'
+    yield 'out is the root', (*good, '--out', '/'), '/ is the root folder: choose'
     yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
     yield 'csv2bag, bad table', ('csv2bag', 'number.csv', 'b', '--chain', 'ur5e'), 'line 4: q2'
     yield 'csv2bag, bag exists', ('csv2bag', 'good.csv', 'folder', '--chain', 'ur5e'), 'exists al'
@@ -58,7 +58,7 @@ def bad_inputs():
     yield (
         'no calibration',
         ('compare', 'none', 'none'),
-        'no calibration at none: give the folder that ide',
+        'no calibration at none: give the folder written by ide',
     )
     yield 'not accepted', ('compare', 'refused', 'none'), 'refused was not accepted'
     yield 'a folder as calibration', ('compare', 'folder', 'none'), 'folder holds no calibration.y'
@@ -67,7 +67,7 @@ def bad_inputs():
         ('compare', 'good.csv', 'none'),
         'is a table, but compare takes',
     )
-    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is no text in UTF-8: save it'
+    yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is not UTF-8 text: save it'
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
     yield (
         'a result as a table',

@@ -26,7 +26,7 @@ def test_identify_and_verify_are_filed(folder, capsys):
     common = ['--chain', 'ur10e', '--history', 'history']
     identify = ['identify', measured[0], *common, '--out', 'result']
     assert main(identify) == 1
-    assert 'give --serial' in capsys.readouterr().err
+    assert 'add --serial' in capsys.readouterr().err
     identify += ['--serial', '0042', '--force']
     assert [main(identify), main(identify)] == [0, 0]
     verify = ['verify', measured[1], *common, '--serial', '0042', '--calibration', 'result']
@@ -65,8 +65,8 @@ def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, c
     assert ended == ['workers']
     assert signal.getsignal(signal.SIGINT) is before
     assert capsys.readouterr().err.splitlines() == [
-        'note: results so far are filed: the next run does the rest',
-        'calib_ros: interrupted: no file is left half written',
+        'note: results so far are saved; the next run continues',
+        'calib_ros: interrupted: no half-written file remains',
     ]
 
 

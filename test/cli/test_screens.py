@@ -128,7 +128,7 @@ def test_help_of_a_command_is_that_command_with_help(shown):
     [
         (('plan', '--chain', 'ur5e', '--pose', '9', '--otu', 'x'), 'option "--otu": did you mean'),
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
-        (('robots', 'ur5e'), '"ur5e" is one too many'),
+        (('robots', 'ur5e'), 'unexpected argument "ur5e"'),
         (('chain',), 'required: ROBOT'),
         (
             ('identify', 'measured.csv', '--chain', 'ur5e', '--folds', 'five'),
@@ -365,8 +365,8 @@ def test_a_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, shown)
     [
         (OSError(errno.ENOSPC, 'No space left on device', 'x'), 1, 'make room'),
         (PermissionError(errno.EACCES, 'Permission denied', 'x'), 1, 'choose another place'),
-        (MemoryError(), 1, 'not enough memory'),
-        (KeyboardInterrupt(), 130, 'no file is left half written'),
+        (MemoryError(), 1, 'out of memory'),
+        (KeyboardInterrupt(), 130, 'no half-written file remains'),
     ],
 )
 def test_what_goes_wrong_below_is_one_line_with_advice(shown, monkeypatch, error, status, words):

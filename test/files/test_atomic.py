@@ -175,7 +175,7 @@ def test_names_in_the_way_are_kept_unless_overwritten(tmp_path):
     add_notes(path)
     (path / 'link').symlink_to('nowhere')
     path.chmod(0o750)
-    with pytest.raises(InputError, match=r'holds a\.txt, b\.txt, sub already.*--force'):
+    with pytest.raises(InputError, match=r'already holds a\.txt, b\.txt, sub: .*--force'):
         make(path, 'B', overwrite=False)
     with pytest.raises(InputError, match='exists already'):
         make(path, 'B', own=None)

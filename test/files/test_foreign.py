@@ -297,7 +297,7 @@ def test_presets_of_users_and_their_faults(tmp_path):
     'text', ['a**b', 'f(x)', 'a b', '1+', '__import__("os")', '{}', '', 'a;b']
 )
 def test_what_is_no_expression(text):
-    with pytest.raises(ConfigError, match='no expression'):
+    with pytest.raises(ConfigError, match='not an expression'):
         Expression.parse(text)
 
 
@@ -305,7 +305,7 @@ def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
     text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'])
     table = read(text + '0,0,,,\n', length='m', angle='rad')
     assert_same(table, None)
-    assert 'line 5: left out' in ' '.join(table.warnings)
+    assert 'line 5: skipped' in ' '.join(table.warnings)
 
 
 def test_joint_values_that_stand_a_row_below(read):
@@ -326,7 +326,7 @@ def test_joint_values_that_stand_a_row_below(read):
             {'columns': {'q1': 'a'}},
             'comes 2 times: name it by its number',
         ),
-        ('q1,q2,x,y,z,rx,ry,rz\n1,2,3,4,5,6,7,8\n', {}, 'say what they are, --euler'),
+        ('q1,q2,x,y,z,rx,ry,rz\n1,2,3,4,5,6,7,8\n', {}, 'say which, --euler'),
         ('q1,q2,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,0,0,0,2\n', {}, 'line 2: quaternion'),
         ('q1,q2,x,y,z\n', {}, 'no rows'),
         ('', {}, 'no rows'),
@@ -359,7 +359,7 @@ def test_axes_called_like_accelerations_are_none(tmp_path):
 def test_a_table_of_semicolons_says_what_to_give(tmp_path, row):
     path = tmp_path / 'cell.csv'
     path.write_text(f'q1;q2;x;y;z\n{row}\n')
-    with pytest.raises(InputError, match=r'separated by semicolons: .* with --separator'):
+    with pytest.raises(InputError, match=r'separated by semicolons: .* give --separator'):
         read_table(path, 2)
 
 

@@ -128,7 +128,7 @@ def test_kinds_of_one_stop_are_told_apart(tmp_path):
 
 def test_a_row_written_twice_is_refused(tmp_path):
     written(tmp_path / 'cell.csv', [plain(1), plain(2), plain(1)])
-    with pytest.raises(InputError, match='line 4: stamp_ns 1 is there already'):
+    with pytest.raises(InputError, match='line 4: stamp_ns 1 already exists'):
         read_journal(tmp_path / 'cell.csv', JOINTS)
 
 
@@ -167,9 +167,9 @@ def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
     journal.close()
     assert_equal(read_journal(path, JOINTS)[0], [*many[:2], *many[3:28]])
     written(path, [many[0]])
-    with pytest.raises(InputError, match='line 33: stamp_ns 1 is there already'):
+    with pytest.raises(InputError, match='line 33: stamp_ns 1 already exists'):
         read_journal(path, JOINTS)
-    for damage, said in ((b'x,' * 40, 'line 34'), (bytes(2000), 'line 34 has no end')):
+    for damage, said in ((b'x,' * 40, 'line 34'), (bytes(2000), 'line 34 is incomplete')):
         copy = tmp_path / 'copy.csv'
         copy.write_bytes(path.read_bytes() + damage + b'\n' * (damage[:1] == b'x'))
         with pytest.raises(InputError, match=said):
@@ -212,7 +212,7 @@ def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
         file.truncate(begin + round(share * (path.stat().st_size - begin)))
     found, (warning,) = read_journal(path, JOINTS)
     assert_equal(found, [plain(1, target=name)])
-    assert 'was cut off and is left out' in warning
+    assert 'was cut off and is ignored' in warning
     written(path, [plain(3, target=name)])
     assert_equal(read_journal(path, JOINTS)[0], [plain(1, target=name), plain(3, target=name)])
 

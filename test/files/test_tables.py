@@ -161,13 +161,13 @@ FAULTS = [
       ('0.5,-0.5,0.5,', ',,,1', '0.5,,0.5,0.5')),
     *((each, r'cell\.csv has no') for each in
       ('', '\n', 'q1,q2,x,y,z\n', 'q1,q2,x,y,z\n\n\n')),
-    (b'\xff\xfe\x00\x80', r'cell\.csv is no text in UTF-8'),
+    (b'\xff\xfe\x00\x80', r'cell\.csv is not UTF-8 text'),
     *((f'{FLAG}{each}\n', f"line 2: eye_in_hand must be 0 or 1, not '{each}'") for each in
       ('yes', 'True', '2')),
     (SESSIONS, r'cell\.csv holds several sessions, .*A, B'),
     (
         '\n'.join(FRAMES.splitlines()[:-1]),
-        r'different frames: world \(lines 2, 6\), map \(line 5\); one is needed',
+        r'different frames: world \(lines 2, 6\), map \(line 5\); only one is allowed',
     ),
     (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7, and 3 more\)'),
 ]  # fmt: skip

@@ -200,7 +200,7 @@ def test_the_hash_is_that_of_the_robot_or_of_the_numbers():
     assert checksum(nominal) == checksum(nominal)
     assert checksum(nominal).removeprefix('calib_').isdigit()
     assert checksum(nominal) != checksum(nominal.with_offsets({'elbow_joint.a': 1e-6}))
-    with pytest.raises(ConfigError, match='no checksum'):
+    with pytest.raises(ConfigError, match='not a Universal Robots checksum'):
         checksum(nominal, '12788084448423163542')
 
 

@@ -61,7 +61,7 @@ def test_robots_with_what_their_group_says(tmp_path):
         ('serial: B', 'serial: "0042"', r'two robots with the serial 0042'),
         ('folds: 6', 'folds: 6.5', r'folds must be a whole number'),
         ('folds: 6', 'folds: 1', r'robot 1 .*folds must be at least 2'),
-        ('fixed: []', 'fixed: [1]', r'fixed must be a list of texts'),
+        ('fixed: []', 'fixed: [1]', r'fixed must be a list of strings'),
         ('group: weld', 'group: [weld]', r'robot 1 \(0042\).*"\[\'weld\'\]".*did you mean "weld"'),
         ('"0042"', '..', r'robot 1: serial must be text'),
         ('"0042"', 'ö' * 60, r'robot 1: serial is too long to name a folder'),

@@ -131,7 +131,7 @@ def test_a_table_that_was_edited_is_not_the_calibration(document, change):
     document = deepcopy(document)
     parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
     change(document)
-    with pytest.raises(ConfigError, match=r'c\.yaml does not hold the table and effects that'):
+    with pytest.raises(ConfigError, match=r'c\.yaml does not contain the table and effects'):
         parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml', UR)
 
 
@@ -174,8 +174,8 @@ def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
 @pytest.mark.parametrize(
     ('nominal', 'record', 'message'),
     [
-        ('ur10e', None, 'is a chain, but no calibration'),
-        ('ur10e', {}, 'is a chain, but no calibration'),
+        ('ur10e', None, 'is a chain, but not a calibration'),
+        ('ur10e', {}, 'is a chain, but not a calibration'),
         ('ur10e', {'accepted': False}, 'was not accepted'),
         ('puma560', {'samples': 3}, 'is it the right nominal chain'),
         ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),

@@ -127,7 +127,7 @@ def test_an_arm_with_other_links_is_another_one(nights):
     found = difference(first, calibrated(other, 1))
     assert not found.same
     assert found.unexplained < 1e-6
-    assert 'many parameters are different' in found.in_words()
+    assert 'many parameters differ' in found.in_words()
 
 
 def test_what_a_parameter_shares_with_others_is_a_share():
@@ -152,14 +152,14 @@ def test_what_moves_nothing_takes_no_share(nights):
 
 def test_what_cannot_be_compared_is_refused(nights):
     _, first = nights
-    with pytest.raises(InputError, match='calibration 2 does not hold the covariance'):
+    with pytest.raises(InputError, match='calibration 2 has no parameter covariance'):
         difference(first, replace(first, covariance=None))
     panda = load_chain('franka_panda')
-    with pytest.raises(InputError, match='are of other robots'):
+    with pytest.raises(InputError, match='belong to different robots'):
         difference(first, replace(first, chain=panda, before=panda))
     for change in ({'type': 'prismatic'}, {'sign': -1}):
         other = replace(UR, joints=(replace(UR.joints[0], **change), *UR.joints[1:]))
-        with pytest.raises(InputError, match='are of other robots'):
+        with pytest.raises(InputError, match='belong to different robots'):
             difference(first, replace(first, chain=other, before=other))
 
 

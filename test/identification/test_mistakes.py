@@ -308,7 +308,7 @@ def test_a_row_lost_in_one_of_two_tables_is_named(row, lost, where, oriented):
     result = identify(Problem(UR, replace(measured, joints=kept)))
     assert not result.accepted
     assert result.refusals[0].startswith(
-        f'from pose {row + 1} on the joint values stand 1 row {where} the measurement'
+        f'from pose {row + 1} on the joint values stand 1 row {where} their measurement'
     )
 
 

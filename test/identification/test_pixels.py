@@ -126,7 +126,7 @@ def test_images_that_tell_no_pose_are_left_out():
     poses = board_poses(seen.select(~(line | few)), CAMERA.lens)
     first = np.flatnonzero(corner == 0)[[0, 3]]
     np.testing.assert_array_equal(poses.joints, seen.joints[first])
-    with pytest.raises(InputError, match='no image shows 4 points'):
+    with pytest.raises(InputError, match='no image shows 4 board points'):
         board_poses(seen.select((index == 1) & ~line), CAMERA.lens)
     bent = replace(seen, points=seen.points + np.array([0.0, 0.0, 0.02]) * (corner % 2)[:, None])
     with pytest.raises(InputError, match='must be in a plane'):
@@ -189,7 +189,7 @@ def test_a_prior_holds_a_lens():
     )
     assert held.priors == {'base.fx': 1e-3, 'base.fy': 1e-3}
     assert held.chain.value('base.fx') == pytest.approx(wrong.fx, abs=0.1)
-    with pytest.raises(ConfigError, match='frames are unknown or known'):
+    with pytest.raises(ConfigError, match='a frame is either known or unknown'):
         Problem(known(False), seen, priors={'base.x': 1.0})
 
 
@@ -240,7 +240,7 @@ def test_pixels_without_a_lens_are_refused():
     _, seen = scene(1, False, 3)
     with pytest.raises(InputError, match=r'need the intrinsics of their camera \(base\)'):
         Problem(UR, seen)
-    with pytest.raises(InputError, match='pixels need the points'):
+    with pytest.raises(InputError, match='pixels and the board points'):
         replace(seen, points=None)
     with pytest.raises(InputError, match='pixels of 72 observations'):
         Observations.from_pixels(seen.joints, seen.pixels[:, :1], seen.points, seen.images)
@@ -285,7 +285,7 @@ def test_corners_and_a_table_by_the_command_line(tmp_path, capsys, rng):
     assert 'tool_camera.x' in both['parameters']
     lacking = [word for word in words if 'board' not in word]
     assert main(lacking) == 1
-    assert 'need --board' in capsys.readouterr().err
+    assert 'needs --board' in capsys.readouterr().err
     assert main([*words[:1], '--chain', 'flange_pose', *words[3:]]) == 1
     assert 'holds joint values: give the chain of the arm' in capsys.readouterr().err
 
@@ -365,7 +365,7 @@ def test_a_fit_that_runs_away_ends_in_words(monkeypatch):
     monkeypatch.setattr(identification, 'fit', away)
     _, seen = scene(2, True)
     for given, words in (
-        (seen, 'no stable answer: check the arm'),
+        (seen, 'no stable solution: check the arm'),
         (spoilt(seen, points=1e3 * seen.points), 'at all: the lengths of the board are in mm'),
     ):
         with pytest.raises(InputError, match=words):

@@ -147,7 +147,7 @@ def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told)
     found = recalibrate(previous, replace(seen, observations=grown), 0.1, new=new)
     assert not found.accepted
     assert 1e6 * found.scale.change[0] == pytest.approx(ppm, abs=60.0)
-    assert f'another scale than before, by {ppm:+.0f}'[:-3] in found.in_words()
+    assert f'scale of the measuring device changed, by {ppm:+.0f}'[:-3] in found.in_words()
     assert not found.odd
     assert recalibrate(previous, seen, 0.1, new=new).accepted
 
@@ -229,7 +229,7 @@ def test_another_arm_is_not_mended_by_8_poses(earlier):
 def test_what_is_needed_is_asked_for(earlier):
     true, previous = earlier
     few = problem(true, 8, 1)
-    with pytest.raises(InputError, match='does not hold the covariance'):
+    with pytest.raises(InputError, match='has no parameter covariance'):
         recalibrate(replace(previous, covariance=None), few, 0.1)
     strange = replace(few.observations, base='base_other')
     with pytest.raises(InputError, match='knows the frames base, tool, not base_other'):
@@ -265,7 +265,7 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, tmp_path
     given[-7:-4] = [str(tmp_path / 'again'), '--previous', str(tmp_path / 'out')]
     assert main(given) == 3
     said = ' '.join(capsys.readouterr().out.split())
-    assert 'NOT accepted: these are the measurements that the calibration was fitted to' in said
+    assert 'NOT accepted: these are measurements to which the calibration was fitted' in said
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
     given[-7] = str(tmp_path / 'out')  # over what it brings up to date
     assert main([*given, '--force']) == 3

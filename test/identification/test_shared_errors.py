@@ -207,7 +207,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
         if parameter['std'] is not None:
             assert parameter['half_width_95'] > 1.95 * parameter['std']
     _, quiet = run(9, identified=identify)
-    assert 'share no error' in neighbours_in_words(quiet.noise)
+    assert 'No test finds errors' in neighbours_in_words(quiet.noise)
 
 
 def test_the_moments_of_the_forms_leave_out_what_was_not_measured():

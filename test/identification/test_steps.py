@@ -160,7 +160,7 @@ def test_a_step_beside_the_fit_is_told_and_harms_nothing():
     assert result.accepted
     assert result.step.unused
     assert result.remarks == (str(result.step),)
-    assert 'what was measured from there on carries no weight' in result.remarks[0]
+    assert 'measurements from there on carry no weight' in result.remarks[0]
     assert result.remarks[0] in remarks(result)
     assert as_document(result, {})['remarks'] == list(result.remarks)
 

@@ -94,7 +94,7 @@ def test_a_sister_is_named():
     assert 'the arm is a ur10, not a ur10e: --chain ur10' in remark
     near = UR.with_offsets({f'{UR.joint_names[1]}.a': 0.006})
     (remark,) = identify(Problem(near, seen_of(arm(0, 0.2)))).remarks
-    assert 'nearer to the shipped ur10e (' in remark
+    assert 'closer to the supplied ur10e (' in remark
     assert 'is it the right chain file?' in remark
 
 

@@ -185,7 +185,7 @@ def test_defaults_and_numbers_without_a_dot():
 
 BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\n'
 WRONG = [
-    ('alpha:', 'alpha: 0.0, alpha:', 'key "alpha" comes twice'),
+    ('alpha:', 'alpha: 0.0, alpha:', 'key "alpha" appears twice'),
     ('theta: 0.0', 'theat: 0.0', 'joint 1 "theat": did you mean "theta"'),
     ('convention:', 'konvention:', '"konvention": did you mean "convention"'),
     ('quat_xyzw:', 'quat:', 'base "quat": did you mean "quat_xyzw"'),

@@ -175,7 +175,7 @@ def test_effects_do_not_fit_into_a_urdf():
     chain = chain_from_urdf(UR10E)
     still = chain.with_effects(['elbow_joint.ratio'])
     assert corrected_urdf(UR10E, still) == UR10E
-    with pytest.raises(ConfigError, match=r'cannot hold the effects elbow_joint\.ratio'):
+    with pytest.raises(ConfigError, match=r'cannot represent the effects elbow_joint\.ratio'):
         corrected_urdf(UR10E, still.with_effect_values({'elbow_joint.ratio': 1e-3}))
 
 

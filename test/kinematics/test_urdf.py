@@ -358,6 +358,6 @@ def test_chain_command(tmp_path, capsys):
     assert main(['chain', 'ur10e', '--out', str(out)]) == 1
     assert 'exists already' in capsys.readouterr().err
     assert main(['chain', 'ur10e', '--tip-link', 'tool0']) == 1
-    assert '--tip-link is of use with a URDF only' in capsys.readouterr().err
+    assert '--tip-link applies only to a URDF' in capsys.readouterr().err
     assert main(['chain', str(path)]) == 1
     assert 'ends in panda_leftfinger, panda_rightfinger' in capsys.readouterr().err

@@ -60,7 +60,7 @@ def test_harmonics_of_gears_are_drawn_and_counted_but_not_listed():
     problem = problem_of(effects=('eccentricity', *WAVES))
     page = page_of(report_of(problem, identify(problem)))
     assert 'drives' in page.data['figures']
-    assert 'Errors of the drives' in page.text
+    assert 'Drive errors' in page.text
     assert 'the 2 harmonics of gears are in result.json.' in page.text
     assert WAVES[0] not in page.text
     assert 'elbow_joint.sin_1' in page.text

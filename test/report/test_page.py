@@ -176,7 +176,7 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     assert few.meaning.startswith('Only 14 different poses')
     assert few.steps == advice.rules()[Rule.CONFIGURATIONS].steps
     (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
-    assert 'a noise of 0.46 mm in each direction; 0.1 mm are set' in enough.meaning
+    assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
 
 
 def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
@@ -236,7 +236,7 @@ def test_an_accepted_page_says_that_the_robot_is_not_changed_yet(solved):
     problem, result = solved
     report = report_of(problem, result)
     assert result.accepted
-    assert 'not changed yet' in report.verdict.text[-1]
+    assert 'unchanged so far' in report.verdict.text[-1]
     assert 'calib_ros compensate' in ' '.join(report.steps)
 
 
@@ -275,7 +275,7 @@ def test_a_refused_page_says_why_and_what_to_do():
     page = page_of(report_of(problem, result))
     where = [
         page.text.index(words)
-        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of what')
+        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of the')
     ]
     assert where == sorted(where)
     for each in advice.advice(result.refusals):
@@ -364,10 +364,10 @@ def test_a_verification_has_its_verdict_first(solved):
     found = verify(Calibration.of(result), sets, 1e-3)
     poses = poses_to_verify(result.chain, sets, found.comparison)
     page = page_of(verification_report(result.chain, found, poses, Origin()))
-    order = ('PASS', 'not the robot with it', 'Accuracy before')
+    order = ('PASS', 'not the corrected robot', 'Accuracy before')
     where = [page.text.index(words) for words in order]
     assert where == sorted(where)
-    assert page.text.count('not the robot with it') == 1
+    assert page.text.count('not the corrected robot') == 1
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
 

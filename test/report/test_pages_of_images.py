@@ -62,7 +62,7 @@ def test_a_result_counts_images_and_corners(identified):
     assert status == 0
     assert 'fitted to 30 images with 720 corners position error' in told
     page = Page((out / 'report.html').read_text())
-    for text in ('Corners one by one', 'How many corners are within', 'Corners 720'):
+    for text in ('Corners one by one', 'Share of corners within', 'Corners 720'):
         assert text in page.text
     assert page.data['explorer']['images'][24] == '1.png'
     assert page.data['explorer']['things'] == 'corners'

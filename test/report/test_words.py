@@ -27,7 +27,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
         checked(previous, Recalibration(previous, (), 1.0, now, now, 0.0)),
     ):
         assert told[0] == holds
-        assert ('does not hold any more: RMS 0.160 mm' in told[1]) != holds
+        assert ('no longer holds: RMS 0.160 mm' in told[1]) != holds
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])
@@ -39,4 +39,4 @@ def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     found = verify(Calibration(arm, arm, residual=1e-4), [seen], None)
     row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
     assert (row.verdict, row.accepted) == (verdict, False)
-    assert ('larger than it was' in in_words(found)) == (verdict == 'does not hold')
+    assert ('the error has grown' in in_words(found)) == (verdict == 'does not hold')

@@ -111,7 +111,7 @@ def test_ros_takes_text_for_text(text):
         ('resume', 'maybe', 'true or false'),
         ('folds', '2.5', 'a whole number'),
         ('settle', 'long', 'a finite number'),
-        ('priors', '[1, 2]', 'a list of texts'),
+        ('priors', '[1, 2]', 'a list of strings'),
     ],
 )
 def test_values_of_another_type_are_refused(name, text, expected):

@@ -270,7 +270,7 @@ WRONG = {
     'must be a finite number': lambda q: trajectory(q * np.nan),
     'has no positions': lambda q: JointTrajectory(joint_names=list(UR.joint_names)),
     'needs velocities as well': lambda q: trajectory(q, accelerations=q),
-    '8 points, at most 7 are taken': lambda q: trajectory(np.repeat(q[:1], 8, axis=0)),
+    '8 points; the limit is 7': lambda q: trajectory(np.repeat(q[:1], 8, axis=0)),
 }
 
 
@@ -295,13 +295,13 @@ def test_trajectories_that_cannot_be_corrected_are_refused(calibrated, corrected
     [
         (
             JointTrajectory(points=[JointTrajectoryPoint()] * 60_000),
-            'refused: 60000 points, at most 50000 are taken',
+            'refused: 60000 points; the limit is 50000',
         ),
         (
             JointTrajectory(points=[JointTrajectoryPoint(effort=[0.0] * 2_600_000)]),
-            'bytes, at most 20000000 are taken',
+            'bytes; the limit is 20000000',
         ),
-        (JointTrajectory(joint_names=['j'] * 20_000), 'refused: 20000 joints, at most 1000'),
+        (JointTrajectory(joint_names=['j'] * 20_000), 'refused: 20000 joints; the limit is 1000'),
     ],
     ids=['points', 'bytes', 'joints'],
 )
@@ -368,7 +368,7 @@ def test_the_end_does_not_wait_for_what_has_not_begun(tmp_path, monkeypatch):
         monkeypatch.setattr(guide_module, 'MOST_QUEUED', 2)
         publisher.publish(trajectory(path(5)[0]))
         cell.spin_until(lambda: cell.node._guide._last_trajectory)
-        assert 'refused: 2 others wait already' in cell.node._guide._last_trajectory
+        assert 'refused: 2 others are already waiting' in cell.node._guide._last_trajectory
         assert not cell.node._guide.join(0.05)
         free.set()
         assert cell.node._guide.join(PATIENCE)

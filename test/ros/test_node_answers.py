@@ -27,7 +27,7 @@ from calib_ros.ros.identifying import Snapshot, _page, _without_middle
 def test_errors_are_answers(cell, recording):
     for name, said in (
         ('identify', 'no poses to fit'),
-        ('capture', 'no joint states have come'),
+        ('capture', 'no joint states received'),
         ('remove_last', 'no pose to remove'),
         ('validate', 'identify or load one first'),
         ('load', 'no saved calibration of ur10e'),
@@ -70,7 +70,7 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
         _, found = identifying.shortened((False, text))
         assert len(found) <= 200
         assert found.startswith('NOT accepted: no gain')
-        said, _, name = found.partition(' ... all of it: ')
+        said, _, name = found.partition(' ... full text: ')
         assert said.endswith(step)
         assert (tmp_path / folder / name).read_text() == f'{text}\n'
 
@@ -146,7 +146,7 @@ def test_record_remove_last_and_clear(cell, recording):
     assert removed.message == 'pose 5 removed'
     assert len(cell.node.session.samples) == 4
     cleared = cell.done('clear')
-    assert '4 poses cleared; they stay in' in cleared.message
+    assert '4 poses cleared; they remain in' in cleared.message
     assert cell.node.session.account().samples == 0
     assert cell.node.session.account().joint_states == 0
 
@@ -159,7 +159,7 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
         taken = cell.done('capture')
         assert taken.message.startswith('pose 1 taken (4 measurements, spread 0.0')
         twice = cell.refused('capture')
-        assert 'no measurements have come since the last pose' in twice.message
+        assert 'no measurements since the last pose' in twice.message
         cell.node.set_parameters([Parameter('socket', value='plate A/1')])
         ball = cell.done('capture')
         assert ball.message == 'pose 2 taken: ball in socket plate A/1'
@@ -171,7 +171,7 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
         cell.node.set_parameters([Parameter('socket', value='')])
         cell.play({'joint_states': joints[28:40], 'measured_pose': poses[4:5]})
         moving = cell.refused('capture')
-        assert 'the arm has not stood for 0.2 s yet' in moving.message
+        assert 'the arm has not been still for 0.2 s yet' in moving.message
         cell.play({'joint_states': joints[40:], 'measured_pose': poses[5:]})
         assert len(cell.node.session.samples) == 1
 
@@ -201,17 +201,17 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         assert 'the calibration holds: RMS 0.0' in holds.message
         assert f'{STOPS} poses measured since' in holds.message
         agrees = cell.done('check')
-        assert 'agrees with what was measured: RMS 0.0' in agrees.message
+        assert 'agrees with the measurements: RMS 0.0' in agrees.message
         cell.call('clear')
         moved = pose_messages(recording.poses)
         for message in moved:
             message.pose.position.x += 0.003
         cell.play(topics(recording, measured_pose=moved))
         broken = cell.refused('validate')
-        assert 'does not hold any more' in broken.message
+        assert 'no longer holds' in broken.message
         assert 'RMS 3.0' in broken.message
         bumped = cell.refused('check')
-        assert 'does not fit any more, changed: base' in bumped.message
+        assert 'no longer fits, changed: base' in bumped.message
     filed = {(row.kind, row.verdict): row for row in History(history).rows('7')}
     holds, broken = (filed['validate', text] for text in ('holds', 'does not hold'))
     assert set(filed) == {
@@ -232,7 +232,7 @@ def test_the_calibration_of_another_robot_of_the_kind_is_not_loaded(tmp_path, re
         with Cell(**parameters, serial=serial, calibration_filename=str(saved)) as cell:
             answer = cell.call('load')
             assert answer.success == loads, answer.message
-            assert loads or 'the robot with serial "7", this is "8"' in answer.message
+            assert loads or 'the robot with serial "7"; this one is "8"' in answer.message
             assert (cell.node.session.calibration is not None) == loads
 
 
@@ -336,7 +336,7 @@ def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cel
     cell.play(topics(recording, measured_pose=pose_messages(noisy)))
     answer = cell.refused('identify')
     assert 'no gain' in answer.message
-    assert 'last good calibration stays' in cell.in_full(answer)
+    assert 'last good calibration stays in use' in cell.in_full(answer)
     assert cell.node.session.calibration is good
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     cell.spin_until(lambda: heard)

@@ -89,7 +89,7 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
         file.write('1700000000,0.1,0.')  # a row that a crash of the machine cut off
     with cell_and_child(resume='true') as (cell, child):
         output = child.wait_for('ready to calibrate')
-        assert 'was cut off and is left out' in output
+        assert 'was cut off and is ignored' in output
         assert f'resumed 10 poses of {path}' in output
         cell.play(part(recording, 12.0, 24.0))
         cell.spin_until(lambda: len(samples_in(folder)) == 20)

@@ -96,7 +96,7 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     def wait_for(said, wanted=True):
         cell.spin_until(lambda: heard and (said in heard[-1].status[0].message) == wanted)
 
-    silent = 'nothing is heard on /measured_pose any more'
+    silent = 'no more messages on /measured_pose'
     cell.spin_until(lambda: heard and 'rate of /measured_pose [Hz]' in values_of(heard[-1]))
     alive.remove(tracker)
     wait_for(silent)
@@ -105,7 +105,7 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     alive.append(tracker)
     wait_for(silent, wanted=False)
     alive.clear()
-    wait_for('nothing is heard on /joint_states any more')
+    wait_for('no more messages on /joint_states')
 
 
 def test_a_bag_that_is_played_again(cell, recording):
@@ -202,7 +202,7 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     answer = cell.refused('identify')
     assert 'set joint_names' in answer.message
     assert names[5] in cell.in_full(answer)
-    said = 'waiting for joint states, set joint_names? Those that come name '
+    said = 'waiting for joint states, set joint_names? Those received name '
     cell.spin_until(lambda: words and words[-1].data.startswith(said))
     missing = recording.joint_names if all_renamed else recording.joint_names[5:]
     whole = f'{said}{", ".join(sorted(names))}, not {", ".join(missing)}; '
@@ -246,7 +246,7 @@ def test_poses_that_no_identification_takes_are_told_by_the_status(cell, recordi
 def test_two_nodes_of_one_name_are_told(cell, tmp_path):
     heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
     logged = cell.log()
-    said = '2 nodes are called /calibration_node'
+    said = '2 nodes are named /calibration_node'
     cell.spin_until(lambda: heard)
     assert said not in heard[-1].status[0].message
     other = cell.start(chain='ur10e', data_dir=str(tmp_path / 'other'))
@@ -265,7 +265,7 @@ def test_two_nodes_of_one_name_are_told(cell, tmp_path):
 
 def test_a_list_without_end_is_refused(cell):
     for entries, said in (
-        ([f'joint_{k}.a' for k in range(100_000)], 'fixed has 100000 entries, at most 1000'),
+        ([f'joint_{k}.a' for k in range(100_000)], 'fixed has 100000 entries; the limit is 1000'),
         (['x' * 100_000], 'has 100000 characters in an entry'),
     ):
         (result,) = cell.set_parameters({'fixed': entries})

@@ -230,7 +230,7 @@ def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_not
     assert feed(session, batch, lambda message, kind: message) == []
     assert session.account().joint_states == len(shift[0])  # none has waited
     assert (
-        session.account().dropped['measurements: image while others were looked at'] > STOPS // 2
+        session.account().dropped['measurements: image while others were processed'] > STOPS // 2
     )
     camera.go_on.set()
     session.finish()

@@ -85,7 +85,7 @@ def test_a_queue_that_was_full_is_told(tmp_path, recording):
         for message in joint_messages(recording)[:20]:
             publisher.publish(message)
         cell.spin_until(
-            lambda: any('messages get lost on /joint_states' in r.status[0].message for r in heard)
+            lambda: any('messages are lost on /joint_states' in r.status[0].message for r in heard)
         )
         assert cell.node.session.received['joints'] < 20
         assert int(values_of(heard[-1])['queue of /joint_states full']) > 0

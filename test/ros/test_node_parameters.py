@@ -127,7 +127,7 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ),
         ({'resume': 1}, 'parameter "resume" must be true or false, not 1'),
         ({'folds': True}, 'parameter "folds" must be a finite number, not True'),
-        ({'joint_names': [1, 2]}, 'parameter "joint_names" must be a list of texts such as ['),
+        ({'joint_names': [1, 2]}, 'parameter "joint_names" must be a list of strings such as ['),
         ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
         ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
     ],

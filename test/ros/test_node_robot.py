@@ -75,12 +75,12 @@ def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
     monkeypatch.setattr(parameters_module, 'DESCRIPTION_WAIT', 0.2)
     with Cell() as cell:
         told = cell.log()
-        with pytest.raises(ConfigError, match='no robot_description has come within'):
+        with pytest.raises(ConfigError, match='no robot_description arrived within'):
             cell.start(['__ns:=/cell_2'], chain='robot_description', data_dir=str(tmp_path))
-        said = 'waiting for /cell_2/robot_description, 0.2 s at most'
+        said = 'waiting up to 0.2 s for /cell_2/robot_description'
         cell.spin_until(lambda: said in [each.msg for each in told])
 
 
 def test_links_belong_to_a_urdf(tmp_path):
-    with Cell() as cell, pytest.raises(ConfigError, match='of use with a URDF only'):
+    with Cell() as cell, pytest.raises(ConfigError, match='apply only to a URDF'):
         cell.start(chain='ur10e', tip_link='tool0', data_dir=str(tmp_path))

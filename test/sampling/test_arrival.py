@@ -151,7 +151,7 @@ def test_a_small_joint_buffer_costs_only_what_it_cannot_hold():
 @pytest.mark.parametrize('capacity', [2, 60])
 def test_a_joint_buffer_that_is_too_small_says_so(capacity):
     made, _ = toured(joint_buffer=capacity, end=4.5)
-    assert made.notes['joint states let go, the joint buffer was full'] > 0
+    assert made.notes['joint states dropped, the joint buffer was full'] > 0
 
 
 def test_a_full_pose_buffer_drops_new_measurements_and_counts_them():

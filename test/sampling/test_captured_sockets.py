@@ -67,7 +67,7 @@ def test_a_moving_arm_and_a_wrong_label_are_refused():
     ]
     take(session, *moving)
     count, why = session.capture('A/1')
-    assert (count, 'has not stood' in why) == (0, True)
+    assert (count, 'has not been still' in why) == (0, True)
     for label in ('A', '/1', 'A/', 'A/1_2', 'A/B/1', 'A/\n'):
         with pytest.raises(ConfigError, match='LOCATION/SOCKET'):
             session.capture(label)

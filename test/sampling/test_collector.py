@@ -135,7 +135,7 @@ def test_a_stop_at_which_the_target_moves_is_dropped_and_counted():
     ]
     assert play(made, joint_events(motion, 9.5), events) == []
     assert made.dropped == {
-        'measurements: a stop that spreads more than the noise': pytest.approx(270, abs=10)
+        'measurements: a stop with more spread than noise': pytest.approx(270, abs=10)
     }
 
 
@@ -185,7 +185,7 @@ def test_in_continuous_mode_samples_come_while_the_arm_moves():
 def test_in_triggered_mode_nothing_is_taken_unasked():
     made, samples = toured(mode='triggered')
     assert samples == []
-    assert set(made.unused) == {MOVING, 'measurements: nobody asked for them'}
+    assert set(made.unused) == {MOVING, 'measurements: not requested'}
 
 
 def ask(times):
@@ -203,14 +203,14 @@ def test_a_sample_is_taken_when_it_is_asked_for():
 def test_a_capture_that_gives_nothing_says_why():
     motion = tour()
     made = collector(mode='triggered')
-    assert made.capture() == (0, 'no joint states have come')
+    assert made.capture() == (0, 'no joint states received')
     play(made, joint_events(motion, 0.5), finish=False)
-    assert made.capture() == (0, 'no measurements have come since the last pose')
+    assert made.capture() == (0, 'no measurements since the last pose')
     events = joint_events(motion, 1.5, begin=0.5), pose_events(motion, 1.5, begin=0.5)
     play(made, *events, finish=False)
     count, why = made.capture()
     assert count == 0
-    assert 'has not stood for 0.2 s' in why
+    assert 'has not been still for 0.2 s' in why
 
 
 def test_a_capture_in_dwell_mode_does_not_sample_the_stop_again():

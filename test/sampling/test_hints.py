@@ -112,7 +112,7 @@ def test_two_robots_on_one_topic_are_told_and_no_still_to_set():
     made.finish()
     assert made.samples == []
     (warning,) = told(made)
-    assert 'do two robots publish joints of the same names?' in warning
+    assert 'do two robots publish the same joint names?' in warning
     assert 'set still' not in warning
 
 
@@ -148,10 +148,10 @@ def test_joint_states_that_are_too_slow_are_told_and_the_rate_needed():
 def test_clocks_too_far_apart_for_the_delay_to_be_found_are_told(seconds):
     made = heard(tour(15), 29.5, late=lambda times: seconds)
     words = f'{abs(seconds):.0f} s {"before" if seconds < 0 else "after"}'
-    assert f'stamped {words} the newest joint state: make the clocks' in told(made)[0]
+    assert f'stamped {words} the newest joint state: synchronise the clocks' in told(made)[0]
     made.finish()
     if abs(seconds) > 30.0:
-        with pytest.raises(InputError, match='make the clocks of both agree'):
+        with pytest.raises(InputError, match='synchronise the clocks'):
             made.identify()
 
 
@@ -184,7 +184,9 @@ def with_a_step(step, of):
 def test_a_clock_that_goes_far_astray_is_told_at_once(step, of, words):
     """However many measurements were matched before it, and by how much it was moved."""
     (warning,) = told(with_a_step(step, of))
-    assert f'measurement is stamped {words} the newest joint state: make the clocks' in warning
+    assert (
+        f'measurement is stamped {words} the newest joint state: synchronise the clocks' in warning
+    )
 
 
 def test_a_clock_that_is_not_moved_is_not_told_of():
@@ -209,7 +211,7 @@ def test_stops_at_which_the_target_still_moves_are_told(speed, stops_taken):
     warnings = told(made)
     assert len(warnings) == (stops_taken == 0)
     for words in warnings:
-        assert re.match(r'1[45] of 1[45] stops are refused: what is measured still moves', words)
+        assert re.match(r'1[45] of 1[45] stops are refused: the target still moves', words)
         assert 'set settle' in words
 
 
@@ -240,9 +242,9 @@ def test_two_publishers_are_told_rather_than_what_comes_of_them():
         (seen, stamps(seen), found.positions, found.rotations),
     )
     made.finish()
-    assert made.account().dropped['measurements: a stop that spreads more than the noise'] > 100
+    assert made.account().dropped['measurements: a stop with more spread than noise'] > 100
     (warning,) = told(made)
-    assert 'of two publishers' in warning
+    assert 'two publishers' in warning
 
 
 @pytest.mark.parametrize(
@@ -271,7 +273,7 @@ def test_other_values_with_the_same_stamp_are_told(of, other, count):
     warnings = told(made)
     assert len(warnings) == count
     for words in warnings:
-        said = rf'[45]\d% of the {of} were dropped .*: other values with the same stamp'
+        said = rf'[45]\d% of the {of} were dropped .*: different values with the same stamp'
         assert re.match(said, words)
 
 
@@ -351,7 +353,7 @@ def test_a_delay_left_open_that_may_be_none_is_not_told_of_stops():
 def test_a_delay_that_periodic_motion_leaves_open_is_told_and_not_applied(mode, late, said):
     made = heard(back_and_forth, 20.0, mode=mode, late=lambda times: late)
     (warning,) = told(made)
-    assert re.search(rf'may be {said} s, for the motion repeats itself', warning)
+    assert re.search(rf'is ambiguous \({said} s\) because the motion repeats itself', warning)
     made.finish()
     assert made.delay is None
     assert {sample.delay for sample in made.samples} <= {0.0}

@@ -71,10 +71,8 @@ def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     made.finish()
     expected.finish()
     if where:  # the first comes in the time in which the arm has just stopped
-        assert (
-            made.account().dropped['measurements: in frame "stray", not in "tracker" as others']
-            == 1
-        )
+        dropped = made.account().dropped
+        assert dropped['measurements: in frame "stray", not in "tracker" like the others'] == 1
     assert 'different frames' not in made.status()
     assert made.identify().accepted
     assert made.problem().world_frame == 'tracker'
@@ -98,7 +96,7 @@ def test_a_sample_in_a_stray_frame_goes_when_the_usual_one_is_known():
     assert removed == [stray]
     assert stray not in made.samples
     assert made.account().dropped == {
-        'measurements: in frame "stray", not in "tracker" as others': 1
+        'measurements: in frame "stray", not in "tracker" like the others': 1
     }
     assert made.identify().accepted
 
@@ -240,7 +238,7 @@ def test_samples_that_were_fitted_are_known_again():
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
     words = verdict(made.calibration, *made.validate(), made.reused())[1]
-    assert 'these are the measurements that the calibration was fitted to' in words
+    assert 'these are measurements to which the calibration was fitted' in words
 
 
 def test_a_bumped_robot_is_noticed():

@@ -39,7 +39,7 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
 def test_the_status_tells_how_far_it_is():
     made = session(samples(6))
     assert made.status().startswith('waiting for joint states; 6 poses, ')
-    assert 'too few to tell how many it takes' in made.status()
+    assert 'too few to predict how many are needed' in made.status()
     assert 'more' not in made.status()
     made.restore(samples(60, start=100))
     assert 'mm expected' in made.status()
@@ -98,7 +98,7 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
     assert 'the arm stands' in made.status()
     take(made, *come[110:])
     assert made.status().startswith(
-        'nothing can be sampled: no joint states of wrist_2_joint, wrist_3_joint come any more'
+        'nothing can be sampled: no more joint states of wrist_2_joint, wrist_3_joint'
     )
 
 
@@ -149,7 +149,7 @@ def test_poses_that_do_not_follow_the_arm_are_told():
     assert not made.warnings
     still = {'position': np.full(3, 1e-16), 'rotation': np.eye(3)}
     made.restore([replace(each, **still) for each in good[8:]])
-    assert '22 poses are one and the same: is the device frozen?' in made.status()
+    assert '22 poses are identical: is the device frozen?' in made.status()
     assert '22 poses are at 0, 0, 0 m' in made.warnings[0]
 
 
