@@ -40,12 +40,10 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     title = ', '.join(f'{count} {state}' for state, count in number.items() if count)
     screen.title(title, number['fine'] == len(found))
     for each in found:
-        for alarm in each.alarms:
-            screen.bullet(f'{each.robot.serial}, {alarm}')
+        for words in each.actions:
+            Screen().bullet(f'{each.robot.serial}, {words}')  # quiet or not: the mail of cron
         for error in each.errors.values():
             screen.warn(f'{each.robot.serial}: {error}')
-        if each.state == 'refused' and each.last is not None:
-            screen.bullet(f'{each.robot.serial}: not accepted: {"; ".join(each.last.reasons)}')
     screen.say(f'{done.filed} new results in {options.history}')
     if options.out is not None:
         screen.say(f'wrote {options.out}: open {options.out / "index.html"}')

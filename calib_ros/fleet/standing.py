@@ -27,12 +27,13 @@ from calib_ros.report.page import MISSING, State, filled, plotly_script
 STATES: Mapping[str, tuple[State, str]] = {
     'changed': ('bad', 'the arm is another one than in the nights before'),
     'worse': ('bad', 'the errors of its verifications have grown'),
-    'unreadable': ('bad', 'some of its measurements could not be used'),
     'refused': ('open', 'the newest identification was not accepted'),
     'beyond tolerance': ('open', 'the error of the corrected arm is larger than wanted'),
+    'unreadable': ('open', 'some of its measurements could not be used'),
     'fine': ('good', 'nothing to do'),
 }
-"""From the worst to the best, with their looks and meaning."""
+"""From the worst to the best, with their looks and meaning: what calls for a look at the arm, then
+at its calibration, then at files."""
 MOST_NIGHTS = MOST_ENTRIES // 10
 """Nights of a robot that the page shows; the history has all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
@@ -73,17 +74,21 @@ class Standing:
         return cls(robot, own[-1] if own else None, watched, errors, known, found)
 
     @property
+    def states(self) -> tuple[str, ...]:
+        """Return all that is to be said of it, the worst first."""
+        found = {
+            'changed': bool(self.watched.changes),
+            'worse': bool(self.drift.alarms),
+            'refused': self.last is not None and not self.last.accepted,
+            'beyond tolerance': self.share > 1.0,
+            'unreadable': bool(self.errors) or self.last is None,
+        }
+        return tuple(state for state, holds in found.items() if holds) or ('fine',)
+
+    @property
     def state(self) -> str:
         """Return the worst that is to be said of it."""
-        if self.watched.changes:
-            return 'changed'
-        if self.drift.alarms:
-            return 'worse'
-        if self.errors or self.last is None:
-            return 'unreadable'
-        if not self.last.accepted:
-            return 'refused'
-        return 'beyond tolerance' if self.share > 1.0 else 'fine'
+        return self.states[0]
 
     @property
     def alarms(self) -> tuple[str, ...]:
@@ -93,6 +98,17 @@ class Standing:
             for first in self.drift.since
         )
         return (*(f'{each.time:%Y-%m-%d}: {each}' for each in self.watched.changes), *grown)
+
+    @property
+    def actions(self) -> tuple[str, ...]:
+        """Return what calls for a look at the robot or its calibration, in words."""
+        found = list(self.alarms)
+        if self.last is not None and 'refused' in self.states:
+            found.append(f'not accepted: {"; ".join(self.last.reasons)}')
+        if self.last is not None and 'beyond tolerance' in self.states:
+            wanted = self.robot.tolerance
+            found.append(f'beyond tolerance: {self.last.rms_mm:.3f} mm, {wanted:g} mm are wanted')
+        return tuple(found)
 
     @property
     def share(self) -> float:
