@@ -44,6 +44,8 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
             Screen().bullet(f'{each.robot.serial}, {words}')  # quiet or not: the mail of cron
         for error in each.errors.values():
             screen.warn(f'{each.robot.serial}: {error}')
+        for remark in () if options.quiet else each.remarks:
+            screen.warn(f'{each.robot.serial}: {remark}', 'note')
     screen.say(f'{done.filed} new results in {options.history}')
     if options.out is not None:
         screen.say(f'wrote {options.out}: open {options.out / "index.html"}')

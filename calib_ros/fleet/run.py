@@ -57,11 +57,15 @@ class Cluster:
 
 @dataclass
 class Run:
-    """What a run did: results filed, time spent on them [s], and errors by robot and source."""
+    """What a run did: results filed, time spent on them [s], and errors by robot and source.
+
+    `copies` are, by robot and source, sources whose content is filed as that of another one.
+    """
 
     filed: int = 0
     seconds: float = 0.0
     errors: dict[str, dict[str, str]] = field(default_factory=dict)
+    copies: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def note(self, serial: str, source: str, error: str) -> None:
         """Keep what is wrong with a source."""
@@ -104,9 +108,29 @@ def page_path(out: Path, row: Row) -> Path:
 
 
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the identifications among rows of a robot that are by its settings of today."""
+    """Return the identifications among rows of a robot that are by its settings of today.
+
+    There is one of each night: that of this version, or else the one filed last.
+    """
     hashed = robot.settings_hash
-    return tuple(row for row in rows if row.kind == 'identify' and row.settings == hashed)
+    own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
+    return _once(own, lambda row: row.inputs)
+
+
+def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return the verifications among rows that can be compared.
+
+    There is one of the same poses by the same calibration, whatever the tolerance or the version.
+    """
+    own = [row for row in rows if row.kind == 'verify' and row.rms_mm and row.rms_freedom]
+    return _once(own, lambda row: (row.inputs, row.chain))
+
+
+def _once(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
+    """Return rows without those that others are `of` the same as."""
+    newest = sorted(rows, key=lambda row: (row.software == calib_ros.__version__, row.filed))
+    kept = {of(row): row.key for row in newest}
+    return tuple(row for row in rows if kept[of(row)] == row.key)
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
@@ -123,11 +147,12 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
         return []
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
+    names = {each.name for each in there}
+    known = {row.inputs: row.source if row.source in names else '' for row in rows}  # or moved
     last = max(there, key=lambda each: (each.modified or NEVER, each.name))
     tasks = []
     for source in there:
         if (source.name, source.fingerprint) not in done:
-            known = frozenset(row.inputs for row in rows if row.source == source.name)
             tasks.append(Task(robot, source, known, out is not None and source == last))
     return tasks
 
@@ -147,13 +172,17 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
     """File a result, and write its page in place of the earlier ones."""
     found.seconds += outcome.seconds
+    row, serial, source, first = outcome.row, task.robot.serial, task.source.name, outcome.known
     if outcome.error:
-        found.note(task.robot.serial, task.source.name, outcome.error)
-    if outcome.row is None:
-        return
-    found.filed += history.file(outcome.row)
-    if outcome.page and out is not None:
-        path = page_path(out, outcome.row)
+        found.note(serial, source, outcome.error)
+    if row is not None and history.file(row):
+        found.filed += 1
+    elif row is not None:  # filed meanwhile
+        first = next(r.source for r in history.rows(serial) if r.key == row.key)
+    if first not in ('', source):
+        found.copies.setdefault(serial, {})[source] = first
+    if row is not None and outcome.page and out is not None:
+        path = page_path(out, row)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_file(path, outcome.page, overwrite=True)
         for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from calib_ros.atomic import write_file
 from calib_ros.errors import MOST_ENTRIES, CalibrationError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.run import Run, page_path, results
+from calib_ros.fleet.run import Run, page_path, results, verifications
 from calib_ros.fleet.watch import Change, Watched, watch
 from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MISSING, State, filled, plotly_script
@@ -42,7 +42,10 @@ ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A robot, its newest result, changes, unread sources, its verifications and their `drift`."""
+    """A robot, its newest result, changes, unread sources, its verifications and their `drift`.
+
+    `remarks` say what else to know of it, which is neither good nor bad.
+    """
 
     robot: Robot
     last: Row | None
@@ -50,28 +53,37 @@ class Standing:
     errors: Mapping[str, str]
     verified: tuple[Row, ...]
     drift: Drift
+    remarks: tuple[str, ...] = ()
 
     @classmethod
-    def of(
-        cls, robot: Robot, history: History, errors: Mapping[str, str], years: float
-    ) -> Standing:
+    def of(cls, robot: Robot, history: History, done: Run, years: float) -> Standing:
         """Return how a robot stands; a false alarm of each kind comes once in so many years."""
         try:
-            return cls._of(robot, history.rows(robot.serial), errors, years)
+            return cls._of(robot, history.rows(robot.serial), done, years)
         except (CalibrationError, ValueError, KeyError) as err:  # rows of others, or damaged ones
-            told = {**errors, '': f'its rows in the history cannot be compared: {err}'}
-            return cls._of(robot, (), told, years)
+            found = cls._of(robot, (), done, years)
+            told = {**found.errors, '': f'its rows in the history cannot be compared: {err}'}
+            return replace(found, errors=told)
 
     @classmethod
-    def _of(
-        cls, robot: Robot, rows: tuple[Row, ...], errors: Mapping[str, str], years: float
-    ) -> Standing:
+    def _of(cls, robot: Robot, rows: tuple[Row, ...], done: Run, years: float) -> Standing:
         own = results(robot, rows)
-        rows = tuple(row for row in rows if robot.compares(row.time))
-        known = tuple(r for r in rows if r.kind == 'verify' and r.rms_mm and r.rms_freedom)
+        last = own[-1] if own else None
+        compared = tuple(row for row in own if robot.compares(row.time))
+        known = tuple(r for r in verifications(rows) if robot.compares(r.time))
         found = drift([r.rms_mm or 0 for r in known], [r.rms_freedom or 0 for r in known], years)
-        watched = watch(results(robot, rows), years)
-        return cls(robot, own[-1] if own else None, watched, errors, known, found)
+        watched = watch(compared, years)
+        errors, copies = (of.get(robot.serial, {}) for of in (done.errors, done.copies))
+        remarks = [
+            f'{copy} has the content of {first}: one night' for copy, first in copies.items()
+        ]
+        if others := _others(robot, rows, own):
+            remarks.append(
+                f'nights in the history by other settings or another chain, not compared: {others} '
+                '(put their files back to identify them anew)'
+            )
+        remarks += watched.remarks
+        return cls(robot, last, watched, errors, known, found, tuple(remarks))
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -118,11 +130,18 @@ class Standing:
         return self.last.rms_mm / self.robot.tolerance
 
 
+def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> int:
+    """Return how many nights are in the history, but not by the settings of today."""
+    known = {row.inputs for row in own}
+    accepted = (row for row in rows if row.accepted and row.source and robot.compares(row.time))
+    return len({row.inputs for row in accepted} - known)
+
+
 def standings(
     robots: Sequence[Robot], history: History, done: Run, years: float
 ) -> tuple[Standing, ...]:
     """Return how robots stand, the worst first."""
-    found = [Standing.of(r, history, done.errors.get(r.serial, {}), years) for r in robots]
+    found = [Standing.of(robot, history, done, years) for robot in robots]
     order = list(STATES)
 
     def rank(one: Standing) -> tuple[int, float, float, str]:
@@ -201,6 +220,7 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
         total=len(found),
         alarmed=[each for each in shown if each.alarms],
         unreadable=[each for each in shown if each.errors],
+        remarked=[each for each in shown if each.remarks],
         rows=[(each, _link(out, each)) for each in shown],
         done=done,
         script=PLOTLY,
@@ -224,7 +244,7 @@ def _chart(standing: Standing) -> dict[str, Any]:
         return [each.time.isoformat(timespec='seconds') for each in of]
 
     nights = standing.watched.nights[-MOST_NIGHTS:]
-    joints = list(nights[0].strength) if nights else []
+    joints = dict.fromkeys(joint for night in nights for joint in night.strength)
     verified = standing.verified[-MOST_NIGHTS:]
     return {
         'serial': standing.robot.serial,
@@ -238,6 +258,10 @@ def _chart(standing: Standing) -> dict[str, Any]:
             'sums': standing.drift.sums[-MOST_NIGHTS:].round(3).T.tolist(),
         },
         'joints': {
-            joint: [round(night.strength[joint], 2) for night in nights] for joint in joints
+            joint: [
+                None if (x := night.strength.get(joint)) is None else round(x, 2)
+                for night in nights
+            ]
+            for joint in joints
         },
     }

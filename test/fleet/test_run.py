@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from datetime import timedelta
 
 import plants
 import pytest
@@ -10,7 +11,7 @@ from calib_ros.errors import ConfigError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Measured, read_plant
-from calib_ros.fleet.run import Cluster, LostError, run
+from calib_ros.fleet.run import Cluster, LostError, results, run, verifications
 from calib_ros.fleet.standing import standings
 from calib_ros.fleet.work import Outcome, Source, Task
 
@@ -64,6 +65,71 @@ def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
     page.unlink()  # or another folder of the report
     assert run(plant, history, cluster, out).filed == 0
     assert page.exists()
+
+
+def test_a_night_counts_once_whatever_its_file_is_called(plant, cluster, tmp_path, monkeypatch):
+    history, out = History(tmp_path / 'history'), tmp_path / 'report'
+    first, copy = (tmp_path / f'nights/A/{name}.csv' for name in ('000', '000 copy'))
+    copy.write_bytes(first.read_bytes())
+    found = run(plant, history, cluster, out)
+    assert found.filed == len(keys(history)) == 4
+    ((one, other),) = found.copies['A'].items()
+    assert {one, other} == {str(first), str(copy)}
+
+    done = []
+    monkeypatch.setitem(running.work.__globals__, 'table', lambda *_: done.append(0))
+    again = run(plant, history, cluster, out)
+    assert (again.copies, again.filed, again.errors, done) == (found.copies, 0, {}, [])
+    (standing,) = (s for s in standings(plant, history, again, 100.0) if s.robot.serial == 'A')
+    assert standing.remarks == (f'{one} has the content of {other}: one night',)
+    assert standing.state == 'fine'
+    assert len(standing.watched.nights) == 2
+
+    (tmp_path / 'nights/A/001.csv').rename(tmp_path / 'nights/A/moved.csv')
+    assert run(plant, history, cluster, out).copies == found.copies
+    assert done == []
+
+
+def test_a_night_counts_once_after_an_upgrade(plant, cluster, tmp_path, monkeypatch):
+    history = History(tmp_path / 'history')
+    run(plant, history, cluster)
+    old = history.rows('A')
+    for row in old:
+        history.file(replace(row, software='9.9.9', filed=row.filed + timedelta(days=1)))
+    assert len(history.rows('A')) == 4
+    robot = plant[0]
+    assert [row.key for row in results(robot, history.rows('A'))] == [row.key for row in old]
+    monkeypatch.setattr('calib_ros.__version__', '9.9.9')
+    assert {row.software for row in results(robot, history.rows('A'))} == {'9.9.9'}
+    monkeypatch.setattr('calib_ros.__version__', '10')  # whose results are not there yet
+    assert {row.software for row in results(robot, history.rows('A'))} == {'9.9.9'}
+
+
+def test_poses_verified_twice_count_once(plant, tmp_path):
+    errors = {'rms_mm': 0.1, 'rms_freedom': 30.0}
+    row = Row('A', 'verify', plants.when(0), 'holds', 'poses', 'settings', chain='{}', **errors)
+    others = (
+        replace(row, settings='with a tolerance', filed=row.filed + timedelta(days=1)),
+        replace(row, chain='[]'),
+        replace(row, inputs='other poses'),
+        replace(row, kind='validate'),
+        replace(row, rms_freedom=None, inputs='others'),
+    )
+    assert verifications((row, *others)) == others[:3]
+
+
+def test_nights_by_other_settings_are_told_of(plant, cluster, tmp_path):
+    history = History(tmp_path / 'history')
+    run(plant, history, cluster)
+    (tmp_path / 'nights/A/000.csv').unlink()
+    changed = replace(plant[0], settings=replace(plant[0].settings, folds=4))
+    found = run((changed,), history, cluster)
+    (standing,) = standings((changed,), history, found, 100.0)
+    (remark,) = standing.remarks
+    assert remark.startswith('nights in the history by other settings or another chain')
+    assert 'not compared: 1 (put their files back' in remark
+    later = replace(changed, since=plants.when(1))
+    assert standings((later,), history, found, 100.0)[0].remarks == ()
 
 
 def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path):
