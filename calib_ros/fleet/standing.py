@@ -79,8 +79,8 @@ class Standing:
         ]
         if others := _others(robot, rows, own):
             remarks.append(
-                f'nights in the history by other settings or another chain, not compared: {others} '
-                '(put their files back to identify them anew)'
+                'nights in the history by other settings or another chain, not compared: '
+                f'{others} (put their files back to identify them anew)'
             )
         remarks += watched.remarks
         return cls(robot, last, watched, errors, known, found, tuple(remarks))
