@@ -20,7 +20,7 @@ from urllib.parse import quote
 
 import calib_ros
 from calib_ros.atomic import write_file
-from calib_ros.errors import CalibrationError, ConfigError, shortened
+from calib_ros.errors import CalibrationError, ConfigError, shortened, trouble
 from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
@@ -182,12 +182,18 @@ def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, foun
     if first not in ('', source):
         found.copies.setdefault(serial, {})[source] = first
     if row is not None and outcome.page and out is not None:
-        path = page_path(out, row)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, outcome.page, overwrite=True)
-        for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
-            if earlier != path:
-                earlier.unlink(missing_ok=True)
+        try:
+            _write_page(page_path(out, row), outcome.page)
+        except OSError as err:
+            found.note(serial, source, f'the page of its report: {trouble(err)}')
+
+
+def _write_page(path: Path, page: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, page, overwrite=True)
+    for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
+        if earlier != path:
+            earlier.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -111,6 +111,11 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
         assert f'- {serial}, beyond tolerance: 0.' in said
     assert said.endswith(' mm, 0.01 mm are wanted\n')
 
+    assert main([*quiet, '--metrics', 'none/calib.prom']) == 1  # but alarms are told
+    told = capsys.readouterr()
+    assert told.out == said
+    assert 'none/calib.prom: No such file or directory' in told.err
+
     plant['groups']['line']['tolerance'] = 0.3
     plant['robots'][1]['since'] = '2025-10-12'
     (folder / 'plant.yaml').write_text(json.dumps(plant))

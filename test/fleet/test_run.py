@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
 from datetime import timedelta
+from unittest.mock import ANY
 
 import plants
 import pytest
@@ -151,6 +152,20 @@ def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     assert found.filed == 1
     assert str(bad) in found.errors['A'][str(bad)]
     assert found.errors['B'] == {(none := plant[1].measured[0].files): f'nothing matches {none}'}
+
+
+def test_a_page_that_cannot_be_written_costs_no_result(plant, cluster, tmp_path):
+    history, out = History(tmp_path / 'history'), tmp_path / 'report'
+    (out / 'robots').mkdir(parents=True)
+    (out / 'robots/A').write_text('no folder')
+    found = run(plant, history, cluster, out)
+    assert found.filed == 4
+    (error,) = found.errors['A'].values()
+    assert error.startswith('the page of its report: ')
+    assert 'robots/A' in error
+    (out / 'robots/A').unlink()
+    assert run(plant, history, cluster, out) == running.Run(seconds=ANY)
+    assert len(list(out.glob('robots/*/*.html'))) == 2
 
 
 def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
