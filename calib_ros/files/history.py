@@ -232,6 +232,8 @@ class History:
         except (ImportError, ValueError) as err:
             raise ConfigError(f'a history cannot be at {place}: {err}') from err
         self._local = is_local(self._files)
+        if self._local and Path(self._root).exists() and not Path(self._root).is_dir():
+            raise ConfigError(f'a history cannot be at {place}: that is no folder')
 
     def file(self, row: Row) -> bool:
         """Add a row; return False where it was there already."""

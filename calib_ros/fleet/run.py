@@ -86,6 +86,7 @@ def run(
     raised.
     """
     found = Run()
+    history.serials()  # one that cannot be read at all is an error of the run, not of each robot
     with ExitStack() as stack:
         client = None
         for plan in (_new, _without_page):

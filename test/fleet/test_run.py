@@ -8,7 +8,7 @@ import plants
 import pytest
 from distributed import LocalCluster
 
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Measured, read_plant
@@ -186,6 +186,15 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     worst = standings(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
+
+
+def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch):
+    def denied(*_, **__):
+        raise PermissionError(13, 'Permission denied')
+
+    monkeypatch.setattr('fsspec.implementations.local.LocalFileSystem.ls', denied)
+    with pytest.raises(InputError, match='history .* cannot be read: .*Permission denied'):
+        run(plant, History(tmp_path / 'history'), Cluster())
 
 
 def test_small_tasks_go_together_and_the_one_that_ends_a_worker_is_found(plant, cluster):
