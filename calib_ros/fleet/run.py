@@ -111,11 +111,12 @@ def page_path(out: Path, row: Row) -> Path:
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
     """Return the identifications among rows of a robot that are by its settings of today.
 
-    There is one of each night: that of this version, or else the one filed last.
+    There is one of each night, of the same content or the same time, as a file that was put right
+    has: that of this version, or else the one filed last.
     """
     hashed = robot.settings_hash
     own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
-    return _once(own, lambda row: row.inputs)
+    return _once(_once(own, lambda row: row.inputs), lambda row: row.time)
 
 
 def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:

@@ -106,6 +106,22 @@ def test_a_night_counts_once_after_an_upgrade(plant, cluster, tmp_path, monkeypa
     assert {row.software for row in results(robot, history.rows('A'))} == {'9.9.9'}
 
 
+def test_a_night_whose_file_was_put_right_counts_once(plant, cluster, tmp_path):
+    history, place = History(tmp_path / 'history'), tmp_path / 'nights/A/001.csv'
+    right = place.read_text()
+    head, *lines = (line.split(',') for line in right.splitlines())
+    in_mm = [[*row[:7], *(str(1e3 * float(x)) for x in row[7:10]), *row[10:]] for row in lines]
+    place.write_text('\n'.join(','.join(row) for row in (head, *in_mm)))
+    found = run(plant, history, cluster)
+    assert standings(plant, history, found, 100.0)[0].state == 'refused'
+    place.write_text(right)
+    found = run(plant, history, cluster)
+    rows = history.rows('A')
+    assert [row.time for row in rows] == [plants.when(0), plants.when(1), plants.when(1)]
+    for each in (rows, (*rows[:1], *rows[:0:-1])):
+        assert [row.verdict for row in results(plant[0], each)] == ['accepted', 'accepted']
+
+
 def test_poses_verified_twice_count_once(plant, tmp_path):
     errors = {'rms_mm': 0.1, 'rms_freedom': 30.0}
     row = Row('A', 'verify', plants.when(0), 'holds', 'poses', 'settings', chain='{}', **errors)
@@ -193,7 +209,7 @@ def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch
         raise PermissionError(13, 'Permission denied')
 
     monkeypatch.setattr('fsspec.implementations.local.LocalFileSystem.ls', denied)
-    with pytest.raises(InputError, match='history .* cannot be read: .*Permission denied'):
+    with pytest.raises(InputError, match=r'history .* cannot be read: .*Permission denied'):
         run(plant, History(tmp_path / 'history'), Cluster())
 
 
