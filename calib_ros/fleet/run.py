@@ -12,8 +12,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -116,7 +116,7 @@ def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
     """
     hashed = robot.settings_hash
     own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
-    return _once(_once(own, lambda row: row.inputs), lambda row: row.time)
+    return _once(_once(_dated(own), lambda row: row.inputs), lambda row: row.time)
 
 
 def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -125,14 +125,24 @@ def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
     There is one of the same poses by the same calibration, whatever the tolerance or the version.
     """
     own = [row for row in rows if row.kind == 'verify' and row.rms_mm and row.rms_freedom]
-    return _once(own, lambda row: (row.inputs, row.chain))
+    return _once(_dated(own), lambda row: (row.inputs, row.chain))
 
 
 def _once(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
-    """Return rows without those that others are `of` the same as."""
+    """Return rows in the order of their times, without those that others are `of` the same as."""
     newest = sorted(rows, key=lambda row: (row.software == calib_ros.__version__, row.filed))
-    kept = {of(row): row.key for row in newest}
-    return tuple(row for row in rows if kept[of(row)] == row.key)
+    kept = {of(row): row for row in newest}
+    return tuple(sorted(kept.values(), key=lambda row: (row.time, row.source, row.key)))
+
+
+def _dated(rows: Sequence[Row]) -> list[Row]:
+    """Return rows with times that can be: of what was filed before it was measured, when filed."""
+    return [replace(row, time=row.filed) if too_late(row) else row for row in rows]
+
+
+def too_late(row: Row) -> bool:
+    """Tell whether stamps are later than their result, in any time zone: of a clock set wrong."""
+    return row.time - row.filed > timedelta(days=1)
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:

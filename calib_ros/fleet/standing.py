@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,7 +19,7 @@ from calib_ros.atomic import write_file
 from calib_ros.errors import MOST_ENTRIES, CalibrationError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.run import Run, page_path, results, verifications
+from calib_ros.fleet.run import Run, page_path, results, too_late, verifications
 from calib_ros.fleet.watch import Change, Watched, watch
 from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MISSING, State, filled, plotly_script
@@ -75,14 +75,9 @@ class Standing:
         watched = watch(compared, years)
         errors, copies = (of.get(robot.serial, {}) for of in (done.errors, done.copies))
         remarks = [
-            f'{copy} has the content of {first}: one night' for copy, first in copies.items()
+            f'{copy} has the content of {source}: one night' for copy, source in copies.items()
         ]
-        if others := _others(robot, rows, own):
-            remarks.append(
-                'nights in the history by other settings or another chain, not compared: '
-                f'{others} (put their files back to identify them anew)'
-            )
-        remarks += watched.remarks
+        remarks += [*_clocks(rows, own), *_others(robot, rows, own), *watched.remarks]
         return cls(robot, last, watched, errors, known, found, tuple(remarks))
 
     @property
@@ -130,11 +125,33 @@ class Standing:
         return self.last.rms_mm / self.robot.tolerance
 
 
-def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> int:
-    """Return how many nights are in the history, but not by the settings of today."""
-    known = {row.inputs for row in own}
+def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
+    """Yield in words how many nights are in the history, but not by the settings of today."""
     accepted = (row for row in rows if row.accepted and row.source and robot.compares(row.time))
-    return len({row.inputs for row in accepted} - known)
+    if number := len({row.inputs for row in accepted}.difference(row.inputs for row in own)):
+        yield (
+            'nights in the history by other settings or another chain, not compared: '
+            f'{number} (put their files back to identify them anew)'
+        )
+
+
+def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
+    """Yield in words which nights cannot have been measured when their stamps say."""
+    if ahead := [row for row in rows if too_late(row)]:
+        row = max(ahead, key=lambda each: each.filed)
+        yield (
+            f'{len(ahead)} result{"s" * (len(ahead) > 1)} with stamps later than the filing, on '
+            f'{row.filed:%Y-%m-%d} of {row.time:%Y-%m-%d} ({row.source or row.kind}): set the '
+            'clock of what records them'
+        )
+    newest = max(own, key=lambda row: row.filed, default=None)
+    if newest is None or newest.time >= own[-1].time:
+        return
+    if newest.filed.date() > own[-1].filed.date():
+        yield (
+            f'{newest.source} was filed last, and its stamps are of {newest.time:%Y-%m-%d}, '
+            'before those of other nights: unless it is an old one, a clock was set back'
+        )
 
 
 def standings(
