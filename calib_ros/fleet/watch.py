@@ -8,15 +8,16 @@ compared with the mean of the nights before, both weighted by information:
 
     d = x_after - x_before,   S = s^2 (C_after + C_before),   u = S^-1 d,   W = S^-1
 
-An arm is bumped at one joint, not at all of them. That joint j alone changed, by
+An arm is bumped at one joint or two, not at all of them. That j alone, a joint or two, changed by
 
     d_j = W_jj^-1 u_j,   covariance W_jj^-1,
 
 explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution where nothing
-changed: as many degrees of freedom as j has parameters, over those of the noise. s^2 is by how
-much the nights so far scatter more than their covariances tell, where they clearly do, or by how
-much more j leaves of the difference: what warms up, what the model lacks. `changes.py` names what
-changed, and all begins anew.
+changed: as many degrees of freedom as j has parameters, over those of the noise, or of s^2 if it
+has fewer: those of the nights before and of what j leaves. s^2 is by how much the nights so far
+scatter more than their covariances tell, where they clearly do, or by how much more j leaves of
+the difference: what warms up, what the model lacks. `changes.py` names what changed, and all
+begins anew.
 
 Nights are compared by the parameters that they have in common. An effect that only some nights
 fitted is taken at its nominal value in the others too: with the information matrix I of all
@@ -24,16 +25,18 @@ parameters of the arm, a fit of the common ones c alone has I_cc and (I x)_c. Th
 DH parameters, which are far from nominal: nights that determine other ones are compared among
 themselves only.
 
-Neither warmth nor model makes nights scatter CLEARLY more all at once. Where every joint leaves
-more, several are different: a mended arm, or measurements of another robot.
+Neither warmth nor model makes nights scatter CLEARLY more all at once. Where every joint and pair
+leaves more, several are different: a mended arm, or measurements of another robot.
 """
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,6 +68,7 @@ class Change:
     time: datetime  # of the first night from which on it is
     seen: datetime  # of the night in which that was found
     reasons: tuple[Explanation, ...]  # the likeliest first; none where several joints changed
+    pair: tuple[str, ...] = ()  # the joints where two changed
 
     @property
     def joint(self) -> str:
@@ -73,6 +77,8 @@ class Change:
 
     def __str__(self) -> str:
         """Return it in words."""
+        if self.pair:
+            return f'two joints changed: {" and ".join(self.pair)}: was it bumped?'
         if not self.reasons:
             return (
                 'several joints are different: was it mended, or are these the measurements of '
@@ -150,29 +156,35 @@ def _alike(rows: Sequence[Row], arms: Sequence[Sequence[Parameter]], years: floa
         lacking = (k for k in range(known_up_to, len(rows)) if not common.issubset(arms[k]))
         end = next(lacking, len(rows))
         data = _Data.of(rows[first:end], arms[first:end], names)
-        level = 1.0 / (365.25 * years * len(LAGS) * len(data.joints))
+        level = 1.0 / (365.25 * years * len(LAGS) * len(data.groups))
         tests = data.tests()
-        least = tests.chances.min(axis=0)
+        count = len(data.joints)
+        least = tests.chances[..., :count].min(axis=0)
         shown = -special.ndtri(np.maximum(0.5 * least, 1e-300))
         for k in range(known_up_to, end):
             strengths[k] = dict(zip(data.joints, shown[k - first].tolist(), strict=True))
-        several = tests.several.min(axis=0) < level
         fresh = np.arange(first, end) >= known_up_to
-        alarms = np.flatnonzero(((least.min(axis=1) < level) | several) & fresh)
+        several = tests.several.min(axis=0) < level
+        alarms = np.flatnonzero(((tests.chances.min(axis=(0, 2)) < level) | several) & fresh)
         if not alarms.size:
             known_up_to = end
             continue
         k = int(alarms[0])
-        chances = tests.several if several[k] else tests.chances.min(axis=2)
-        lag = int(chances[:, k].argmin())
+        chances = tests.several[:, k] if several[k] else tests.chances[:, k].min(axis=1)
+        lag = int(chances.argmin())
         row = rows[first + k]
         reasons: tuple[Explanation, ...] = ()
-        if not several[k]:
+        pair: tuple[str, ...] = ()
+        one = float(tests.chances[lag, k, :count].min())
+        two = float(tests.chances[lag, k, count:].min(initial=1.0))
+        if not several[k] and two < level * (one if one < level else 1.0):
+            pair = data.groups[count + int(tests.chances[lag, k, count:].argmin())]
+        elif not several[k]:
             columns = Columns(row.corrected(), data.names)
             told = Told(data.names, tests.weight[lag, k], tests.pull[lag, k])
             reasons = likely(explanations(told, columns, float(data.freedom[k])))
         first, known_up_to = first + k + 1 - LAGS[lag], first + k + 1
-        changes.append(Change(rows[first].time, row.time, reasons))
+        changes.append(Change(rows[first].time, row.time, reasons, pair))
     nights = tuple(Night(row, each) for row, each in zip(rows, strengths, strict=True))
     if not (left := sorted(set().union(*arms[first:]).difference(names))):
         return Watched(nights, tuple(changes))
@@ -184,7 +196,7 @@ def _alike(rows: Sequence[Row], arms: Sequence[Sequence[Parameter]], years: floa
 
 
 class _Tests(NamedTuple):
-    """Tests of L lags at K nights for J joints."""
+    """Tests of L lags at K nights for J joints and pairs of these."""
 
     chances: FloatArray  # (L, K, J), 1 where there is no night before
     several: FloatArray  # (L, K), that no joint alone changed
@@ -222,13 +234,27 @@ class _Data(NamedTuple):
     def joints(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(name.owner for name in self.names))
 
+    @property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """Return what may change at once: joints, then pairs with half of all parameters at most.
+
+        What is left by more than that tells little of how nights scatter.
+        """
+        known = Counter(name.owner for name in self.names)
+        pairs = (
+            pair
+            for pair in combinations(self.joints, 2)
+            if 2 * sum(known[joint] for joint in pair) <= len(self.names)
+        )
+        return (*((joint,) for joint in self.joints), *pairs)
+
     def tests(self) -> _Tests:
         """Return the tests of all nights against those before."""
         count, size = self.pulls.shape
         owners = np.array([name.owner for name in self.names])
-        groups = [np.flatnonzero(owners == joint) for joint in self.joints]
+        groups = [np.flatnonzero(np.isin(owners, group)) for group in self.groups]
         whole, pulled = np.cumsum(self.information, axis=0), np.cumsum(self.pulls, axis=0)
-        chances = np.ones((len(LAGS), count, len(self.joints)))
+        chances = np.ones((len(LAGS), count, len(groups)))
         several = np.ones((len(LAGS), count))
         pull = np.zeros((len(LAGS), count, size))
         weight = np.zeros((len(LAGS), count, size, size))
@@ -260,7 +286,8 @@ class _Data(NamedTuple):
                 several[number, nights] = np.maximum(several[number, nights], beyond)
                 left = _clearly(left, others)
                 gain /= np.maximum(usual, left) * len(group)
-                chances[number, nights, j] = special.fdtrc(len(group), self.freedom[nights], gain)
+                known = np.minimum(self.freedom[nights], others + size * (nights - lag))
+                chances[number, nights, j] = special.fdtrc(len(group), known, gain)
         return _Tests(chances, several, pull, weight)
 
     def _usual(self, scatter: FloatArray) -> float:
