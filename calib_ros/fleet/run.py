@@ -165,7 +165,9 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
     tasks = []
     for source in there:
         if (source.name, source.fingerprint) not in done:
-            tasks.append(Task(robot, source, known, out is not None and source == last))
+            own = {inputs: name for inputs, name in known.items() if name == source.name}
+            page = out is not None and source == last
+            tasks.append(Task(robot, source, own or known, page))  # touched, or perhaps a copy
     return tasks
 
 
