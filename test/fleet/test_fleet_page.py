@@ -71,3 +71,12 @@ def test_the_page_tells_all_that_is_to_be_said_of_a_robot():
     fleet = [standing('2', {'x.csv': 'damaged'}, verdict='refused')]
     page = page_of(Path('report'), fleet, Run())
     assert 'refused, beyond tolerance, unreadable</span>' in page
+
+
+def test_a_night_that_does_not_determine_a_joint_leaves_a_gap_in_its_chart():
+    each = standing('1')
+    few = Watched((*each.watched.nights[:2], Night(each.watched.nights[2].row, {'a': 0.5})))
+    told = replace(each, watched=few, remarks=('a <remark>',))
+    page = page_of(Path('report'), [told], Run())
+    assert '"joints": {"\\u003cb\\u003e": [6.0, 6.0, null], "a": [0.5, 0.5, 0.5]}' in page
+    assert '<li>a &lt;remark&gt;</li>' in page
