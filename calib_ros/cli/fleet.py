@@ -32,22 +32,22 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
         done = run(robots, history, cluster, options.out, work)
         work('comparing nights')
         found = standings(robots, history, done, options.years)
-        if options.out is not None and (missing := write_report(options.out, found, done)):
-            screen.warn(missing, 'note')
-        if options.metrics is not None:
-            write_file(options.metrics, metrics(found, done, time.time()), overwrite=True)
     number = counts(found)
     title = ', '.join(f'{count} {state}' for state, count in number.items() if count)
     screen.title(title, number['fine'] == len(found))
     for each in found:
-        for alarm in each.alarms:
-            screen.bullet(f'{each.robot.serial}, {alarm}')
+        for words in each.actions:
+            Screen().bullet(f'{each.robot.serial}, {words}')  # quiet or not: the mail of cron
         for error in each.errors.values():
             screen.warn(f'{each.robot.serial}: {error}')
-        if each.state == 'refused' and each.last is not None:
-            screen.bullet(f'{each.robot.serial}: not accepted: {"; ".join(each.last.reasons)}')
+        for remark in () if options.quiet else each.remarks:
+            screen.warn(f'{each.robot.serial}: {remark}', 'note')
     screen.say(f'{done.filed} new results in {options.history}')
+    if options.metrics is not None:
+        write_file(options.metrics, metrics(found, done, time.time()), overwrite=True)
     if options.out is not None:
+        if missing := write_report(options.out, found, done):
+            screen.warn(missing, 'note')
         screen.say(f'wrote {options.out}: open {options.out / "index.html"}')
     if number['fine'] + number['unreadable'] < len(found):
         return common.Status.NOT_ACCEPTED

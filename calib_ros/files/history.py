@@ -43,6 +43,7 @@ from calib_ros.values import LONGEST_NAME, parse_name
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
+AWAY = 'move it away, its work is done again'
 
 
 @dataclass(frozen=True)
@@ -232,6 +233,8 @@ class History:
         except (ImportError, ValueError) as err:
             raise ConfigError(f'a history cannot be at {place}: {err}') from err
         self._local = is_local(self._files)
+        if self._local and Path(self._root).exists() and not Path(self._root).is_dir():
+            raise ConfigError(f'a history cannot be at {place}: that is no folder')
 
     def file(self, row: Row) -> bool:
         """Add a row; return False where it was there already."""
@@ -296,9 +299,7 @@ class History:
             with self._files.open(path, 'rb') as file:
                 return _conformed(parquet.ParquetFile(file).read(), key)
         except Exception as err:  # a damaged file fails in many ways
-            raise InputError(
-                f'{path} is no row of a history ({err}): move it away, its work is done again'
-            ) from err
+            raise InputError(f'{path} is no row of a history ({err}): {AWAY}') from err
 
     def _write(self, path: str, content: bytes) -> None:
         """Write a file that others see as a whole or not at all."""
@@ -366,18 +367,23 @@ def _conformed(table: Any, key: str) -> Any:
 
 def _rows_of(table: Any) -> list[Row]:
     rows = []
-    for record in table.drop_columns(['key']).to_pylist():
+    for record in table.to_pylist():
+        key = record.pop('key')
         for each in fields(Row):
             value = record[each.name]
             if str(each.type) == 'FloatArray':
                 record[each.name] = np.array(value or (), dtype=float)
             elif str(each.type).startswith('tuple'):
                 record[each.name] = tuple(value or ())
+            elif value is None and 'None' not in str(each.type):
+                raise InputError(f'{key}{ENDING} in the history has no {each.name}: {AWAY}')
         size = len(record['names'])
-        square = record['covariance']
-        if square.size != size * size or not np.isfinite(square).all():
+        square, offsets = record['covariance'], record['offsets']
+        numbers = np.concatenate([square, offsets])
+        if (square.size, offsets.size) != (size**2, size) or not np.isfinite(numbers).all():
             raise InputError(
-                f'the covariance of {record["serial"]} in the history is not one of {size} names'
+                f'the offsets or covariance of {key}{ENDING} in the history are not those of '
+                f'{size} names: {AWAY}'
             )
         record['covariance'] = square.reshape(size, size)
         rows.append(Row(**record))

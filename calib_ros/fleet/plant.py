@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from datetime import date, datetime, timezone
+from datetime import date, datetime, timedelta, timezone
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -168,4 +168,7 @@ def _moment(value: object, where: str) -> datetime | None:
         moment = datetime.fromisoformat(text)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         raise ConfigError(f'{where} must be a date, such as 2026-11-20, not {value!r}') from None
-    return moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+    if moment - datetime.now(timezone.utc) > timedelta(days=1):  # tomorrow, in some time zones
+        raise ConfigError(f'{where} is in the future, so no night would be compared: {value!s}')
+    return moment

@@ -12,15 +12,15 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import calib_ros
 from calib_ros.atomic import write_file
-from calib_ros.errors import CalibrationError, ConfigError, shortened
+from calib_ros.errors import CalibrationError, ConfigError, shortened, trouble
 from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
@@ -57,11 +57,15 @@ class Cluster:
 
 @dataclass
 class Run:
-    """What a run did: results filed, time spent on them [s], and errors by robot and source."""
+    """What a run did: results filed, time spent on them [s], and errors by robot and source.
+
+    `copies` are, by robot and source, sources whose content is filed as that of another one.
+    """
 
     filed: int = 0
     seconds: float = 0.0
     errors: dict[str, dict[str, str]] = field(default_factory=dict)
+    copies: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def note(self, serial: str, source: str, error: str) -> None:
         """Keep what is wrong with a source."""
@@ -82,6 +86,7 @@ def run(
     raised.
     """
     found = Run()
+    history.serials()  # one that cannot be read at all is an error of the run, not of each robot
     with ExitStack() as stack:
         client = None
         for plan in (_new, _without_page):
@@ -104,9 +109,40 @@ def page_path(out: Path, row: Row) -> Path:
 
 
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the identifications among rows of a robot that are by its settings of today."""
+    """Return the identifications among rows of a robot that are by its settings of today.
+
+    There is one of each night, of the same content or the same time, as a file that was put right
+    has: that of this version, or else the one filed last.
+    """
     hashed = robot.settings_hash
-    return tuple(row for row in rows if row.kind == 'identify' and row.settings == hashed)
+    own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
+    return _once(_once(_dated(own), lambda row: row.inputs), lambda row: row.time)
+
+
+def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Return the verifications among rows that can be compared.
+
+    There is one of the same poses by the same calibration, whatever the tolerance or the version.
+    """
+    own = [row for row in rows if row.kind == 'verify' and row.rms_mm and row.rms_freedom]
+    return _once(_dated(own), lambda row: (row.inputs, row.chain))
+
+
+def _once(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
+    """Return rows in the order of their times, without those that others are `of` the same as."""
+    newest = sorted(rows, key=lambda row: (row.software == calib_ros.__version__, row.filed))
+    kept = {of(row): row for row in newest}
+    return tuple(sorted(kept.values(), key=lambda row: (row.time, row.source, row.key)))
+
+
+def _dated(rows: Sequence[Row]) -> list[Row]:
+    """Return rows with times that can be: of what was filed before it was measured, when filed."""
+    return [replace(row, time=row.filed) if too_late(row) else row for row in rows]
+
+
+def too_late(row: Row) -> bool:
+    """Tell whether stamps are later than their result, in any time zone: of a clock set wrong."""
+    return row.time - row.filed > timedelta(days=1)
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
@@ -123,12 +159,15 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
         return []
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
+    names = {each.name for each in there}
+    known = {row.inputs: row.source if row.source in names else '' for row in rows}  # or moved
     last = max(there, key=lambda each: (each.modified or NEVER, each.name))
     tasks = []
     for source in there:
         if (source.name, source.fingerprint) not in done:
-            known = frozenset(row.inputs for row in rows if row.source == source.name)
-            tasks.append(Task(robot, source, known, out is not None and source == last))
+            own = {inputs: name for inputs, name in known.items() if name == source.name}
+            page = out is not None and source == last
+            tasks.append(Task(robot, source, own or known, page))  # touched, or perhaps a copy
     return tasks
 
 
@@ -147,18 +186,28 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
     """File a result, and write its page in place of the earlier ones."""
     found.seconds += outcome.seconds
+    row, serial, source, first = outcome.row, task.robot.serial, task.source.name, outcome.known
     if outcome.error:
-        found.note(task.robot.serial, task.source.name, outcome.error)
-    if outcome.row is None:
-        return
-    found.filed += history.file(outcome.row)
-    if outcome.page and out is not None:
-        path = page_path(out, outcome.row)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, outcome.page, overwrite=True)
-        for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
-            if earlier != path:
-                earlier.unlink(missing_ok=True)
+        found.note(serial, source, outcome.error)
+    if row is not None and history.file(row):
+        found.filed += 1
+    elif row is not None:  # filed meanwhile
+        first = next(r.source for r in history.rows(serial) if r.key == row.key)
+    if first not in ('', source):
+        found.copies.setdefault(serial, {})[source] = first
+    if row is not None and outcome.page and out is not None:
+        try:
+            _write_page(page_path(out, row), outcome.page)
+        except OSError as err:
+            found.note(serial, source, f'the page of its report: {trouble(err)}')
+
+
+def _write_page(path: Path, page: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_file(path, page, overwrite=True)
+    for earlier in path.parent.glob(f'{"[0-9a-f]" * 64}.html'):
+        if earlier != path:
+            earlier.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from calib_ros.atomic import write_file
 from calib_ros.errors import MOST_ENTRIES, CalibrationError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.run import Run, page_path, results
+from calib_ros.fleet.run import Run, page_path, results, too_late, verifications
 from calib_ros.fleet.watch import Change, Watched, watch
 from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MISSING, State, filled, plotly_script
@@ -27,12 +27,13 @@ from calib_ros.report.page import MISSING, State, filled, plotly_script
 STATES: Mapping[str, tuple[State, str]] = {
     'changed': ('bad', 'the arm is another one than in the nights before'),
     'worse': ('bad', 'the errors of its verifications have grown'),
-    'unreadable': ('bad', 'some of its measurements could not be used'),
     'refused': ('open', 'the newest identification was not accepted'),
     'beyond tolerance': ('open', 'the error of the corrected arm is larger than wanted'),
+    'unreadable': ('open', 'some of its measurements could not be used'),
     'fine': ('good', 'nothing to do'),
 }
-"""From the worst to the best, with their looks and meaning."""
+"""From the worst to the best, with their looks and meaning: what calls for a look at the arm, then
+at its calibration, then at files."""
 MOST_NIGHTS = MOST_ENTRIES // 10
 """Nights of a robot that the page shows; the history has all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
@@ -41,7 +42,10 @@ ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A robot, its newest result, changes, unread sources, its verifications and their `drift`."""
+    """A robot, its newest result, changes, unread sources, its verifications and their `drift`.
+
+    `remarks` say what else to know of it, which is neither good nor bad.
+    """
 
     robot: Robot
     last: Row | None
@@ -49,41 +53,49 @@ class Standing:
     errors: Mapping[str, str]
     verified: tuple[Row, ...]
     drift: Drift
+    remarks: tuple[str, ...] = ()
 
     @classmethod
-    def of(
-        cls, robot: Robot, history: History, errors: Mapping[str, str], years: float
-    ) -> Standing:
+    def of(cls, robot: Robot, history: History, done: Run, years: float) -> Standing:
         """Return how a robot stands; a false alarm of each kind comes once in so many years."""
         try:
-            return cls._of(robot, history.rows(robot.serial), errors, years)
+            return cls._of(robot, history.rows(robot.serial), done, years)
         except (CalibrationError, ValueError, KeyError) as err:  # rows of others, or damaged ones
-            told = {**errors, '': f'its rows in the history cannot be compared: {err}'}
-            return cls._of(robot, (), told, years)
+            found = cls._of(robot, (), done, years)
+            told = {**found.errors, '': f'its rows in the history cannot be compared: {err}'}
+            return replace(found, errors=told)
 
     @classmethod
-    def _of(
-        cls, robot: Robot, rows: tuple[Row, ...], errors: Mapping[str, str], years: float
-    ) -> Standing:
+    def _of(cls, robot: Robot, rows: tuple[Row, ...], done: Run, years: float) -> Standing:
         own = results(robot, rows)
-        rows = tuple(row for row in rows if robot.compares(row.time))
-        known = tuple(r for r in rows if r.kind == 'verify' and r.rms_mm and r.rms_freedom)
+        last = own[-1] if own else None
+        compared = tuple(row for row in own if robot.compares(row.time))
+        known = tuple(r for r in verifications(rows) if robot.compares(r.time))
         found = drift([r.rms_mm or 0 for r in known], [r.rms_freedom or 0 for r in known], years)
-        watched = watch(results(robot, rows), years)
-        return cls(robot, own[-1] if own else None, watched, errors, known, found)
+        watched = watch(compared, years)
+        errors, copies = (of.get(robot.serial, {}) for of in (done.errors, done.copies))
+        remarks = [
+            f'{copy} has the content of {source}: one night' for copy, source in copies.items()
+        ]
+        remarks += [*_clocks(rows, own), *_others(robot, rows, own), *watched.remarks]
+        return cls(robot, last, watched, errors, known, found, tuple(remarks))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Return all that is to be said of it, the worst first."""
+        found = {
+            'changed': bool(self.watched.changes),
+            'worse': bool(self.drift.alarms),
+            'refused': self.last is not None and not self.last.accepted,
+            'beyond tolerance': self.share > 1.0,
+            'unreadable': bool(self.errors) or self.last is None,
+        }
+        return tuple(state for state, holds in found.items() if holds) or ('fine',)
 
     @property
     def state(self) -> str:
         """Return the worst that is to be said of it."""
-        if self.watched.changes:
-            return 'changed'
-        if self.drift.alarms:
-            return 'worse'
-        if self.errors or self.last is None:
-            return 'unreadable'
-        if not self.last.accepted:
-            return 'refused'
-        return 'beyond tolerance' if self.share > 1.0 else 'fine'
+        return self.states[0]
 
     @property
     def alarms(self) -> tuple[str, ...]:
@@ -95,6 +107,17 @@ class Standing:
         return (*(f'{each.time:%Y-%m-%d}: {each}' for each in self.watched.changes), *grown)
 
     @property
+    def actions(self) -> tuple[str, ...]:
+        """Return what calls for a look at the robot or its calibration, in words."""
+        found = list(self.alarms)
+        if self.last is not None and 'refused' in self.states:
+            found.append(f'not accepted: {"; ".join(self.last.reasons)}')
+        if self.last is not None and 'beyond tolerance' in self.states:
+            wanted = self.robot.tolerance
+            found.append(f'beyond tolerance: {self.last.rms_mm:.3f} mm, {wanted:g} mm are wanted')
+        return tuple(found)
+
+    @property
     def share(self) -> float:
         """Return its error, of that wanted; 0 where none is wanted or known."""
         if self.last is None or self.last.rms_mm is None or self.robot.tolerance is None:
@@ -102,11 +125,40 @@ class Standing:
         return self.last.rms_mm / self.robot.tolerance
 
 
+def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
+    """Yield in words how many nights are in the history, but not by the settings of today."""
+    accepted = (row for row in rows if row.accepted and row.source and robot.compares(row.time))
+    if number := len({row.inputs for row in accepted}.difference(row.inputs for row in own)):
+        yield (
+            'nights in the history by other settings or another chain, not compared: '
+            f'{number} (put their files back to identify them anew)'
+        )
+
+
+def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
+    """Yield in words which nights cannot have been measured when their stamps say."""
+    if ahead := [row for row in rows if too_late(row)]:
+        row = max(ahead, key=lambda each: each.filed)
+        yield (
+            f'{len(ahead)} result{"s" * (len(ahead) > 1)} with stamps later than the filing, on '
+            f'{row.filed:%Y-%m-%d} of {row.time:%Y-%m-%d} ({row.source or row.kind}): set the '
+            'clock of what records them'
+        )
+    newest = max(own, key=lambda row: row.filed, default=None)
+    if newest is None or newest.time >= own[-1].time:
+        return
+    if newest.filed.date() > own[-1].filed.date():
+        yield (
+            f'{newest.source} was filed last, and its stamps are of {newest.time:%Y-%m-%d}, '
+            'before those of other nights: unless it is an old one, a clock was set back'
+        )
+
+
 def standings(
     robots: Sequence[Robot], history: History, done: Run, years: float
 ) -> tuple[Standing, ...]:
     """Return how robots stand, the worst first."""
-    found = [Standing.of(r, history, done.errors.get(r.serial, {}), years) for r in robots]
+    found = [Standing.of(robot, history, done, years) for robot in robots]
     order = list(STATES)
 
     def rank(one: Standing) -> tuple[int, float, float, str]:
@@ -185,6 +237,7 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
         total=len(found),
         alarmed=[each for each in shown if each.alarms],
         unreadable=[each for each in shown if each.errors],
+        remarked=[each for each in shown if each.remarks],
         rows=[(each, _link(out, each)) for each in shown],
         done=done,
         script=PLOTLY,
@@ -208,7 +261,7 @@ def _chart(standing: Standing) -> dict[str, Any]:
         return [each.time.isoformat(timespec='seconds') for each in of]
 
     nights = standing.watched.nights[-MOST_NIGHTS:]
-    joints = list(nights[0].strength) if nights else []
+    joints = dict.fromkeys(joint for night in nights for joint in night.strength)
     verified = standing.verified[-MOST_NIGHTS:]
     return {
         'serial': standing.robot.serial,
@@ -222,6 +275,10 @@ def _chart(standing: Standing) -> dict[str, Any]:
             'sums': standing.drift.sums[-MOST_NIGHTS:].round(3).T.tolist(),
         },
         'joints': {
-            joint: [round(night.strength[joint], 2) for night in nights] for joint in joints
+            joint: [
+                None if (x := night.strength.get(joint)) is None else round(x, 2)
+                for night in nights
+            ]
+            for joint in joints
         },
     }

@@ -5,9 +5,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -53,19 +53,23 @@ class Source(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A source to identify; not if its content is `known`, by hash, unless a `page` is wanted."""
+    """A source to identify, with a `page` if wanted; not if its content is `known`.
+
+    That are hashes of contents, each with the source that it is filed of, if that is still there.
+    """
 
     robot: Robot
     source: Source
-    known: frozenset[str] = frozenset()
+    known: Mapping[str, str] = field(default_factory=dict)
     page: bool = False
 
 
 class Outcome(NamedTuple):
-    """What became of a task: a row, or what is wrong with the source; neither if it was known."""
+    """What became of a task: a row, what is wrong with the source, or whose content it has."""
 
     row: Row | None = None
     error: str = ''
+    known: str = ''
     page: str = ''
     seconds: float = 0.0
 
@@ -109,8 +113,8 @@ def _outcome(task: Task) -> Outcome:
     with fetched(source.url) as path:
         inputs = input_of(path)
         content = content_hash([each.sha256 for each in inputs], source.session)
-        if content in task.known and not task.page:
-            return Outcome()
+        if content in task.known:
+            return Outcome(known=task.known[content])
         chain, settings = robot.chain, robot.settings
         if path.suffix.lower() in TABLES:  # anything else is a bag, or a folder that is one
             sessions = (source.session,) if source.session else ()

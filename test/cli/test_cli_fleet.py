@@ -99,10 +99,27 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     assert len(pandas.read_parquet('history')) == 11
 
     plant = json.loads((folder / 'plant.yaml').read_text())
+    plant['groups']['line']['tolerance'] = 0.01
+    (folder / 'plant.yaml').write_text(json.dumps(plant))
+    quiet = [*command[:-1], 'tcp://127.0.0.1:1', '--quiet']
+    bad.unlink()
+    assert main(quiet) == Status.NOT_ACCEPTED
+    said = capsys.readouterr().out
+    assert said.startswith('- B, 2025-10-12: changed: elbow_joint.theta by +0.')
+    assert said.count('- B, ') == 2
+    for serial in ('A', 'B', '<C>'):
+        assert f'- {serial}, beyond tolerance: 0.' in said
+    assert said.endswith(' mm, 0.01 mm are wanted\n')
+
+    assert main([*quiet, '--metrics', 'none/calib.prom']) == 1  # but alarms are told
+    told = capsys.readouterr()
+    assert told.out == said
+    assert 'none/calib.prom: No such file or directory' in told.err
+
+    plant['groups']['line']['tolerance'] = 0.3
     plant['robots'][1]['since'] = '2025-10-12'
     (folder / 'plant.yaml').write_text(json.dumps(plant))
-    command = [*command[:-1], 'tcp://127.0.0.1:1']  # for the damaged one, which is tried again
-    bad.unlink()
+    command = quiet[:-1]
     assert main(command) == 0
     plant['robots'][1]['measured'] = 'nowhere/*.csv'
     (folder / 'plant.yaml').write_text(json.dumps(plant))
@@ -115,6 +132,7 @@ def test_what_cannot_be_asked_for(folder, capsys):
         (['--years', '0'], '--years must be positive'),
         (['--workers', '-1'], '--workers must be'),
         (['--history', 'nowhere://x'], 'a history cannot be at nowhere'),
+        (['--history', 'plant.yaml'], 'a history cannot be at plant.yaml: that is no folder'),
     ):
         assert main(['fleet', 'plant.yaml', '--history', 'history', *more]) == 1
         assert words in capsys.readouterr().err

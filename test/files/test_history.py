@@ -80,7 +80,9 @@ def test_whatever_a_result_depends_on_makes_it_another_one():
 def test_pandas_and_arrow_read_it_as_a_plain_dataset(tmp_path):
     store = History(tmp_path)
     for k in range(12):
-        store.file(row(k, '007' if k % 2 else 'B', rms_mm=0.1 * k, offsets=np.arange(k) * 1e-3))
+        names = tuple(f'joint.{number}' for number in range(k))
+        fitted = {'names': names, 'offsets': np.arange(k) * 1e-3, 'covariance': np.eye(k)}
+        store.file(row(k, '007' if k % 2 else 'B', rms_mm=0.1 * k, **fitted))
     assert len(store.rows('B')) == 6  # makes its cache
     store.file(row(12, 'B'))
     frame = pandas.read_parquet(tmp_path).sort_values('time')
@@ -122,6 +124,17 @@ def test_rows_of_an_older_version_are_read(tmp_path):
     (found,) = store.rows('SN 1/ö')
     assert found.rms_mrad is None
     assert found.remarks == ()
+
+
+@pytest.mark.parametrize('column', ['offsets', 'covariance', 'filed', 'verdict'])
+def test_rows_without_what_is_compared_are_named(tmp_path, column):
+    store = History(tmp_path)
+    store.file(row(names=('joint.a',), offsets=np.ones(1), covariance=np.eye(1)))
+    (path,) = tmp_path.rglob('*.parquet')
+    table = pyarrow.parquet.read_table(path, partitioning=None)
+    pyarrow.parquet.write_table(table.drop_columns([column]), path)
+    with pytest.raises(InputError, match=f'{column}.*{path.name}|{path.name}.*{column}'):
+        store.rows('SN 1/ö')
 
 
 def test_what_is_no_row_is_named(tmp_path):

@@ -3,6 +3,7 @@
 """How robots stand, from the worst to the best."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import plants
@@ -10,7 +11,8 @@ import plants
 from calib_ros.apply.confidence import drift
 from calib_ros.files.history import Row
 from calib_ros.fleet.plant import Measured, Robot
-from calib_ros.fleet.standing import Standing, counts
+from calib_ros.fleet.run import Run
+from calib_ros.fleet.standing import STATES, Standing, counts, page_of
 from calib_ros.fleet.watch import Change, Night, Watched
 from calib_ros.identification.changes import Explanation
 from calib_ros.kinematics.chain_file import load_chain
@@ -39,22 +41,42 @@ def test_states_from_the_worst_to_the_best():
         standing('1', changes=(CHANGE,), verdict='refused'),
         standing('7', errors_mm=(0.1, 0.1, 0.5)),
         standing('2', {'x.csv': 'damaged'}, verdict='refused'),
-        replace(standing('3'), last=None),
         standing('4', verdict='refused'),
+        standing('8', {'x.csv': 'damaged'}),
         standing('5'),
+        replace(standing('3'), last=None),
         standing('6', lower_mm=0.1, upper_mm=0.2),
     ]
-    fleet[-1] = replace(fleet[-1], robot=replace(fleet[-1].robot, tolerance=None))
+    wide = replace(fleet[-1].robot, tolerance=None)
+    fleet = [replace(each, robot=wide) if each.robot.serial in '126' else each for each in fleet]
     states = [
-        'changed',
-        'worse',
-        'unreadable',
-        'unreadable',
-        'refused',
-        'beyond tolerance',
-        'fine',
+        ('changed', 'refused'),
+        ('worse', 'beyond tolerance'),
+        ('refused', 'unreadable'),
+        ('refused', 'beyond tolerance'),
+        ('beyond tolerance', 'unreadable'),
+        ('beyond tolerance',),
+        ('unreadable',),
+        ('fine',),
     ]
-    assert [each.state for each in fleet] == states
-    assert counts(fleet)['unreadable'] == 2
+    assert [each.states for each in fleet] == states
+    order = list(STATES)
+    assert all(sorted(each, key=order.index) == list(each) for each in states)
+    assert [counts(fleet)[state] for state in order] == [1, 1, 2, 2, 1, 1]
     assert fleet[1].alarms == ('2025-10-11: the errors of its verifications have grown',)
     assert str(CHANGE) == 'changed: <b>.d by +0.100 ± 0.010 mm: was it bumped?'
+
+
+def test_the_page_tells_all_that_is_to_be_said_of_a_robot():
+    fleet = [standing('2', {'x.csv': 'damaged'}, verdict='refused')]
+    page = page_of(Path('report'), fleet, Run())
+    assert 'refused, beyond tolerance, unreadable</span>' in page
+
+
+def test_a_night_that_does_not_determine_a_joint_leaves_a_gap_in_its_chart():
+    each = standing('1')
+    few = Watched((*each.watched.nights[:2], Night(each.watched.nights[2].row, {'a': 0.5})))
+    told = replace(each, watched=few, remarks=('a <remark>',))
+    page = page_of(Path('report'), [told], Run())
+    assert '"joints": {"\\u003cb\\u003e": [6.0, 6.0, null], "a": [0.5, 0.5, 0.5]}' in page
+    assert '<li>a &lt;remark&gt;</li>' in page

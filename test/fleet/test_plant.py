@@ -68,6 +68,7 @@ def test_robots_with_what_their_group_says(tmp_path):
         ('tolerance: 0.3', 'tolerance: -1', r'tolerance must be positive'),
         ('largest_loss: 0.2', 'largest_loss: 20', r'largest_loss must be from 0 to 1'),
         ('2026-11-20', 'yesterday', r"since must be a date.*'yesterday'"),
+        ('2026-11-20', '3026-11-20', r'since is in the future, .* compared: 3026-11-20'),
         ('chain: own.yaml', 'chain: other.yaml', r'robot 2 \(B\).*other.yaml'),
         ('measured: nights/0042/*.csv', 'measured: []', r'measured must be a pattern'),
     ],

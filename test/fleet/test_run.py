@@ -1,18 +1,24 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import json
 from dataclasses import replace
+from datetime import timedelta
+from unittest.mock import ANY
 
 import plants
 import pytest
 from distributed import LocalCluster
 
-from calib_ros.errors import ConfigError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Measured, read_plant
-from calib_ros.fleet.run import Cluster, LostError, run
+from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
 from calib_ros.fleet.standing import standings
 from calib_ros.fleet.work import Outcome, Source, Task
+from calib_ros.kinematics.chain_file import chain_document, load_chain
+
+CHAIN = json.dumps(chain_document(load_chain('ur10e')))
 
 
 @pytest.fixture(scope='module')
@@ -66,6 +72,114 @@ def test_what_is_new_is_done_and_filed_once(plant, cluster, tmp_path):
     assert page.exists()
 
 
+def test_a_night_counts_once_whatever_its_file_is_called(plant, cluster, tmp_path, monkeypatch):
+    history, out = History(tmp_path / 'history'), tmp_path / 'report'
+    first, copy = (tmp_path / f'nights/A/{name}.csv' for name in ('000', '000 copy'))
+    copy.write_bytes(first.read_bytes())
+    found = run(plant, history, cluster, out)
+    assert found.filed == len(keys(history)) == 4
+    ((one, other),) = found.copies['A'].items()
+    assert {one, other} == {str(first), str(copy)}
+
+    done = []
+    monkeypatch.setitem(running.work.__globals__, 'table', lambda *_: done.append(0))
+    again = run(plant, history, cluster, out)
+    assert (again.copies, again.filed, again.errors, done) == (found.copies, 0, {}, [])
+    (standing,) = (s for s in standings(plant, history, again, 100.0) if s.robot.serial == 'A')
+    assert standing.remarks == (f'{one} has the content of {other}: one night',)
+    assert standing.state == 'fine'
+    assert len(standing.watched.nights) == 2
+
+    (tmp_path / 'nights/A/001.csv').rename(tmp_path / 'nights/A/moved.csv')
+    assert run(plant, history, cluster, out).copies == found.copies
+    assert done == []
+
+
+def test_a_night_counts_once_after_an_upgrade(plant, cluster, tmp_path, monkeypatch):
+    history = History(tmp_path / 'history')
+    run(plant, history, cluster)
+    old = history.rows('A')
+    for row in old:
+        history.file(replace(row, software='9.9.9', filed=row.filed + timedelta(days=1)))
+    assert len(history.rows('A')) == 4
+    robot = plant[0]
+    assert [row.key for row in results(robot, history.rows('A'))] == [row.key for row in old]
+    monkeypatch.setattr('calib_ros.__version__', '9.9.9')
+    assert {row.software for row in results(robot, history.rows('A'))} == {'9.9.9'}
+    monkeypatch.setattr('calib_ros.__version__', '10')  # whose results are not there yet
+    assert {row.software for row in results(robot, history.rows('A'))} == {'9.9.9'}
+
+
+def test_a_night_whose_file_was_put_right_counts_once(plant, cluster, tmp_path):
+    history, place = History(tmp_path / 'history'), tmp_path / 'nights/A/001.csv'
+    right = place.read_text()
+    head, *lines = (line.split(',') for line in right.splitlines())
+    in_mm = [[*row[:7], *(str(1e3 * float(x)) for x in row[7:10]), *row[10:]] for row in lines]
+    place.write_text('\n'.join(','.join(row) for row in (head, *in_mm)))
+    found = run(plant, history, cluster)
+    assert standings(plant, history, found, 100.0)[0].state == 'refused'
+    place.write_text(right)
+    found = run(plant, history, cluster)
+    rows = history.rows('A')
+    assert [row.time for row in rows] == [plants.when(0), plants.when(1), plants.when(1)]
+    for each in (rows, (*rows[:1], *rows[:0:-1])):
+        assert [row.verdict for row in results(plant[0], each)] == ['accepted', 'accepted']
+
+
+def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
+    history, robot = History(tmp_path / 'history'), plant[0]
+    day = timedelta(days=1)
+    settings = robot.settings_hash
+    row = Row('A', 'identify', plants.when(0), 'accepted', '0', settings, 'a.csv', chain=CHAIN)
+    rows = [
+        replace(row, time=plants.when(k), filed=plants.when(k) + day / 4, inputs=str(k))
+        for k in range(4)
+    ]
+    ahead = replace(rows[2], time=plants.when(2000), source='b.csv')
+    for each in (*rows[:2], ahead, replace(rows[3], verdict='refused')):
+        history.file(each)
+    (standing,) = standings(plant[:1], history, Run(), 100.0)
+    assert standing.state == 'refused'
+    assert standing.remarks == (
+        '1 result with stamps later than the filing, on 2025-10-11 of 2031-04-01 (b.csv): set the '
+        'clock of what records them',
+    )
+    back = {'time': plants.when(-900), 'filed': plants.when(4), 'source': 'c.csv'}
+    history.file(replace(row, verdict='refused', inputs='4', **back))
+    (standing,) = standings(plant[:1], history, Run(), 100.0)
+    assert standing.remarks[1] == (
+        'c.csv was filed last, and its stamps are of 2023-04-23, before those of other nights: '
+        'unless it is an old one, a clock was set back'
+    )
+
+
+def test_poses_verified_twice_count_once(plant, tmp_path):
+    errors = {'rms_mm': 0.1, 'rms_freedom': 30.0}
+    row = Row('A', 'verify', plants.when(0), 'holds', 'poses', 'settings', chain='{}', **errors)
+    others = (
+        replace(row, settings='with a tolerance', filed=row.filed + timedelta(days=1)),
+        replace(row, chain='[]'),
+        replace(row, inputs='other poses'),
+        replace(row, kind='validate'),
+        replace(row, rms_freedom=None, inputs='others'),
+    )
+    assert set(verifications((row, *others))) == set(others[:3])
+
+
+def test_nights_by_other_settings_are_told_of(plant, cluster, tmp_path):
+    history = History(tmp_path / 'history')
+    run(plant, history, cluster)
+    (tmp_path / 'nights/A/000.csv').unlink()
+    changed = replace(plant[0], settings=replace(plant[0].settings, folds=4))
+    found = run((changed,), history, cluster)
+    (standing,) = standings((changed,), history, found, 100.0)
+    (remark,) = standing.remarks
+    assert remark.startswith('nights in the history by other settings or another chain')
+    assert 'not compared: 1 (put their files back' in remark
+    later = replace(changed, since=plants.when(1))
+    assert standings((later,), history, found, 100.0)[0].remarks == ()
+
+
 def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path):
     first, second = plant
     missing = Measured(str(tmp_path / 'archive/*.csv'))
@@ -87,6 +201,20 @@ def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     assert found.errors['B'] == {(none := plant[1].measured[0].files): f'nothing matches {none}'}
 
 
+def test_a_page_that_cannot_be_written_costs_no_result(plant, cluster, tmp_path):
+    history, out = History(tmp_path / 'history'), tmp_path / 'report'
+    (out / 'robots').mkdir(parents=True)
+    (out / 'robots/A').write_text('no folder')
+    found = run(plant, history, cluster, out)
+    assert found.filed == 4
+    (error,) = found.errors['A'].values()
+    assert error.startswith('the page of its report: ')
+    assert 'robots/A' in error
+    (out / 'robots/A').unlink()
+    assert run(plant, history, cluster, out) == running.Run(seconds=ANY)
+    assert len(list(out.glob('robots/*/*.html'))) == 2
+
+
 def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     history = History(tmp_path / 'history')
     run(plant, history, cluster)
@@ -105,6 +233,15 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     worst = standings(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
+
+
+def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch):
+    def denied(*_, **__):
+        raise PermissionError(13, 'Permission denied')
+
+    monkeypatch.setattr('fsspec.implementations.local.LocalFileSystem.ls', denied)
+    with pytest.raises(InputError, match=r'history .* cannot be read: .*Permission denied'):
+        run(plant, History(tmp_path / 'history'), Cluster())
 
 
 def test_small_tasks_go_together_and_the_one_that_ends_a_worker_is_found(plant, cluster):
