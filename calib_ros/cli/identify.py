@@ -187,7 +187,7 @@ def _detected(
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
-    lens = known if options.intrinsics is None else boards.read_lens(options.intrinsics)
+    lens = known if options.intrinsics is None else boards.read_lens(options.intrinsics, found)
     if lens is not None:
         chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
     chosen = settings.for_problem() | touched
