@@ -209,6 +209,19 @@ def test_gross_errors_of_corners_and_images_are_named(rng):
     assert error(result.chain, true, seen) < 1.5 * error(clean.chain, true, seen)
 
 
+@pytest.mark.parametrize(
+    ('on_flange', 'named'),
+    [(True, 'the camera or its lens (tool'), (False, "the camera, its lens or the robot's foot")],
+)
+def test_a_zoom_in_the_session_is_one_of_the_camera(on_flange, named):
+    _, seen = scene(4, on_flange)
+    late, centre = seen.images >= 15, np.array([CAMERA.lens.cx, CAMERA.lens.cy])
+    pixels = centre + (seen.pixels - centre) * np.where(late, 1.005, 1.0)[:, np.newaxis]
+    result = identify(Problem(known(on_flange), replace(seen, pixels=pixels), sigma_pixel=SIGMA))
+    assert 'before image 16 ' in str(result.step)
+    assert named in str(result.step)
+
+
 def test_pixels_and_poses_in_one_fit(rng):
     true, seen = scene(5, False)
     seen = replace(seen, base='base_camera', tool='tool_board')
