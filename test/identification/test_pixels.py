@@ -3,6 +3,7 @@
 """Points of a board in images, as measurements of the arm."""
 
 import json
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -353,6 +354,18 @@ def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
     change, words = MISTAKES['board']
     result = identify(Problem(known(False), change(scene(2, False)[1]), sigma_pixel=SIGMA))
     assert words in str(result.refusals[0])
+
+
+@pytest.mark.parametrize('kind', ['degrees', 'mirrored', 'mount'])
+def test_a_fit_that_runs_away_is_told_in_figures(kind):
+    wrong = MISTAKES[kind][0](scene(0, False)[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        result = identify(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))
+    assert not result.accepted
+    for figures in (*result.validation.figures, *result.fitted.figures):
+        assert figures.rms_px < 1.5e6
+        assert figures.rms_mm < 2e9
 
 
 def test_corners_of_another_board_are_named():
