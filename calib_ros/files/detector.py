@@ -271,10 +271,13 @@ class Detector:
         return np.array(corners, dtype=float).reshape(-1, 4, 2), numbers
 
     def _others(self, image: Image) -> str:
-        """Return in words which other dictionary's markers an image shows.
+        """Return in words which other dictionary's markers an image shows, or that it is mirrored.
 
         Boards number them from 0, and dictionaries of one kind have the first ones in common.
         """
+        mirrored = self._markers(np.ascontiguousarray(image[:, ::-1]), self._dictionary)[1]
+        if len(mirrored) >= FEWEST:
+            return f', but {len(mirrored)} mirrored: give images as the camera sees them'
         names = sorted(dictionaries(), key=len, reverse=True)
         known = {name: _dictionary(name) for name in names if 'ARUCO_MIP' not in name}
         few = min(len(each.bytesList) for each in known.values())

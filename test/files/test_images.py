@@ -58,6 +58,7 @@ def test_images_are_refused_with_the_reason():
     cases = [
         (whole, photograph(CHARUCO, blur=4.0)[0], r'blurred: its sharpest edges are \d+ px wide'),
         (whole, photograph(CHARUCO, shift=(0.27, 0.2))[0], 'of the 24 corners, fewer than 6'),
+        (whole, image[:, ::-1].copy(), r'no marker of DICT_6X6_250, but \d+ mirrored'),
         (whole, np.full((480, 640), 90, np.uint8), 'no marker of DICT_6X6_250: is the board in'),
         (whole, np.zeros((0, 0), np.uint8), 'no image that OpenCV can read'),
         (Detector(other), image, r'no marker of DICT_4X4_50, but \d+ of DICT_6X6'),
