@@ -170,13 +170,14 @@ def _detected(
             raise InputError(f'--detections need --{name} as well')
     board = boards.read_board(options.board)
     found = boards.read_detections(options.detections, board)
-    places, posed = boards.read_places(options.places, len(chain.joints))
+    places, posed, left_out = boards.read_places(options.places, len(chain.joints))
     if posed != (chain.name == boards.POSED):
         raise InputError(
             f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
             + (f'give --chain {boards.POSED}' if posed else 'give the chain of the arm')
         )
-    seen, warnings = boards.observed(found, board, places, options.eye_in_hand)
+    seen, told = boards.observed(found, board, places, options.eye_in_hand)
+    warnings = (*left_out, *told)
     more: Sequence[Observations] = ()
     held_out: Sequence[Observations] = ()
     by_line = True

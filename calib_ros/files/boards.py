@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
-from calib_ros.files.columns import Columns, check_quaternions
+from calib_ros.files.columns import Columns, check_quaternions, joints_left_out
 from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import joint_columns
 from calib_ros.files.programs import POSE
@@ -288,8 +288,10 @@ def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
     return np.column_stack([positions[:, [2, 0, 1]], turns])
 
 
-def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
+def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, tuple[str, ...]]:
     """Read where the arm was at each image; return joint values (n,) by name, and if by poses.
+
+    Also warnings, of joints that the arm does not have.
 
     A table with `image` and q1 ... qn, or with the flange's pose x y z qx qy qz qw.
     """
@@ -310,7 +312,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
     if posed:
         check_quaternions(found, values[:, 3:])
         values = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
-    return dict(zip(names, values, strict=True)), posed
+    return dict(zip(names, values, strict=True)), posed, joints_left_out(found, joints)
 
 
 def observed(

@@ -198,6 +198,17 @@ def test_detections_that_are_none_are_refused(tmp_path, text, said):
         boards.read_detections(path, CHARUCO)
 
 
+def test_joints_that_the_arm_does_not_have_are_told(tmp_path):
+    path = tmp_path / 'places.csv'
+    path.write_text('image,q1,q2,q3\na.png,0.1,0.2,0.3\n')
+    for joints, said in (
+        (3, ()),
+        (2, (f'{path}: the column q3 is left out: the arm has 2 joints',)),
+    ):
+        places, posed, told = boards.read_places(path, joints)
+        assert (len(places['a.png']), posed, told) == (joints, False, said)
+
+
 def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
     path = tmp_path / 'camera.yaml'
     path.write_text(INTRINSICS)
