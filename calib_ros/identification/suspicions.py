@@ -23,6 +23,10 @@ Lens. If other intrinsics of a camera explain most of what is left, the given on
 another zoom, focus or size of images. If the arm found imitates the lens, it is refused: fitted
 with it, it would be another one, not just a more accurate one.
 
+Board. Printers stretch one side of a page. The residuals at the board, averaged over the images,
+tell by how much one side of it is longer than stated, compared with the other; the scale of both
+together is as unsure, and the arm takes it on.
+
 Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
 the poses tell less of the arm than is known before. It is said where a sigma is larger than the
 errors that any result may leave, or the residuals are hardly any part of it.
@@ -47,7 +51,8 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import SHELL
 from calib_ros.identification.result import Identification
-from calib_ros.identification.robust import SUSPICIOUS
+from calib_ros.identification.robust import OUTLIER, SUSPICIOUS
+from calib_ros.identification.samples import seen_residuals
 from calib_ros.identification.sizes import SPREAD, TYPICAL
 from calib_ros.identification.start import likened
 from calib_ros.identification.steps import EXPLAINED
@@ -91,7 +96,9 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     if refusals and sigmas:
         reason, sigmas = Reason(Rule.MISTAKE, sigmas), ''
         refusals = (reason, *refusals) if another else (*refusals, reason)
-    found = (scale, sister, lens, _gravity(problem, result), _coupling(result), sigmas)
+    board = '' if lens or imitated else _board(problem, result)
+    bent = _gravity(problem, result), _coupling(result)
+    found = (scale, sister, lens, board, *bent, sigmas)
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
 
@@ -285,6 +292,38 @@ def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
         _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
     )
     return after > NEARER * before
+
+
+def _board(problem: Problem, result: Identification) -> str:
+    """Return in words that a board is wider or narrower for its height than stated."""
+    for each, far in zip(problem.sets, result.distances, strict=True):
+        kept = far < OUTLIER
+        if each.points is None or not kept.any():
+            continue
+        seen, points = each.select(kept), each.points[kept]
+        _, shifts = seen_residuals(result.chain, seen)
+        if each.on_flange:  # shifts of the camera, along the axes of the board
+            shifts = -shifts
+        else:
+            poses = result.chain.forward(seen.joints, seen.approach, seen.base, seen.tool)
+            shifts = np.einsum('nji,nj->ni', poses[:, :3, :3], shifts)
+        _, image = np.unique(seen.images, return_inverse=True)
+        count = np.bincount(image)
+        stretched = []
+        for side, shift in zip(points.T[:2], shifts.T, strict=False):
+            beside = side - (np.bincount(image, side) / count)[image]
+            size = np.bincount(image, beside**2)
+            stretched.append(np.bincount(image, beside * shift) / np.maximum(size, 1e-300))
+        wider = stretched[0] - stretched[1]
+        error = wider.std(ddof=1) / np.sqrt(len(count)) if len(count) > 1 else np.inf
+        mean = float(wider.mean())
+        if abs(mean) > LARGEST_SCALE + special.stdtrit(max(len(count) - 1, 1), SURE) * error:
+            way = 'wider' if mean > 0.0 else 'narrower'
+            return (
+                f'the board is {_percent(abs(mean))} % {way} for its height than stated: print it '
+                'unstretched, else the arm becomes as wrong'
+            )
+    return ''
 
 
 def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -254,3 +255,21 @@ def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, erro
             assert bool(refused) == harmful
             assert bool(remarked) == (lens is near and errors > 0.0)
             assert result.accepted == (errors > 0.0 and not harmful)
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_a_board_that_is_stretched_is_told(on_flange):
+    rng, camera = np.random.default_rng(3), Camera()
+    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
+    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
+    for stated, said in (
+        ([1.0, 1.0, 1.0], ''),
+        ([1.005, 1.005, 1.0], ''),
+        ([1.005, 1.0, 1.0], 'narrower'),
+        ([1.0, 1.005, 1.0], 'wider'),
+    ):
+        result = identify(Problem(chain, replace(seen, points=seen.points * stated)))
+        told = [each for each in result.remarks if 'for its height than stated' in each]
+        assert bool(told) == bool(said)
+        assert all(re.match(rf'the board is 0\.[345]\d? % {said}', each) for each in told)
