@@ -28,7 +28,7 @@ ONLY = {
     'matplotlib': ('report.plots',),
     **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
     'weasyprint': ('report.page',),
-    'cv2': ('files.detector',),
+    'cv2': ('files.photographs',),
     'pyarrow': ('files.history',),
     'fsspec': ('files.history', 'fleet.'),
     **dict.fromkeys(('dask', 'distributed'), ('fleet.',)),

@@ -9,12 +9,15 @@ from collections.abc import Iterator
 
 from calib_ros.atomic import write_file, write_together
 from calib_ros.cli import options as common
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
 from calib_ros.files.cameras import image_of
-from calib_ros.files.detector import SUFFIXES, Image, black_of, detect, files_of, read_image
+from calib_ros.files.detector import black_of, detect
+from calib_ros.files.photographs import SUFFIXES, Image, files_of, read_image
+from calib_ros.sampling.pictures import Refusal
 from calib_ros.texts import dump_yaml
 
 
@@ -50,11 +53,13 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image]]:
+def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image | Refusal]]:
     """Yield the images of a folder by their names, of a bag by their stamps."""
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
     folder = options.images.is_dir()
+    if not folder:
+        refuse_others(options.images, 'images', 'images', 'bag')
     paths = files_of(options.images) if folder else []
     if folder and not paths and not (options.images / 'metadata.yaml').exists():
         raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')

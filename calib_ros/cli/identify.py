@@ -174,13 +174,14 @@ def _detected(
             raise InputError(f'--detections needs --{name}')
     board = boards.read_board(options.board)
     found = boards.read_detections(options.detections, board)
-    places, posed = boards.read_places(options.places, len(chain.joints))
+    places, posed, left_out = boards.read_places(options.places, len(chain.joints))
     if posed != (chain.name == boards.POSED):
         raise InputError(
             f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
             + (f'give --chain {boards.POSED}' if posed else 'give the chain of the arm')
         )
-    seen, warnings = boards.observed(found, board, places, options.eye_in_hand)
+    seen, told = boards.observed(found, board, places, options.eye_in_hand)
+    warnings = (*left_out, *told)
     more: Sequence[Observations] = ()
     held_out: Sequence[Observations] = ()
     by_line = True
@@ -191,7 +192,7 @@ def _detected(
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
-    lens = known if options.intrinsics is None else boards.read_lens(options.intrinsics)
+    lens = known if options.intrinsics is None else boards.read_lens(options.intrinsics, found)
     if lens is not None:
         chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
     chosen = settings.for_problem() | touched

@@ -99,8 +99,10 @@ def at_least(options: argparse.Namespace, **lowest: float) -> None:
 
 
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
-    """Refuse to write what is there already, before any work is done."""
+    """Refuse to write what is there already, or into no folder, before any work is done."""
     for path in paths:
+        if not path.parent.is_dir():
+            raise InputError(f'there is no folder {path.parent} to write {path.name} into')
         if path.exists() and not options.force:
             raise InputError(f'{path} exists already: choose another name or --force')
 

@@ -15,6 +15,7 @@ the upper left corner of the first square, or of the first marker.
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
-from calib_ros.files.columns import check_quaternions
+from calib_ros.files.columns import Columns, check_quaternions, joints_left_out
 from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import joint_columns
 from calib_ros.files.programs import POSE
@@ -43,6 +44,9 @@ from calib_ros.values import parse_mapping, parse_number
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
 HEADER = ('image', 'corner', 'u', 'v')
+SIZE = ('width', 'height')
+"""Columns of corners that may be missing: the size of the images [px]."""
+DISTORTION = ('distortion_model', 'distortion_coefficients')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
 POSED = 'flange_pose'
 """Name of the virtual arm."""
@@ -131,14 +135,41 @@ def read_board(path: Path) -> Board:
     return Board(**content | sizes | texts)
 
 
-def read_lens(path: Path) -> Lens:
-    """Read the intrinsics that camera_calibration writes, or the same keys plainly."""
-    content = parse_yaml(read_text(path, what='intrinsics '), str(path))
+def read_lens(path: Path, found: Detections | None = None) -> Lens:
+    """Read the intrinsics that camera_calibration writes, or OpenCV, or the same keys plainly.
+
+    Refuse them if they are of images of another size than those in which corners were `found`.
+    """
+    text = re.sub('^%YAML:1.0|!!opencv-matrix', '', read_text(path, what='intrinsics '))
+    content = parse_yaml(text, str(path))
     if not isinstance(content, dict):
         raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
+    for key in content:
+        if str(key).lower().startswith('dist') and key not in DISTORTION:
+            raise ConfigError(f'{path}: unknown key "{key}": call it {DISTORTION[1]}')
+    if found is not None:
+        _require_size(path, content, found)
     matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
-    distortion = _numbers(content, ('distortion_coefficients', 'd', 'D'), path, required=False)
+    distortion = _numbers(content, (DISTORTION[1], 'd', 'D'), path, required=False)
     return lens_of(content.get('distortion_model', DISTORTED[0]), matrix, distortion, str(path))
+
+
+def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> None:
+    """Refuse intrinsics of images of another size than those that show some corners."""
+    keys = [next((k for k in (f'image_{each}', each) if k in content), '') for each in SIZE]
+    if not all(keys):
+        return
+    size = tuple(parse_number(content[key], f'{path}: {key}') for key in keys)
+    farthest = found.pixels.max(axis=0)
+    if found.size is not None:
+        what, right = 'of images of {} x {} px'.format(*found.size), found.size == size
+    else:
+        what, right = 'reach {:.1f}, {:.1f}'.format(*farthest), (farthest < size).all()
+    if not right:
+        raise InputError(
+            f'{path} is of images of {size[0]:g} x {size[1]:g} px, the corners {what}: give the '
+            'intrinsics of the camera as it took these images'
+        )
 
 
 def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
@@ -166,24 +197,30 @@ def _numbers(
         return []
     if not isinstance(value, list):
         raise ConfigError(f'{path}: {keys[0]} must be numbers, as camera_calibration writes it')
-    return [parse_number(each, f'{path}: {keys[0]}') for each in value]
+    rows = [row if isinstance(row, list) else [row] for row in value]
+    return [parse_number(each, f'{path}: {keys[0]}') for row in rows for each in row]
 
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Corners (N,) by the numbers of their images, which begin at `lines`, and `pixels` (N, 2)."""
+    """Corners (N,) by the numbers of their images, which begin at `lines`, and `pixels` (N, 2).
+
+    All images have one `size`, width and height [px], if it is known.
+    """
 
     names: tuple[str, ...]
     image: NDArray[np.intp]
     corner: NDArray[np.intp]
     pixels: FloatArray
     lines: tuple[int, ...] = ()
+    size: tuple[int, int] | None = None
 
     def as_csv(self) -> str:
         """Return the table of a row per corner."""
         numbers = zip(self.image.tolist(), self.corner.tolist(), self.pixels.tolist(), strict=True)
         rows = ((to_cell(self.names[k]), n, f'{u:.4f}', f'{v:.4f}') for k, n, (u, v) in numbers)
-        return csv_text([HEADER, *rows])
+        size = self.size or ()
+        return csv_text([(*HEADER, *SIZE[: len(size)]), *((*row, *size) for row in rows)])
 
 
 def read_detections(path: Path, board: Board) -> Detections:
@@ -206,7 +243,24 @@ def read_detections(path: Path, board: Board) -> Detections:
     pixels = found.block(('u', 'v'))
     first = np.unique(image, return_index=True)[1].tolist()
     lines = tuple(int(found.lines[row]) for row in first)
-    return Detections(tuple(names), image[order], corner[order], pixels[order], lines)
+    return Detections(
+        tuple(names), image[order], corner[order], pixels[order], lines, _size_of(found)
+    )
+
+
+def _size_of(found: Columns) -> tuple[int, int] | None:
+    """Return the size of all images; refuse those of several sizes."""
+    if not {*SIZE} <= {*found.header}:
+        return None
+    pairs = zip(*(found.integers(name).tolist() for name in SIZE), strict=True)
+    first, *others = sorted(set(pairs))
+    if others:
+        sizes = ' and '.join(f'{w} x {h}' for w, h in (first, others[0]))
+        raise InputError(
+            f'{found.path} has corners of images of {sizes} px: give those of one size, as each '
+            'has its own intrinsics'
+        )
+    return first
 
 
 def posed_arm() -> Chain:
@@ -234,8 +288,10 @@ def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
     return np.column_stack([positions[:, [2, 0, 1]], turns])
 
 
-def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
+def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, tuple[str, ...]]:
     """Read where the arm was at each image; return joint values (n,) by name, and if by poses.
+
+    Also warnings, of joints that the arm does not have.
 
     A table with `image` and q1 ... qn, or with the flange's pose x y z qx qy qz qw.
     """
@@ -256,7 +312,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool]:
     if posed:
         check_quaternions(found, values[:, 3:])
         values = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
-    return dict(zip(names, values, strict=True)), posed
+    return dict(zip(names, values, strict=True)), posed, joints_left_out(found, joints)
 
 
 def observed(

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import lens_of, read_board
-from calib_ros.files.detector import Detector, Image, decoded, opencv
+from calib_ros.files.detector import Detector
+from calib_ros.files.photographs import Image, decoded, opencv
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.messages import Source, parse_sources
 from calib_ros.sampling.pictures import Refusal

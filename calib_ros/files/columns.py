@@ -184,6 +184,14 @@ def numbered(texts: Sequence[str]) -> Codes:
     return numbers, list(known)
 
 
+def joints_left_out(columns: Columns, joints: int) -> tuple[str, ...]:
+    """Return a warning of joint values that an arm of so many joints does not have."""
+    name = f'q{joints + 1}'
+    if name not in columns.header:
+        return ()
+    return (f'{columns.path}: the column {name} is left out: the arm has {joints} joints',)
+
+
 def check_quaternions(columns: Columns, quat: FloatArray) -> None:
     """Refuse quaternions (N, 4) of rows that are not of length 1, but for NaN."""
     lengths = np.sqrt(np.einsum('ni,ni->n', quat, quat))

@@ -8,8 +8,8 @@ little of this one.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,15 +17,12 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
-from calib_ros.files.stored import LARGEST_IMAGE
+from calib_ros.files.photographs import Image, opencv
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
 
-SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
-Image = NDArray[np.uint8]
-"""In grey."""
 Corners = tuple[NDArray[np.intp], FloatArray]
 """Numbers (K,) and pixels (K, 2) of a board's corners."""
 Markers = tuple[FloatArray, NDArray[np.intp]]
@@ -40,43 +37,6 @@ WIDEST = 10
 """Half of the widest such window [px]."""
 SMALLEST_SIDE = 700
 """Longer side [px] of the smallest image in which markers are sought."""
-
-
-def opencv() -> Any:
-    """Return OpenCV with its ArUco module."""
-    try:
-        import cv2
-    except ImportError as err:
-        raise ConfigError(
-            'photographs need OpenCV: sudo apt install python3-opencv, or pip install '
-            '"calib_ros[camera]"'
-        ) from err
-    if not hasattr(cv2, 'aruco'):
-        raise ConfigError('this OpenCV has no ArUco module: before 4.7 it is in opencv-contrib')
-    return cv2
-
-
-def files_of(folder: Path) -> list[Path]:
-    """Return the images of a folder by name, shorter ones first."""
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
-    return sorted(paths, key=lambda path: (len(path.name), path.name))
-
-
-def read_image(path: Path) -> Image:
-    """Return an image in grey; without pixels where it cannot be read."""
-    if path.stat().st_size > LARGEST_IMAGE:
-        return np.zeros((0, 0), dtype=np.uint8)
-    return decoded(np.fromfile(path, dtype=np.uint8))
-
-
-def decoded(data: NDArray[np.uint8]) -> Image:
-    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) where it is none."""
-    cv2 = opencv()
-    try:
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
-    except cv2.error:
-        image = None
-    return np.zeros((0, 0), dtype=np.uint8) if image is None else np.asarray(image)
 
 
 def dictionaries() -> tuple[str, ...]:
@@ -311,10 +271,13 @@ class Detector:
         return np.array(corners, dtype=float).reshape(-1, 4, 2), numbers
 
     def _others(self, image: Image) -> str:
-        """Return in words which other dictionary's markers an image shows.
+        """Return in words which other dictionary's markers an image shows, or that it is mirrored.
 
         Boards number them from 0, and dictionaries of one kind have the first ones in common.
         """
+        mirrored = self._markers(np.ascontiguousarray(image[:, ::-1]), self._dictionary)[1]
+        if len(mirrored) >= FEWEST:
+            return f', but {len(mirrored)} mirrored: give images as the camera sees them'
         names = sorted(dictionaries(), key=len, reverse=True)
         known = {name: _dictionary(name) for name in names if 'ARUCO_MIP' not in name}
         few = min(len(each.bytesList) for each in known.values())
@@ -329,30 +292,44 @@ class Detector:
 
 
 def detect(
-    images: Iterable[tuple[str, Image]],
+    images: Iterable[tuple[str, Image | Refusal]],
     board: Board,
     fewest: int = FEWEST,
     heard: Callable[[str], None] = lambda line: None,
 ) -> tuple[Detections, int]:
-    """Return the corners of a board in named images, and how many of these are not used."""
+    """Return the corners of a board in named images, and how many of these are not used.
+
+    Those of another size than most are not: their lens would be another one.
+    """
     detector = Detector(board, fewest)
-    used: list[tuple[str, Corners]] = []
+    used: list[tuple[str, tuple[int, int], Corners]] = []
     refused: list[str] = []
+
+    def refuse(name: str, reason: str) -> None:
+        refused.append(f'{name}: {reason}')
+        heard(f'{name}: not used, {reason}')
+
     for name, picture in images:
+        if isinstance(picture, Refusal):
+            refuse(name, picture.reason)
+            continue
         found = detector.of(picture)
         if isinstance(found, Refusal):
-            refused.append(f'{name}: {found.reason}')
-            heard(f'{name}: not used, {found.reason}')
+            refuse(name, found.reason)
             continue
         heard(f'{name}: {len(found[0])} corners')
-        used.append((name, found))
+        used.append((name, (picture.shape[1], picture.shape[0]), found))
     if not used:
         first = next(iter(refused), ': there is none')
         raise InputError(f'no image can be used; {first}')
-    names, found_in = zip(*used, strict=True)
-    image = np.repeat(np.arange(len(used)), [len(number) for number, _ in found_in])
+    (most, _), *_ = Counter(size for _, size, _ in used).most_common(1)
+    for name, size, _ in used:
+        if size != most:
+            refuse(name, 'it is of {} x {} px, and most are of {} x {}'.format(*size, *most))
+    names, _, found_in = zip(*(each for each in used if each[1] == most), strict=True)
+    image = np.repeat(np.arange(len(names)), [len(number) for number, _ in found_in])
     corner, pixels = map(np.concatenate, zip(*found_in, strict=True))
-    return Detections(names, image, corner, pixels), len(refused)
+    return Detections(names, image, corner, pixels, size=most), len(refused)
 
 
 def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:

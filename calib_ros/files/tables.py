@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError, unreadable
-from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct
+from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct, joints_left_out
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
@@ -110,8 +110,7 @@ def read_table(
 
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
-    if f'q{joints + 1}' in found.header:
-        yield f'{found.path}: the column q{joints + 1} is left out: the arm has {joints} joints'
+    yield from joints_left_out(found, joints)
     if {*TURNS} <= {*found.header} and QUATERNION[0] not in found.header:
         turns = ', '.join(TURNS)
         yield f'{found.path}: {turns} are left out: give --euler or --rotation-vector to use them'

@@ -36,6 +36,7 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import EXCEPTION
 
 
+@np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a fit that runs away
 def identify(
     problem: Problem, simpler: Identification | None = None, progress: Told = nobody
 ) -> Identification:

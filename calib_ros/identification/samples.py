@@ -27,6 +27,7 @@ from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.lens import require_lens, view
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK as BLOCK
+from calib_ros.values import LARGEST
 
 Block: TypeAlias = tuple[slice, FloatArray, FloatArray, ErrorModel]
 Both: TypeAlias = tuple[FloatArray, FloatArray]
@@ -302,7 +303,10 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
 
 @_kept
 def seen_residuals(chain: Chain, observations: Observations) -> Both:
-    """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m]."""
+    """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m].
+
+    Up to LARGEST: more comes of points behind the camera, or far away, and means nothing.
+    """
     camera = observations.camera
     lens = require_lens(chain.frame(camera).lens, camera)
     then = observations.earlier(chain.frame(observations.base).delay)
@@ -316,9 +320,9 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
     for start in range(0, len(then), 4 * BLOCK):
         part = slice(start, start + 4 * BLOCK)
         seen = view(lens, axes, origin, then.images[part], then.points[part].T, then.on_flange)
-        residual = then.pixels[part].T - seen.pixels
+        residual = np.clip(then.pixels[part].T - seen.pixels, -LARGEST, LARGEST)
         pixels[part], shifts[part] = residual.T, seen.at_the_board(residual)
-    return pixels, shifts
+    return pixels, np.clip(shifts, -LARGEST, LARGEST)
 
 
 def _along(

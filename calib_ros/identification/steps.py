@@ -31,6 +31,7 @@ from calib_ros.identification.drift import inverse_root, slow_cosines
 from calib_ros.identification.fitting import SOME
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, gram
 from calib_ros.identification.levels import LEAST_ASIDE, SURE, chance_of
+from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.robust import Robust, weights_of
@@ -47,16 +48,17 @@ EXPLAINED = 0.5
 class Step:
     """What moved, when and by how much.
 
-    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `set`, `sample`, the
-    `image` of it and `stamp_ns` are those of the first sample after it. `size` is the RMS change
-    of positions ('m') or, where it weighs more, of orientations ('rad'); of a joint that of its
-    zero. `share` is what it explains of the squares of the residuals beyond as many useless
-    parameters. If all that was measured on one side are outliers, `unused` says which: the fit is
-    not spoilt by it.
+    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `thing` is what the frame
+    is of, another with the device on the flange. `set`, `sample`, the `image` of it and `stamp_ns`
+    are those of the first sample after it. `size` is the RMS change of positions ('m') or, where
+    it weighs more, of orientations ('rad'); of a joint that of its zero. `share` is what it
+    explains of the squares of the residuals beyond as many useless parameters. If all that was
+    measured on one side are outliers, `unused` says which: the fit is not spoilt by it.
     """
 
     what: str
     kind: str
+    thing: str
     set: int
     sample: int
     stamp_ns: int
@@ -88,8 +90,7 @@ class Step:
         size = f'{1e3 * self.size:.2g} m{self.unit}'
         if self.kind == 'joint':
             return f'{text}the zero of {self.what} ({size})'
-        thing = 'the target' if self.kind == 'tool' else "the measuring device or the robot's foot"
-        text += f'{thing} ({self.what}, {size})'
+        text += f'{self.thing} ({self.what}, {size})'
         if self.unused:
             text += f'; measurements {self.unused} carry no weight'
         return text
@@ -314,9 +315,20 @@ class _Scan:
         seen = problem.sets[of_set]
         image = None if seen.pixels is None else int(seen.images[sample])
         where = (of_set, sample, stamp)
-        return Step(
-            group.what, group.kind, *where, size, unit, found.share, ''.join(unused), image
-        )
+        named = group.what, group.kind, _thing(group.kind, seen)
+        return Step(*named, *where, size, unit, found.share, ''.join(unused), image)
+
+
+def _thing(kind: str, seen: Observations) -> str:
+    """Return what the base or tool frame of a set is of, a joint's zero of the joint itself."""
+    if kind == 'joint':
+        return 'the joint'
+    of_images = seen.pixels is not None
+    target = ['the board' if of_images else 'the target']
+    device = ['the camera', 'its lens'] if of_images else ['the measuring device']
+    on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
+    *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
+    return f'{", ".join(first)} or {last}' if first else last
 
 
 def _groups(problem: Problem) -> list[_Group]:

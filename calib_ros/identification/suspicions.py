@@ -19,6 +19,14 @@ given one. The base frame found does not tell which way is up: the device may ha
 
 Coupling. Joint values without the couplings of a wrist leave residuals that these explain.
 
+Lens. If other intrinsics of a camera explain most of what is left, the given ones are those of
+another zoom, focus or size of images. If the arm found imitates the lens, it is refused: fitted
+with it, it would be another one, not just a more accurate one.
+
+Board. Printers stretch one side of a page. The residuals at the board, averaged over the images,
+tell by how much one side of it is longer than stated, compared with the other; the scale of both
+together is as unsure, and the arm takes it on.
+
 Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
 the poses tell less of the arm than is known before. It is said where a sigma is larger than the
 errors that any result may leave, or the residuals are hardly any part of it.
@@ -26,26 +34,32 @@ errors that any result may leave, or the residuals are hardly any part of it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy import special
 
+from calib_ros.errors import InputError
+from calib_ros.identification.configurations import distinct
+from calib_ros.identification.fitting import fit
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
 from calib_ros.identification.levels import CLEARLY, NEARER, SCALE, SURE
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.region import SHELL
 from calib_ros.identification.result import Identification
-from calib_ros.identification.robust import SUSPICIOUS
+from calib_ros.identification.robust import OUTLIER, SUSPICIOUS
+from calib_ros.identification.samples import seen_residuals
 from calib_ros.identification.sizes import SPREAD, TYPICAL
 from calib_ros.identification.start import likened
 from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME, LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXACT, EXCEPTION
 
@@ -75,11 +89,16 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
     refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
+    lens, imitated = _lens(problem, result) if another else ('', False)
+    if imitated:
+        refusals, another, lens = (Reason(Rule.MISTAKE, lens), *refusals), False, ''
     sigmas = _sigmas(problem, result)
     if refusals and sigmas:
         reason, sigmas = Reason(Rule.MISTAKE, sigmas), ''
         refusals = (reason, *refusals) if another else (*refusals, reason)
-    found = (scale, sister, _gravity(problem, result), _coupling(result), sigmas)
+    board = '' if lens or imitated else _board(problem, result)
+    bent = _gravity(problem, result), _coupling(result)
+    found = (scale, sister, lens, board, *bent, sigmas)
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=refusals)
 
@@ -229,6 +248,83 @@ def _sigmas(problem: Problem, result: Identification) -> str:
                 f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'
             )
     return '; '.join(found)
+
+
+def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
+    """Return in words that other intrinsics than those given explain most of what is left.
+
+    Also whether the arm found imitates them: fitted with them it is another one, by as much as
+    it may be nearer to the nominal. The points of an image share its pose, so each image counts
+    for the freedoms of that only.
+    """
+    if not result.converged or (result.step is not None and result.step.harmful):
+        return '', False
+    images: Counter[str] = Counter()
+    for each in problem.sets:
+        if each.pixels is not None:
+            images[each.camera] += distinct(each.images)
+    for camera, count in images.items():
+        frame, names = problem.chain.frame(camera), parameters_of(camera, LENS_KINDS)
+        freedom = IN_A_FRAME * count - len(result.names)
+        if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
+            continue
+        left = 1.0 - _explained(problem, result.chain, result.names, names)
+        share = 1.0 - left * freedom / (freedom - len(names))
+        if share > EXPLAINED:
+            lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
+            text = f'other intrinsics of the camera than those given explain {100.0 * share:.0f} %'
+            text += f' of what is left: {lens}, or calibrate the camera as it is used'
+            fitted = replace(frame, lens=replace(frame.lens, fixed=False))
+            return text, _imitated(problem, result, problem.chain.with_frame(camera, fitted))
+    return '', False
+
+
+def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
+    """Tell whether a fit of another nominal chain finds another arm, as far as this one counts."""
+    try:
+        other = fit(replace(problem, chain=freed))[2].chain
+    except (InputError, np.linalg.LinAlgError):
+        return True
+    joints = [each.spread().joints for each in problem.sets]
+    if result.region is not None:
+        drawn = freed.random_joints(SHELL, np.random.default_rng(0))
+        joints.append(drawn[result.region.covers(drawn)])
+    before, after = (
+        _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
+    )
+    return after > NEARER * before
+
+
+def _board(problem: Problem, result: Identification) -> str:
+    """Return in words that a board is wider or narrower for its height than stated."""
+    for each, far in zip(problem.sets, result.distances, strict=True):
+        kept = far < OUTLIER
+        if each.points is None or not kept.any():
+            continue
+        seen, points = each.select(kept), each.points[kept]
+        _, shifts = seen_residuals(result.chain, seen)
+        if each.on_flange:  # shifts of the camera, along the axes of the board
+            shifts = -shifts
+        else:
+            poses = result.chain.forward(seen.joints, seen.approach, seen.base, seen.tool)
+            shifts = np.einsum('nji,nj->ni', poses[:, :3, :3], shifts)
+        _, image = np.unique(seen.images, return_inverse=True)
+        count = np.bincount(image)
+        stretched = []
+        for side, shift in zip(points.T[:2], shifts.T, strict=False):
+            beside = side - (np.bincount(image, side) / count)[image]
+            size = np.bincount(image, beside**2)
+            stretched.append(np.bincount(image, beside * shift) / np.maximum(size, 1e-300))
+        wider = stretched[0] - stretched[1]
+        error = wider.std(ddof=1) / np.sqrt(len(count)) if len(count) > 1 else np.inf
+        mean = float(wider.mean())
+        if abs(mean) > LARGEST_SCALE + special.stdtrit(max(len(count) - 1, 1), SURE) * error:
+            way = 'wider' if mean > 0.0 else 'narrower'
+            return (
+                f'the board is {_percent(abs(mean))} % {way} for its height than stated: print it '
+                'unstretched, else the arm becomes as wrong'
+            )
+    return ''
 
 
 def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:

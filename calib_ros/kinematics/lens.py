@@ -158,16 +158,16 @@ class View:
             out[3 + k] -= self.arm[j] * out[i]
 
     def at_the_board(self, residual: FloatArray) -> FloatArray:
-        """Return the shortest shifts (C, 3) [m] in the world that residuals (2, C) amount to."""
-        (first, second), (u, v) = self.by_shift, residual
-        square, mixed, other = [
-            (one * two).sum(axis=0)
-            for one, two in ((first, first), (first, second), (second, second))
-        ]
-        scale = 1.0 / (square * other - mixed * mixed)
-        shift = first * ((other * u - mixed * v) * scale) + second * (
-            (square * v - mixed * u) * scale
-        )
+        """Return the shortest shifts (C, 3) [m] in the world that residuals (2, C) amount to.
+
+        For points behind the camera, all of which it sees in one direction, along that.
+        """
+        length = np.linalg.norm(self.by_shift, axis=1)
+        first, second = self.by_shift / length[:, np.newaxis]
+        u, v = residual / length
+        mixed = (first * second).sum(axis=0)
+        scale = 1.0 / np.maximum(1.0 - mixed * mixed, SAME)
+        shift = first * ((u - mixed * v) * scale) + second * ((v - mixed * u) * scale)
         if self.axes is not None:
             shift = np.einsum('kcn,kn->cn', self.axes, shift)
         return np.asarray(shift.T)

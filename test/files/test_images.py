@@ -5,6 +5,7 @@
 import csv
 import json
 import re
+import struct
 import zlib
 
 import numpy as np
@@ -15,7 +16,8 @@ from robots import DATA, needs_data
 from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files import boards
-from calib_ros.files.detector import Detector
+from calib_ros.files.detector import Detector, detect
+from calib_ros.files.photographs import decoded, read_image
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.pictures import Refusal
@@ -56,6 +58,7 @@ def test_images_are_refused_with_the_reason():
     cases = [
         (whole, photograph(CHARUCO, blur=4.0)[0], r'blurred: its sharpest edges are \d+ px wide'),
         (whole, photograph(CHARUCO, shift=(0.27, 0.2))[0], 'of the 24 corners, fewer than 6'),
+        (whole, image[:, ::-1].copy(), r'no marker of DICT_6X6_250, but \d+ mirrored'),
         (whole, np.full((480, 640), 90, np.uint8), 'no marker of DICT_6X6_250: is the board in'),
         (whole, np.zeros((0, 0), np.uint8), 'no image that OpenCV can read'),
         (Detector(other), image, r'no marker of DICT_4X4_50, but \d+ of DICT_6X6'),
@@ -66,6 +69,52 @@ def test_images_are_refused_with_the_reason():
         found = detector.of(picture)
         assert isinstance(found, Refusal), reason
         assert re.search(reason, found.reason), found
+
+
+def turned_by_exif(image, orientation):
+    """Return an image as JPEG whose EXIF says how to turn it."""
+    data = cv2.imencode('.jpg', image)[1].tobytes()
+    entry = struct.pack('>IHHHIHHI', 8, 1, 0x112, 3, 1, orientation, 0, 0)
+    exif = b'Exif\0\0MM\0*' + entry
+    marker = b'\xff\xe1' + struct.pack('>H', len(exif) + 2)
+    return np.frombuffer(data[:2] + marker + exif + data[2:], np.uint8)
+
+
+@pytest.mark.parametrize('orientation', [1, 3, 6, 8])
+def test_an_image_is_as_the_sensor_sees_it(orientation):
+    image = np.arange(60 * 80, dtype=np.uint16).reshape(60, 80) // 20
+    image = image.astype(np.uint8)
+    np.testing.assert_allclose(decoded(turned_by_exif(image, orientation)), image, atol=3)
+
+
+def test_images_of_twelve_bits_are_as_bright_as_they_can_be():
+    image, _ = photograph(CHARUCO)
+    exact = Detector(CHARUCO).of(image)
+    for size in (1, 16, 256):
+        found = Detector(CHARUCO).of(decoded(cv2.imencode('.png', image.astype('u2') * size)[1]))
+        np.testing.assert_array_equal(found[0], exact[0])
+        np.testing.assert_allclose(found[1], exact[1], atol=0.01)
+
+
+def test_images_of_another_size_than_most_are_refused():
+    image, _ = photograph(CHARUCO)
+    half = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA)
+    said = []
+    found, unused = detect([('a', half), ('b', image), ('c', image)], CHARUCO, heard=said.append)
+    assert (found.names, found.size, unused) == (('b', 'c'), (1280, 960), 1)
+    assert said[-1] == 'a: not used, it is of 640 x 480 px, and most are of 1280 x 960'
+    np.testing.assert_array_equal(found.image, np.repeat([0, 1], 24))
+
+
+def test_what_cannot_be_read_is_not_used(tmp_path):
+    (tmp_path / 'folder.png').mkdir()
+    (tmp_path / 'gone.png').symlink_to(tmp_path / 'nowhere')
+    for name, reason in (('folder', 'Is a directory'), ('gone', 'No such file')):
+        found = read_image(tmp_path / f'{name}.png')
+        assert isinstance(found, Refusal)
+        assert reason in found.reason
+    found, unused = detect([('a', found), ('b', photograph(CHARUCO)[0])], CHARUCO)
+    assert (found.names, unused) == (('b',), 1)
 
 
 def test_what_opencv_does_not_know_is_refused():
@@ -90,6 +139,24 @@ def test_a_board_is_printed_in_its_true_size(tmp_path, capsys):
     assert drawing.count(b'\nh\n') + drawing.count(b' h\n') > 100  # squares and runs of cells
     assert main([*words.split(), 'DICT_6X6_250', '--out', str(out)]) == 1
     assert 'exists already' in capsys.readouterr().err
+
+
+def test_what_images_cannot_use_is_told_before_any_work(tmp_path, capsys):
+    (tmp_path / 'board.yaml').write_text(BOARD.replace('D\n', 'DICT_6X6_250\n'))
+    folder = tmp_path / 'photographs'
+    folder.mkdir()
+    cv2.imwrite(str(folder / 'a.png'), photograph(CHARUCO)[0])
+    for given, out, said in (
+        (folder / 'a.png', 'x.csv', 'a.png is an image, but images takes a folder of images or'),
+        (folder, 'none/x.csv', 'there is no folder'),
+    ):
+        assert main(['images', str(given), *corners_to(tmp_path, out)]) == 1
+        told = capsys.readouterr()
+        assert said in told.err
+        assert 'corners' not in told.out
+    (folder / 'b\udcff.png').write_bytes(b'')
+    assert main(['images', str(folder), *corners_to(tmp_path, 'x.csv')]) == 1
+    assert 'cannot stand in a table: rename it' in capsys.readouterr().err
 
 
 BOARD = 'type: charuco\ncolumns: 5\nrows: 7\nsquare: 0.036\nmarker: 0.026\ndictionary: D\n'
@@ -131,6 +198,17 @@ def test_detections_that_are_none_are_refused(tmp_path, text, said):
         boards.read_detections(path, CHARUCO)
 
 
+def test_joints_that_the_arm_does_not_have_are_told(tmp_path):
+    path = tmp_path / 'places.csv'
+    path.write_text('image,q1,q2,q3\na.png,0.1,0.2,0.3\n')
+    for joints, said in (
+        (3, ()),
+        (2, (f'{path}: the column q3 is left out: the arm has 2 joints',)),
+    ):
+        places, posed, told = boards.read_places(path, joints)
+        assert (len(places['a.png']), posed, told) == (joints, False, said)
+
+
 def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
     path = tmp_path / 'camera.yaml'
     path.write_text(INTRINSICS)
@@ -143,6 +221,43 @@ def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
     for matrix in ([800, 0, 0, 0, 800, 0, 320, 240, 1], [800, 0, 320, 0, 800, 240, 0, 0, 2]):
         with pytest.raises(ConfigError, match='camera_matrix must be'):
             boards.lens_of('plumb_bob', matrix, [], 'camera')
+
+
+def test_intrinsics_of_other_images_are_refused(tmp_path):
+    path, table = tmp_path / 'camera.yaml', tmp_path / 'corners.csv'
+    path.write_text(INTRINSICS)
+    for size, beyond, said in (
+        (',1600,1200', '1599.4', None),
+        ('', '1599.4', None),
+        (',3200,2400', '10', 'of 1600 x 1200 px, the corners of images of 3200 x 2400'),
+        (',800,600', '10', 'of 1600 x 1200 px, the corners of images of 800 x 600'),
+        ('', '1600.2', r'of 1600 x 1200 px, the corners reach 1600.2, 20'),
+    ):
+        sized = ',width,height' if size else ''
+        table.write_text(f'image,corner,u,v{sized}\na,0,{beyond},20{size}\na,1,5,5{size}\n')
+        found = boards.read_detections(table, CHARUCO)
+        if said is None:
+            assert boards.read_lens(path, found).fx == 1352.02747
+            continue
+        with pytest.raises(InputError, match=said):
+            boards.read_lens(path, found)
+    table.write_text('image,corner,u,v,width,height\na,0,1,2,800,600\nb,0,1,2,640,480\n')
+    with pytest.raises(InputError, match='images of 640 x 480 and 800 x 600 px'):
+        boards.read_detections(table, CHARUCO)
+
+
+def test_intrinsics_as_others_write_them(tmp_path):
+    path = tmp_path / 'camera.yaml'
+    matrix = '   rows: 3\n   cols: 3\n   dt: d\n   data: [ 1350., 0., 795., 0., 1355., 605.,\n'
+    matrix = f'%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n{matrix}       0., 0., 1. ]\n'
+    nested = 'camera_matrix: [[1350, 0, 795], [0, 1355, 605], [0, 0, 1]]\n'
+    for text in (matrix, nested):
+        path.write_text(f'{text}distortion_coefficients: [[-0.1, 0.2, 0, 0, 0]]\n')
+        lens = boards.read_lens(path)
+        assert (lens.fx, lens.cy, lens.k1, lens.k2) == (1350.0, 605.0, -0.1, 0.2)
+    path.write_text(f'{nested}dist_coeffs: [-0.1, 0.2, 0, 0, 0]\n')
+    with pytest.raises(ConfigError, match='"dist_coeffs": call it distortion_coefficients'):
+        boards.read_lens(path)
 
 
 def test_the_virtual_arm_is_where_the_flange_is(rng):

@@ -3,6 +3,7 @@
 """Points of a board in images, as measurements of the arm."""
 
 import json
+import warnings
 from dataclasses import replace
 from functools import cache
 
@@ -209,6 +210,19 @@ def test_gross_errors_of_corners_and_images_are_named(rng):
     assert error(result.chain, true, seen) < 1.5 * error(clean.chain, true, seen)
 
 
+@pytest.mark.parametrize(
+    ('on_flange', 'named'),
+    [(True, 'the camera or its lens (tool'), (False, "the camera, its lens or the robot's foot")],
+)
+def test_a_zoom_in_the_session_is_one_of_the_camera(on_flange, named):
+    _, seen = scene(4, on_flange)
+    late, centre = seen.images >= 15, np.array([CAMERA.lens.cx, CAMERA.lens.cy])
+    pixels = centre + (seen.pixels - centre) * np.where(late, 1.005, 1.0)[:, np.newaxis]
+    result = identify(Problem(known(on_flange), replace(seen, pixels=pixels), sigma_pixel=SIGMA))
+    assert 'before image 16 ' in str(result.step)
+    assert named in str(result.step)
+
+
 def test_pixels_and_poses_in_one_fit(rng):
     true, seen = scene(5, False)
     seen = replace(seen, base='base_camera', tool='tool_board')
@@ -340,6 +354,18 @@ def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
     change, words = MISTAKES['board']
     result = identify(Problem(known(False), change(scene(2, False)[1]), sigma_pixel=SIGMA))
     assert words in str(result.refusals[0])
+
+
+@pytest.mark.parametrize('kind', ['degrees', 'mirrored', 'mount'])
+def test_a_fit_that_runs_away_is_told_in_figures(kind):
+    wrong = MISTAKES[kind][0](scene(0, False)[1])
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        result = identify(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))
+    assert not result.accepted
+    for figures in (*result.validation.figures, *result.fitted.figures):
+        assert figures.rms_px < 1.5e6
+        assert figures.rms_mm < 2e9
 
 
 def test_corners_of_another_board_are_named():

@@ -199,6 +199,22 @@ def test_without_stamps_the_order_of_the_rows_is_said():
     )
 
 
+def test_what_is_on_the_flange_is_named():
+    true, seen = session(1)
+    found = {}
+    for what in ('tool', 'base'):
+        spoilt = moved(seen, true, what, 5e-3)
+        fixed = identify(Problem(UR10E, spoilt, **SIGMAS)).step
+        held = identify(Problem(UR10E, replace(spoilt, inverse=True), **SIGMAS)).step
+        found |= {fixed.kind: fixed.thing, f'{held.kind} of a device on it': held.thing}
+    assert found == {
+        'tool': 'the target',
+        'base': "the measuring device or the robot's foot",
+        'tool of a device on it': 'the measuring device',
+        'base of a device on it': "the target or the robot's foot",
+    }
+
+
 def test_one_of_several_targets_and_sessions(rng):
     true, seen = session(4)
     true = true.with_frame('tool_B', random_frame(rng, 0.2))

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from fits import rms
 
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.errors import ConfigError
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Rule
 from calib_ros.identification.suspicions import _common, scale_of
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import as_document, summary
 
@@ -228,3 +229,47 @@ def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
 def test_the_scale_of_a_device_is_a_number():
     with pytest.raises(ConfigError, match=r'sigma_scale must be from 0 to 1, not -0\.1'):
         Problem(FOUR, seen_of(arm()), sigma_scale=-0.1)
+
+
+POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+@pytest.mark.parametrize('errors', [0.0, 0.5])
+def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, errors):
+    rng, camera = np.random.default_rng(3), Camera()
+    true = before_camera(arm(3, errors), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
+    off = camera.lens.moved({'fx': 13.5, 'fy': 13.5, 'cx': 8.0, 'cy': -6.0})
+    near = camera.lens.moved({'fx': 4.0, 'fy': 4.0, 'cx': 3.0, 'cy': -2.0})
+    told = {'--lens fitted': False, 'lens=fitted in sources': True}
+    for lens in (camera.lens, near, off, replace(off, fixed=False)):
+        chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=lens))
+        for words, of_messages in told.items():
+            result = identify(Problem(chain, seen, sigma_pixel=0.1, of_messages=of_messages))
+            refused, remarked = (
+                [str(each) for each in said if words in str(each)]
+                for said in (result.refusals[:1], result.remarks)
+            )
+            harmful = lens is off or (lens is near and errors == 0.0)
+            assert bool(refused) == harmful
+            assert bool(remarked) == (lens is near and errors > 0.0)
+            assert result.accepted == (errors > 0.0 and not harmful)
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_a_board_that_is_stretched_is_told(on_flange):
+    rng, camera = np.random.default_rng(3), Camera()
+    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
+    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
+    for stated, said in (
+        ([1.0, 1.0, 1.0], ''),
+        ([1.005, 1.005, 1.0], ''),
+        ([1.005, 1.0, 1.0], 'narrower'),
+        ([1.0, 1.005, 1.0], 'wider'),
+    ):
+        result = identify(Problem(chain, replace(seen, points=seen.points * stated)))
+        told = [each for each in result.remarks if 'for its height than stated' in each]
+        assert bool(told) == bool(said)
+        assert all(re.match(rf'the board is 0\.[345]\d? % {said}', each) for each in told)

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Photographs as files, read by OpenCV (`pip install calib_ros[camera]`)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.stored import LARGEST_IMAGE
+from calib_ros.sampling.pictures import Refusal
+
+SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
+Image = NDArray[np.uint8]
+"""In grey."""
+
+
+def opencv() -> Any:
+    """Return OpenCV with its ArUco module."""
+    try:
+        import cv2
+    except ImportError as err:
+        raise ConfigError(
+            'photographs need OpenCV: sudo apt install python3-opencv, or pip install '
+            '"calib_ros[camera]"'
+        ) from err
+    if not hasattr(cv2, 'aruco'):
+        raise ConfigError('this OpenCV has no ArUco module: before 4.7 it is in opencv-contrib')
+    return cv2
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Return the images of a folder by name, shorter ones first."""
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    for path in paths:
+        if not path.name.isprintable():
+            raise InputError(f'the name of {path} cannot stand in a table: rename it')
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def read_image(path: Path) -> Image | Refusal:
+    """Return an image in grey, or why it cannot be read; without pixels where it is none."""
+    try:
+        if path.stat().st_size > LARGEST_IMAGE:
+            return np.zeros((0, 0), dtype=np.uint8)
+        return decoded(np.frombuffer(path.read_bytes(), dtype=np.uint8))
+    except OSError as err:
+        return Refusal('that cannot be read', f'it cannot be read: {err.strerror}')
+
+
+def decoded(data: NDArray[np.uint8]) -> Image:
+    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) where it is none.
+
+    As the sensor saw it: turned as its EXIF asks, it would not be the image that the lens made.
+    Of 10 to 16 bits, the eight from the highest that is used on.
+    """
+    cv2 = opencv()
+    kind = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(data, kind)
+    except cv2.error:
+        image = None
+    if image is None:
+        return np.zeros((0, 0), dtype=np.uint8)
+    if image.dtype == np.uint16:
+        image = image >> max(int(image.max()).bit_length() - 8, 0)
+    return np.asarray(image, dtype=np.uint8)
