@@ -24,7 +24,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
     now = ErrorFigures(20, rms_mm, rms_mm, rms_mm, rms_mm, None)
     for told in (
         verdict(previous, now, now),
-        checked(previous, Recalibration(previous, (), 1.0, now, now, 0.0)),
+        checked(previous, Recalibration(previous, (), 1.0, now, now, 1e-4, 1e-4, 0.0)),
     ):
         assert told[0] == holds
         assert ('no longer holds: RMS 0.160 mm' in told[1]) != holds
