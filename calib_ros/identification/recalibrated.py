@@ -24,11 +24,11 @@ class Recalibration(Shown):
     those that cannot be told apart from it; `unexplained` is the probability of residuals as large
     as those that are left. `before` and `after` are errors of the new poses by the earlier
     calibration, and by what the other poses tell; `known_before` and `known_after` are to what RMS
-    [m] positions over the joint range are known (one sigma), `moved` by what they change. `anew`
-    tells whether there are new frames, which are fitted to all of the new poses for `before`.
-    `reused` is the share of the poses that the earlier calibration was fitted to: they would count
-    twice. `odd` names the pose without
-    which the others would be accepted, if there is one.
+    [m] positions over the joint range are known (one sigma), `moved` by what they change. If new
+    frames are fitted to all of the new poses for `before`, errors of poses that were left out are
+    larger by a ratio `anew`. `reused` is the share of the poses that the earlier calibration was
+    fitted to: they would count twice. `odd` names the pose without which the others would be
+    accepted, if there is one.
     """
 
     calibration: Calibration
@@ -40,13 +40,13 @@ class Recalibration(Shown):
     known_after: float
     moved: float
     reused: float = 0.0
-    anew: bool = False
+    anew: float = 1.0
     odd: str = ''
 
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
-        better = self.after.rms_mm <= (ALIKE if self.anew else 1.0) * self.before.rms_mm
+        better = self.after.rms_mm <= self.anew * self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
         fits = self.unexplained > changes.FALSE and bool(agrees)
         return fits and self.determined and not (self.reused or self.scale)
@@ -110,7 +110,7 @@ class Recalibration(Shown):
                 f'arm would be known to {after:.3f} mm, before to {before:.3f} mm; measure more '
                 'poses, all over the joint range'
             )
-        elif self.anew:
+        elif self.anew > 1.0:
             why = (
                 'the earlier calibration, in new frames, fits the new poses better; keep it, or '
                 'identify again from more poses'

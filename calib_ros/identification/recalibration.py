@@ -155,9 +155,14 @@ def _recalibrated(
         *_judged(arm, found, system, sets),
         *_known(arm, before, found),
         previous.reused(sets),
-        bool(names),
+        _left_out_by(system.rows, len(names)),
     )
     return result, earlier
+
+
+def _left_out_by(rows: int, fitted: int) -> float:
+    """Return by what ratio errors grow if rows are left out of a fit of so many parameters."""
+    return float(np.sqrt((rows + fitted) / (rows - fitted))) if rows > fitted else np.inf
 
 
 def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:
