@@ -109,6 +109,11 @@ class Report:
     software: str = field(default=f'calib_ros {calib_ros.__version__}')
 
     @property
+    def title(self) -> str:
+        """Return the name of the robot, with its serial number if that is known."""
+        return ' '.join(filter(None, (self.robot, self.origin.serial)))
+
+    @property
     def of(self) -> str:
         """Return the name of the first input file read."""
         return next((each.name.split('/')[0] for each in self.origin.inputs), '')
@@ -192,7 +197,7 @@ def _shown(value: object) -> object:
 def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     """Return the text and tables of a report; `samples` is the account of the input."""
     verdict = report.verdict
-    lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.robot)}', '']
+    lines = [f'# {in_markdown(report.kind)}: {in_markdown(report.title)}', '']
     lines += [f'**{in_markdown(verdict.heading)}**', '']
     lines += _paragraphs(verdict.gain, *verdict.text)
     for reason in report.advice:

@@ -38,7 +38,7 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
     assert len(content) < 2e6
     page = Page((out / 'report.html').read_text())
     digest = hashlib.sha256(table.read_bytes()).hexdigest()
-    for text in ('A. Smith', 'tracker 7', '0012', digest, 'tolerance of 5 mm'):
+    for text in ('ur5e 0012', 'A. Smith', 'tracker 7', digest, 'tolerance of 5 mm'):
         assert text in page.text
     assert page.data['explorer']['lines']
     document = json.loads((out / 'result.json').read_text())
