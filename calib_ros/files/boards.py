@@ -182,7 +182,7 @@ def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], wh
     if skew or under or last != [0.0, 0.0, 1.0] or fx <= 0.0 or fy <= 0.0:
         raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
     if any(distortion[5:]):
-        raise ConfigError(f'{where}: of distortion only k1 k2 p1 p2 k3 are known')
+        raise ConfigError(f'{where}: distortion supports only k1 k2 p1 p2 k3')
     distorted: dict[str, Any] = dict(zip(LENS_KINDS[4:], distortion, strict=False))
     return Lens(fx, fy, cx, cy, **distorted)
 
@@ -236,8 +236,8 @@ def read_detections(path: Path, board: Board) -> Detections:
     _, first = np.unique(image * most + corner, return_index=True)
     for row in np.delete(np.arange(len(image)), first)[:1].tolist():
         raise InputError(
-            f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]} is there '
-            'already'
+            f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]} '
+            'already exists'
         )
     order = np.argsort(image, kind='stable')
     pixels = found.block(('u', 'v'))
@@ -299,7 +299,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     image, names = found.labels('image')
     if len(names) < len(image):
         row = int(np.argmax(np.bincount(image)[image] > 1))
-        raise InputError(f'{found.where(row, "image")} {names[image[row]]} is there twice')
+        raise InputError(f'{found.where(row, "image")} {names[image[row]]} appears twice')
     posed = 'q1' not in found.header
     columns = POSE if posed else joint_columns(joints)
     missing = [name for name in columns if name not in found.header]
@@ -325,8 +325,8 @@ def observed(
     known = np.array([name in places for name in found.names], dtype=bool)
     if not known.any():
         raise InputError(
-            'no image has joint values: the names in column "image" of both tables must be alike, '
-            f'as {next(iter(found.names), "")!r} and {next(iter(places), "")!r} are not'
+            'no image has joint values: the names in column "image" of both tables must match, '
+            f'but {next(iter(found.names), "")!r} and {next(iter(places), "")!r} do not'
         )
     lost = [name for name, yes in zip(found.names, known.tolist(), strict=True) if not yes]
     told = (f'no joint values for {len(lost)} images: {", ".join(some(lost))}',) if lost else ()

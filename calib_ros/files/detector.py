@@ -108,7 +108,7 @@ class Detector:
     def of(self, image: Image) -> Corners | Refusal:
         """Return numbers (K,) and pixels (K, 2) of the corners, or why the image is not used."""
         if not image.size:
-            return Refusal('that cannot be decoded', 'it is no image that OpenCV can read')
+            return Refusal('that cannot be decoded', 'OpenCV cannot read this image')
         width = _edge_width(self._cv2, image)
         if width > 8.0:
             reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
@@ -182,7 +182,8 @@ class Detector:
         whole = len(self._board.corners)
         if len(number) < self._fewest:
             reason = f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, '
-            reason += f'and {len(ids)} markers: is it a part of the board only, or another board?'
+            reason += f'and {len(ids)} markers: is only part of the board visible, or is it '
+            reason += 'another board?'
             return Refusal('with too little of the board', reason)
         points = self._board.corners[number, :2]
         placed = self._placed(points, pixels, points)

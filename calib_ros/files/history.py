@@ -43,7 +43,7 @@ from calib_ros.values import LONGEST_NAME, parse_name
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
-AWAY = 'move it away, its work is done again'
+AWAY = 'move it away, and its work is repeated'
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class History:
             with self._files.open(path, 'rb') as file:
                 return _conformed(parquet.ParquetFile(file).read(), key)
         except Exception as err:  # a damaged file fails in many ways
-            raise InputError(f'{path} is no row of a history ({err}): {AWAY}') from err
+            raise InputError(f'{path} is not a row of a history ({err}): {AWAY}') from err
 
     def _write(self, path: str, content: bytes) -> None:
         """Write a file that others see as a whole or not at all."""

@@ -38,7 +38,7 @@ DASK = {
     'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2**25,
 }
 """Settings of dask: it watches itself less, which takes more than its work, and workers keep what
-memory [bytes] they need again: to get it anew costs a third of a large task's time."""
+memory [bytes] they need again: to get it back costs a third of a large task's time."""
 NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
@@ -271,7 +271,7 @@ def _done(
     completed = as_completed(futures, client.loop, with_results=True, raise_errors=False)
     for future, outcomes in completed:
         if future.status in ('cancelled', 'lost'):
-            raise LostError('the scheduler is lost: results so far are filed, run again')
+            raise LostError('the scheduler is lost: results so far are saved; run again')
         done = running.pop(future.key)
         if future.status == 'error' and len(done) > 1:  # which of them ends a worker?
             completed.update(submitted([(task,) for task in done]))

@@ -25,17 +25,17 @@ from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MISSING, State, filled, plotly_script
 
 STATES: Mapping[str, tuple[State, str]] = {
-    'changed': ('bad', 'the arm is another one than in the nights before'),
+    'changed': ('bad', 'the arm differs from earlier nights'),
     'worse': ('bad', 'the errors of its verifications have grown'),
     'refused': ('open', 'the newest identification was not accepted'),
-    'beyond tolerance': ('open', 'the error of the corrected arm is larger than wanted'),
+    'beyond tolerance': ('open', 'the error of the corrected arm exceeds the tolerance'),
     'unreadable': ('open', 'some of its measurements could not be used'),
     'fine': ('good', 'nothing to do'),
 }
 """From the worst to the best, with their looks and meaning: what calls for a look at the arm, then
 at its calibration, then at files."""
 MOST_NIGHTS = MOST_ENTRIES // 10
-"""Nights of a robot that the page shows; the history has all."""
+"""Nights of a robot that the page shows; the history lists all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 """How Prometheus takes what would end a label."""
 
@@ -131,7 +131,7 @@ def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[s
     if number := len({row.inputs for row in accepted}.difference(row.inputs for row in own)):
         yield (
             'nights in the history by other settings or another chain, not compared: '
-            f'{number} (put their files back to identify them anew)'
+            f'{number} (put their files back to identify them again)'
         )
 
 

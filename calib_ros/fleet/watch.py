@@ -26,7 +26,7 @@ DH parameters, which are far from nominal: nights that determine other ones are 
 themselves only.
 
 Neither warmth nor model makes nights scatter CLEARLY more all at once. Where every joint and pair
-leaves more, several are different: a mended arm, or measurements of another robot.
+leaves more, several changed: a repaired arm, or measurements of another robot.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Change:
             return f'two joints changed: {" and ".join(self.pair)}: was it bumped?'
         if not self.reasons:
             return (
-                'several joints are different: was it mended, or are these the measurements of '
+                'several joints changed: was the robot repaired, or are these the measurements of '
                 'another robot?'
             )
         return f'{reason_in_words(self.reasons)}: was it bumped?'

@@ -60,7 +60,7 @@ def test_images_are_refused_with_the_reason():
         (whole, photograph(CHARUCO, shift=(0.27, 0.2))[0], 'of the 24 corners, fewer than 6'),
         (whole, image[:, ::-1].copy(), r'no marker of DICT_6X6_250, but \d+ mirrored'),
         (whole, np.full((480, 640), 90, np.uint8), 'no marker of DICT_6X6_250: is the board in'),
-        (whole, np.zeros((0, 0), np.uint8), 'no image that OpenCV can read'),
+        (whole, np.zeros((0, 0), np.uint8), 'OpenCV cannot read this image'),
         (Detector(other), image, r'no marker of DICT_4X4_50, but \d+ of DICT_6X6'),
         (Detector(small), image, 'another board: marker'),
         (Detector(wider), image, r'do not fit the board \(\d+ px off\)'),
@@ -186,7 +186,7 @@ def test_boards_that_are_none_are_refused(tmp_path, old, new, said):
     [
         ('image,corner,u\na,0,1\n', 'no column v;'),
         ('image,corner,u,v\na,24,1,2\n', 'line 2: corner must be from 0 to 23 on this board'),
-        ('image,corner,u,v\na,0,1,2\na,0,1,2\n', 'line 3: corner 0 of image a is there already'),
+        ('image,corner,u,v\na,0,1,2\na,0,1,2\n', 'line 3: corner 0 of image a already exists'),
         ('image,corner,u,v\na,0,x,2\n', 'line 2: u'),
         ('image,corner,u,v\n', 'has no rows'),
     ],

@@ -260,7 +260,7 @@ def test_a_scheduler_that_dies_is_told_of(plant):
         found = running._done(client, tasks, echoed)
         next(found)
         local.close()
-        with pytest.raises(LostError, match='results so far are filed, run again'):
+        with pytest.raises(LostError, match='results so far are saved; run again'):
             list(found)
 
 
