@@ -81,9 +81,8 @@ def run(
 ) -> Run:
     """Identify all that is new, file it, and write the page of each robot's newest result.
 
-    The cluster is not asked for where nothing is to be done. `out` is the folder of the report;
-    without it there are no pages. When the cluster cannot be reached any more a LostError is
-    raised.
+    The cluster is not used if there is nothing to do. `out` is the folder of the report; without
+    it there are no pages. A LostError is raised when the cluster can no longer be reached.
     """
     found = Run()
     history.serials()  # one that cannot be read at all is an error of the run, not of each robot
@@ -109,39 +108,38 @@ def page_path(out: Path, row: Row) -> Path:
 
 
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the identifications among rows of a robot that are by its settings of today.
+    """Return the identifications among rows of a robot that are by its present settings.
 
-    There is one of each night, of the same content or the same time, as a file that was put right
-    has: that of this version, or else the one filed last.
+    There is one for each content, and for each time, which a corrected file shares with the wrong
+    one: that of this version, or else the one filed last.
     """
     hashed = robot.settings_hash
     own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
-    return _once(_once(_dated(own), lambda row: row.inputs), lambda row: row.time)
+    return _once(_once(own, lambda row: row.inputs), lambda row: row.time)
 
 
 def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
     """Return the verifications among rows that can be compared.
 
-    There is one of the same poses by the same calibration, whatever the tolerance or the version.
+    There is one for the same poses and calibration, whatever the tolerance or the version.
     """
     own = [row for row in rows if row.kind == 'verify' and row.rms_mm and row.rms_freedom]
-    return _once(_dated(own), lambda row: (row.inputs, row.chain))
+    return _once(own, lambda row: (row.inputs, row.chain))
 
 
 def _once(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
-    """Return rows in the order of their times, without those that others are `of` the same as."""
-    newest = sorted(rows, key=lambda row: (row.software == calib_ros.__version__, row.filed))
+    """Return rows in the order of their times, one of those that are `of` the same.
+
+    What was filed before its time was measured when it was filed.
+    """
+    dated = [replace(row, time=row.filed) if too_late(row) else row for row in rows]
+    newest = sorted(dated, key=lambda row: (row.software == calib_ros.__version__, row.filed))
     kept = {of(row): row for row in newest}
     return tuple(sorted(kept.values(), key=lambda row: (row.time, row.source, row.key)))
 
 
-def _dated(rows: Sequence[Row]) -> list[Row]:
-    """Return rows with times that can be: of what was filed before it was measured, when filed."""
-    return [replace(row, time=row.filed) if too_late(row) else row for row in rows]
-
-
 def too_late(row: Row) -> bool:
-    """Tell whether stamps are later than their result, in any time zone: of a clock set wrong."""
+    """Tell whether a result was filed before its stamps, in any time zone: by a wrong clock."""
     return row.time - row.filed > timedelta(days=1)
 
 
@@ -237,7 +235,7 @@ def _client(cluster: Cluster) -> Iterator[Any]:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except (OSError, TimeoutError, ValueError) as err:
             raise LostError(f'no workers at {cluster.address or "this machine"}: {err}') from err
-        others = {each for each in client.run(_version).values() if each != calib_ros.__version__}
+        others = set(client.run(_version).values()) - {calib_ros.__version__}
         if others:
             raise ConfigError(
                 f'workers have calib_ros {", ".join(sorted(others))}, this is '

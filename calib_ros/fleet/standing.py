@@ -44,7 +44,7 @@ ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 class Standing:
     """A robot, its newest result, changes, unread sources, its verifications and their `drift`.
 
-    `remarks` say what else to know of it, which is neither good nor bad.
+    `remarks` tell what else there is to know, which is neither good nor bad.
     """
 
     robot: Robot
@@ -110,23 +110,23 @@ class Standing:
     def actions(self) -> tuple[str, ...]:
         """Return what calls for a look at the robot or its calibration, in words."""
         found = list(self.alarms)
-        if self.last is not None and 'refused' in self.states:
+        if self.last is not None and not self.last.accepted:
             found.append(f'not accepted: {"; ".join(self.last.reasons)}')
-        if self.last is not None and 'beyond tolerance' in self.states:
+        if self.last is not None and self.share > 1.0:
             wanted = self.robot.tolerance
             found.append(f'beyond tolerance: {self.last.rms_mm:.3f} mm, {wanted:g} mm are wanted')
         return tuple(found)
 
     @property
     def share(self) -> float:
-        """Return its error, of that wanted; 0 where none is wanted or known."""
+        """Return its error as a share of the tolerance; 0 if either is not known."""
         if self.last is None or self.last.rms_mm is None or self.robot.tolerance is None:
             return 0.0
         return self.last.rms_mm / self.robot.tolerance
 
 
 def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
-    """Yield in words how many nights are in the history, but not by the settings of today."""
+    """Yield in words how many nights in the history are not by the settings of today."""
     accepted = (row for row in rows if row.accepted and row.source and robot.compares(row.time))
     if number := len({row.inputs for row in accepted}.difference(row.inputs for row in own)):
         yield (
@@ -144,10 +144,10 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
             f'{row.filed:%Y-%m-%d} of {row.time:%Y-%m-%d} ({row.source or row.kind}): set the '
             'clock of what records them'
         )
-    newest = max(own, key=lambda row: row.filed, default=None)
-    if newest is None or newest.time >= own[-1].time:
+    if not own:
         return
-    if newest.filed.date() > own[-1].filed.date():
+    newest = max(own, key=lambda row: row.filed)
+    if newest.time < own[-1].time and newest.filed.date() > own[-1].filed.date():
         yield (
             f'{newest.source} was filed last, and its stamps are of {newest.time:%Y-%m-%d}, '
             'before those of other nights: unless it is an old one, a clock was set back'
@@ -215,8 +215,7 @@ def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
 
     Returns what is missing to write it, if anything.
     """
-    script = plotly_script()
-    page = None if script is None else page_of(out, found, done)
+    script, page = plotly_script(), page_of(out, found, done)
     if script is None or page is None:
         return MISSING
     out.mkdir(parents=True, exist_ok=True)
@@ -231,7 +230,7 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
     shown = found[:MOST_ENTRIES]  # the worst
     return filled(
         'fleet.html.jinja',
-        mark=STATES[found[0].state][0] if found else 'info',
+        mark=STATES[found[0].state][0],
         states=STATES,
         counts={state: number for state, number in counts(found).items() if number},
         total=len(found),

@@ -16,8 +16,8 @@ explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution 
 changed: as many degrees of freedom as j has parameters, over those of the noise, or of s^2 if it
 has fewer: those of the nights before and of what j leaves. s^2 is by how much the nights so far
 scatter more than their covariances tell, where they clearly do, or by how much more j leaves of
-the difference: what warms up, what the model lacks. `changes.py` names what changed, and all
-begins anew.
+the difference: what warms up, what the model lacks. `changes.py` names what changed, and the
+comparison starts again.
 
 Nights are compared by the parameters that they have in common. An effect that only some nights
 fitted is taken at its nominal value in the others too: with the information matrix I of all
@@ -31,13 +31,12 @@ leaves more, several changed: a repaired arm, or measurements of another robot.
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy import special
@@ -57,26 +56,26 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
 
 LAGS = tuple(2**k for k in range(TELLING.bit_length()))
-"""Nights, 1 to TELLING, that a change is looked for in: a large one shows at once, a small one
-after some."""
+"""Nights, 1 to TELLING, in which a change is sought: a large one shows at once, a small one after
+some."""
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """An arm that is another one than before."""
+    """A change of an arm."""
 
-    time: datetime  # of the first night from which on it is
-    seen: datetime  # of the night in which that was found
-    reasons: tuple[Explanation, ...]  # the likeliest first; none where several joints changed
-    pair: tuple[str, ...] = ()  # the joints where two changed
+    time: datetime  # of the first night after it
+    seen: datetime  # of the night in which it was found
+    reasons: tuple[Explanation, ...]  # the likeliest first; none where two or more joints did
+    pair: tuple[str, ...] = ()  # the joints if two changed
 
     @property
     def joint(self) -> str:
-        """Return the joint that changed, most likely; empty where several did."""
+        """Return the joint that changed, most likely; empty where two or more did."""
         return self.reasons[0].owner if self.reasons else ''
 
     def __str__(self) -> str:
-        """Return it in words."""
+        """Return in words what changed."""
         if self.pair:
             return f'two joints changed: {" and ".join(self.pair)}: was it bumped?'
         if not self.reasons:
@@ -103,31 +102,38 @@ class Watched:
     remarks: tuple[str, ...] = ()
 
 
+_Fitted: TypeAlias = tuple[Row, tuple[Parameter, ...]]
+"""A night, and the parameters of the arm that it fitted."""
+
+
 def watch(rows: Sequence[Row], years: float) -> Watched:
     """Look for changes in accepted identifications, in order."""
     known = [row for row in rows if row.accepted]
     if not known:
         return Watched()
-    joints = {joint['name'] for joint in json.loads(known[0].chain)['joints']}
-    arms = [[name for name in map(Parameter, row.names) if name.owner in joints] for row in known]
-    determined = [frozenset(name for name in arm if name.of_dh) for arm in arms]
-    nights: dict[int, Night] = {}
+    joints = known[0].corrected().joint_names
+    alike: dict[frozenset[Parameter], list[_Fitted]] = {}
+    for row in known:
+        arm = tuple(name for name in map(Parameter, row.names) if name.owner in joints)
+        newest = frozenset(name for name in arm if name.of_dh)
+        alike.setdefault(newest, []).append((row, arm))
+    nights: list[Night] = []
     changes: list[Change] = []
     remarks: list[str] = []
-    for each in dict.fromkeys(determined):
-        which = [k for k, names in enumerate(determined) if names == each]
-        found = _alike([known[k] for k in which], [arms[k] for k in which], years)
-        nights |= zip(which, found.nights, strict=True)
+    for names, fitted in alike.items():
+        found = _alike(fitted, years)
+        nights += found.nights
         changes += found.changes
         remarks += found.remarks
-        if each != determined[-1]:
+        if names != newest:
             remarks.append(
-                f'{len(which)} night{"s" * (len(which) > 1)}, the last of '
-                f'{known[which[-1]].time:%Y-%m-%d}, cannot be compared with the newest: '
-                f'{_other(each, determined[-1])}'
+                f'{len(fitted)} night{"s" * (len(fitted) > 1)}, the last of '
+                f'{fitted[-1][0].time:%Y-%m-%d}, cannot be compared with the newest: '
+                f'{_other(names, newest)}'
             )
+    nights.sort(key=lambda night: night.row.time)
     changes.sort(key=lambda change: change.seen)
-    return Watched(tuple(nights[k] for k in sorted(nights)), tuple(changes), tuple(remarks))
+    return Watched(tuple(nights), tuple(changes), tuple(remarks))
 
 
 def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
@@ -139,162 +145,153 @@ def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
     return '; '.join(f'{who} {", ".join(some(sorted(what)))}' for who, what in differences if what)
 
 
-def _alike(rows: Sequence[Row], arms: Sequence[Sequence[Parameter]], years: float) -> Watched:
-    """Look for changes in nights that determine the same DH parameters.
-
-    `arms` are the parameters of the arm that each night fitted.
-    """
+def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
+    """Look for changes in nights that determine the same DH parameters."""
+    rows, arms = [row for row, _ in fitted], [arm for _, arm in fitted]
     strengths: list[dict[str, float]] = [{} for _ in rows]
     changes: list[Change] = []
-    names: Sequence[Parameter] = ()
     first = known_up_to = 0
     while known_up_to < len(rows):
         common = set(arms[first]).intersection(*arms[first : known_up_to + 1])
-        names = tuple(name for name in arms[first] if name in common)
-        if not names:
+        if not common:
             break
         lacking = (k for k in range(known_up_to, len(rows)) if not common.issubset(arms[k]))
         end = next(lacking, len(rows))
-        data = _Data.of(rows[first:end], arms[first:end], names)
-        level = 1.0 / (365.25 * years * len(LAGS) * len(data.groups))
-        tests = data.tests()
-        count = len(data.joints)
-        least = tests.chances[..., :count].min(axis=0)
+        tests = _tests(fitted[first:end], tuple(name for name in arms[first] if name in common))
+        level = 1.0 / (365.25 * years * len(LAGS) * len(tests.groups))
+        fresh, joints = known_up_to - first, tests.joints
+        least = tests.chances[:, fresh:, : len(joints)].min(axis=0)
         shown = -special.ndtri(np.maximum(0.5 * least, 1e-300))
-        for k in range(known_up_to, end):
-            strengths[k] = dict(zip(data.joints, shown[k - first].tolist(), strict=True))
-        fresh = np.arange(first, end) >= known_up_to
+        strengths[known_up_to:end] = [dict(zip(joints, z, strict=True)) for z in shown.tolist()]
         several = tests.several.min(axis=0) < level
-        alarms = np.flatnonzero(((tests.chances.min(axis=(0, 2)) < level) | several) & fresh)
+        alarms = np.flatnonzero(((tests.chances.min(axis=(0, 2)) < level) | several)[fresh:])
         if not alarms.size:
             known_up_to = end
             continue
-        k = int(alarms[0])
-        chances = tests.several[:, k] if several[k] else tests.chances[:, k].min(axis=1)
-        lag = int(chances.argmin())
+        k = fresh + int(alarms[0])
         row = rows[first + k]
-        reasons: tuple[Explanation, ...] = ()
-        pair: tuple[str, ...] = ()
-        one = float(tests.chances[lag, k, :count].min())
-        two = float(tests.chances[lag, k, count:].min(initial=1.0))
-        if not several[k] and two < level * (one if one < level else 1.0):
-            pair = data.groups[count + int(tests.chances[lag, k, count:].argmin())]
-        elif not several[k]:
-            columns = Columns(row.corrected(), data.names)
-            told = Told(data.names, tests.weight[lag, k], tests.pull[lag, k])
-            reasons = likely(explanations(told, columns, float(data.freedom[k])))
+        lag, reasons, pair = _cause(tests, k, level, row)
         first, known_up_to = first + k + 1 - LAGS[lag], first + k + 1
         changes.append(Change(rows[first].time, row.time, reasons, pair))
     nights = tuple(Night(row, each) for row, each in zip(rows, strengths, strict=True))
-    if not (left := sorted(set().union(*arms[first:]).difference(names))):
-        return Watched(nights, tuple(changes))
+    newest = set(arms[-1])
+    left = sorted(newest.union(*arms[first:]) - newest.intersection(*arms[first:]))
     remark = (
         f'since {rows[first].time:%Y-%m-%d}, {", ".join(some(left))} are not compared: only some '
         'nights fitted them'
     )
-    return Watched(nights, tuple(changes), (remark,))
+    return Watched(nights, tuple(changes), (remark,) if left else ())
+
+
+def _cause(
+    tests: _Tests, k: int, level: float, row: Row
+) -> tuple[int, tuple[Explanation, ...], tuple[str, ...]]:
+    """Return the lag of an alarm in night k, and what changed: one joint, or two by their names.
+
+    Neither where several did.
+    """
+    if tests.several[:, k].min() < level:
+        return int(tests.several[:, k].argmin()), (), ()
+    lag = int(tests.chances[:, k].min(axis=1).argmin())
+    one, two = np.split(tests.chances[lag, k], [len(tests.joints)])
+    if two.min(initial=1.0) < level * (one.min() if one.min() < level else 1.0):
+        return lag, (), tests.groups[len(one) + int(two.argmin())]
+    columns = Columns(row.corrected(), tests.names)
+    told = Told(tests.names, tests.weight[lag, k], tests.pull[lag, k])
+    return lag, likely(explanations(told, columns, float(tests.freedom[k]))), ()
 
 
 class _Tests(NamedTuple):
-    """Tests of L lags at K nights for J joints and pairs of these."""
+    """Tests of L lags at K nights for P parameters, by J joints and pairs of these, `groups`."""
 
+    names: tuple[Parameter, ...]
+    groups: tuple[tuple[str, ...], ...]
+    freedom: FloatArray  # (K,)
     chances: FloatArray  # (L, K, J), 1 where there is no night before
-    several: FloatArray  # (L, K), that no joint alone changed
+    several: FloatArray  # (L, K), that no joint or pair alone changed
     pull: FloatArray  # (L, K, P), u
     weight: FloatArray  # (L, K, P, P), W
 
-
-class _Data(NamedTuple):
-    """What K nights tell of P parameters: information (K, P, P), and that times values (K, P)."""
-
-    names: tuple[Parameter, ...]
-    information: FloatArray
-    pulls: FloatArray
-    freedom: FloatArray
-
-    @classmethod
-    def of(
-        cls, rows: Sequence[Row], arms: Sequence[Sequence[Parameter]], names: tuple[Parameter, ...]
-    ) -> _Data:
-        """Return what nights tell of some parameters of the arm, `arms`, that each fitted.
-
-        Others of the arm are taken at their nominal values, base and tool are free.
-        """
-        information, pulls = [], []
-        for row, arm in zip(rows, arms, strict=True):
-            own = [row.names.index(name) for name in arm]
-            which = [arm.index(name) for name in names]
-            whole = np.linalg.inv(row.covariance[np.ix_(own, own)])
-            information.append(whole[np.ix_(which, which)])
-            pulls.append((whole @ row.offsets[own])[which])
-        freedom = np.array([row.freedom or KNOWN for row in rows])
-        return cls(names, np.array(information), np.array(pulls), freedom)
-
     @property
-    def joints(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(name.owner for name in self.names))
+    def joints(self) -> list[str]:
+        return [group[0] for group in self.groups if len(group) == 1]
 
-    @property
-    def groups(self) -> tuple[tuple[str, ...], ...]:
-        """Return what may change at once: joints, then pairs with half of all parameters at most.
 
-        What is left by more than that tells little of how nights scatter.
-        """
-        known = Counter(name.owner for name in self.names)
-        pairs = (
-            pair
-            for pair in combinations(self.joints, 2)
-            if 2 * sum(known[joint] for joint in pair) <= len(self.names)
-        )
-        return (*((joint,) for joint in self.joints), *pairs)
+def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
+    """Return the tests of all nights against those before, by parameters that each fitted."""
+    information, pulls = _information(fitted, names)
+    count, size = pulls.shape
+    groups = _groups(names)
+    owners = np.array([name.owner for name in names])
+    freedom = np.array([row.freedom or KNOWN for row, _ in fitted])
+    whole, pulled = np.cumsum(information, axis=0), np.cumsum(pulls, axis=0)
+    chances = np.ones((len(LAGS), count, len(groups)))
+    several = np.ones((len(LAGS), count))
+    pull = np.zeros((len(LAGS), count, size))
+    weight = np.zeros((len(LAGS), count, size, size))
+    scatter = np.ones(count)
+    for number, lag in enumerate(LAGS):
+        nights = np.arange(lag, count)
+        before = np.linalg.inv(whole[nights - lag])
+        after = np.linalg.inv(whole[nights] - whole[nights - lag])
+        moved = np.einsum('kpr,kr->kp', after, pulled[nights] - pulled[nights - lag])
+        moved -= np.einsum('kpr,kr->kp', before, pulled[nights - lag])
+        inverse = np.linalg.inv(after + before)
+        force = np.einsum('kpr,kr->kp', inverse, moved)
+        whole_of = np.einsum('kp,kp->k', moved, force)
+        if lag == 1:
+            scatter[nights] = whole_of / size
+        usual = np.array([_usual(scatter[1 : k + 1 - lag], size) for k in nights])
+        weight[number, nights] = inverse / usual[:, np.newaxis, np.newaxis]
+        pull[number, nights] = force / usual[:, np.newaxis]
+        several[number, nights] = 0.0
+        for j, group in enumerate(groups):
+            own = np.flatnonzero(np.isin(owners, group))
+            part = inverse[:, own[:, np.newaxis], own]
+            found = np.linalg.solve(part, force[:, own, np.newaxis])[..., 0]
+            gain = np.einsum('kp,kp->k', found, force[:, own])
+            others = max(1, size - len(own))
+            left = (whole_of - gain) / others
+            beyond = special.fdtrc(others, freedom[nights], left / (CLEARLY**2 * usual))
+            several[number, nights] = np.maximum(several[number, nights], beyond)
+            left = _clearly(left, others)
+            gain /= np.maximum(usual, left) * len(own)
+            known = np.minimum(freedom[nights], others + size * (nights - lag))
+            chances[number, nights, j] = special.fdtrc(len(own), known, gain)
+    return _Tests(names, groups, freedom, chances, several, pull, weight)
 
-    def tests(self) -> _Tests:
-        """Return the tests of all nights against those before."""
-        count, size = self.pulls.shape
-        owners = np.array([name.owner for name in self.names])
-        groups = [np.flatnonzero(np.isin(owners, group)) for group in self.groups]
-        whole, pulled = np.cumsum(self.information, axis=0), np.cumsum(self.pulls, axis=0)
-        chances = np.ones((len(LAGS), count, len(groups)))
-        several = np.ones((len(LAGS), count))
-        pull = np.zeros((len(LAGS), count, size))
-        weight = np.zeros((len(LAGS), count, size, size))
-        scatter = np.ones(count)
-        for number, lag in enumerate(LAGS):
-            nights = np.arange(lag, count)
-            if not nights.size:
-                continue
-            before = np.linalg.inv(whole[nights - lag])
-            after = np.linalg.inv(whole[nights] - whole[nights - lag])
-            moved = np.einsum('kpr,kr->kp', after, pulled[nights] - pulled[nights - lag])
-            moved -= np.einsum('kpr,kr->kp', before, pulled[nights - lag])
-            inverse = np.linalg.inv(after + before)
-            force = np.einsum('kpr,kr->kp', inverse, moved)
-            whole_of = np.einsum('kp,kp->k', moved, force)
-            if lag == 1:
-                scatter[nights] = whole_of / size
-            usual = np.array([self._usual(scatter[1 : k + 1 - lag]) for k in nights])
-            weight[number, nights] = inverse / usual[:, np.newaxis, np.newaxis]
-            pull[number, nights] = force / usual[:, np.newaxis]
-            several[number, nights] = 0.0
-            for j, group in enumerate(groups):
-                part = inverse[:, group[:, np.newaxis], group]
-                found = np.linalg.solve(part, force[:, group, np.newaxis])[..., 0]
-                gain = np.einsum('kp,kp->k', found, force[:, group])
-                others = max(1, size - len(group))
-                left = (whole_of - gain) / others
-                beyond = special.fdtrc(others, self.freedom[nights], left / (CLEARLY**2 * usual))
-                several[number, nights] = np.maximum(several[number, nights], beyond)
-                left = _clearly(left, others)
-                gain /= np.maximum(usual, left) * len(group)
-                known = np.minimum(self.freedom[nights], others + size * (nights - lag))
-                chances[number, nights, j] = special.fdtrc(len(group), known, gain)
-        return _Tests(chances, several, pull, weight)
 
-    def _usual(self, scatter: FloatArray) -> float:
-        """Return how much nights scatter, by their covariances; 1 where these may be right."""
-        if not scatter.size:
-            return 1.0
-        return float(_clearly(np.median(scatter), len(self.names) * scatter.size))
+def _information(
+    fitted: Sequence[_Fitted], names: tuple[Parameter, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the information (K, P, P) of nights about parameters, and that times values (K, P).
+
+    Others of the arm are taken at their nominal values, base and tool are free.
+    """
+    information, pulls = [], []
+    for row, arm in fitted:
+        own = [row.names.index(name) for name in arm]
+        which = [arm.index(name) for name in names]
+        whole = np.linalg.inv(row.covariance[np.ix_(own, own)])
+        information.append(whole[np.ix_(which, which)])
+        pulls.append((whole @ row.offsets[own])[which])
+    return np.array(information), np.array(pulls)
+
+
+def _groups(names: Sequence[Parameter]) -> tuple[tuple[str, ...], ...]:
+    """Return what may change at once: joints, then pairs with half of all parameters at most.
+
+    What is left by more than that tells little of how nights scatter.
+    """
+    known = Counter(name.owner for name in names)
+    pairs = combinations(known, 2)
+    few = (pair for pair in pairs if 2 * sum(known[joint] for joint in pair) <= len(names))
+    return (*((joint,) for joint in known), *few)
+
+
+def _usual(scatter: FloatArray, size: int) -> float:
+    """Return how much nights scatter, by their covariances; 1 where these may be right."""
+    return float(_clearly(np.median(scatter), size * scatter.size)) if scatter.size else 1.0
 
 
 def _clearly(ratio: FloatArray | np.floating[Any], freedom: int) -> FloatArray:
