@@ -69,7 +69,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             contents |= result_files(found, screen, options.out, options.pdf)
     if history is not None:
         problem, measured = found.loaded.problem, options.csv or options.detections
-        sets, measured = (*problem.sets, *problem.judging), measured or options.measured
+        sets, measured = problem.all_sets, measured or options.measured
         about = given.filing_of(options, problem.chain, sets, measured, options.largest_loss)
         history.file(row_of(found.result, about, found.loaded.warnings))
     shown = () if found.result.accepted and not options.json else words.remarks(found.result)

@@ -122,7 +122,7 @@ def _outcome(task: Task) -> Outcome:
         else:
             loaded = of_bag(*replayed(path, chain, settings), robot.largest_loss)
         problem, result = loaded.problem, loaded.identified(settings.model)
-        time_of = measured_at((*problem.sets, *problem.judging), source.modified)
+        time_of = measured_at(problem.all_sets, source.modified)
         known = (content, robot.settings_hash, source.name, source.fingerprint)
         about = Filing(robot.serial, time_of, *known)
         row = identified(result, about, loaded.warnings)

@@ -74,23 +74,30 @@ class Explanation(Shown):
         """Return what has changed, and by how much where it is one parameter."""
         if len(self.names) > 1:
             return f'{self.owner} ({", ".join(name.kind for name in self.names)})'
+        what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
+        return f'{what} by {self.size_in_words()}'
+
+    def size_in_words(self) -> str:
+        """Return by how much its one parameter has changed."""
+        (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
         if self.names == (SCALE_OF_DEVICE,):
-            change, sigma = 1e6 * self.change[0], 1e6 * self.sigma[0]
-            return f'the scale of the device by {change:+.0f} ± {sigma:.0f} ppm'
-        unit = {'m': 'mm', 'rad': 'mrad'}.get(self.names[0].unit, self.names[0].unit)
-        scale = 1e3 if unit in ('mm', 'mrad') else 1.0
-        change, sigma = scale * self.change[0], scale * self.sigma[0]
-        return f'{self.names[0]} by {change:+.3f} ± {sigma:.3f} {unit}'
+            return f'{1e6 * change:+.0f} ± {1e6 * sigma:.0f} ppm'
+        unit = self.names[0].unit
+        if unit in SIZES:
+            return f'{1e3 * change:+.3f} ± {1e3 * sigma:.3f} m{unit}'
+        return f'{change:+.3f} ± {sigma:.3f} {unit}'
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:
     """Return what has changed, with what cannot be told apart from it."""
-    first, *others = reasons
-    text = f'changed: {first.in_words()}'
-    if others:
-        named = ' or '.join(each.in_words() for each in others)
-        text += f', indistinguishable from {named}'
-    return text
+    first, *others = (each.in_words() for each in reasons)
+    text = f'changed: {first}'
+    return f'{text}, indistinguishable from {" or ".join(others)}' if others else text
+
+
+def changes_in_words(changed: Sequence[Sequence[Explanation]]) -> str:
+    """Return changes one after the other, each with what cannot be told apart from it."""
+    return '; '.join(map(reason_in_words, changed))
 
 
 def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
@@ -152,7 +159,7 @@ class Told(Shown):
         return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
 
 
-def explanations(told: Told, columns: Columns, freedom: float = np.inf) -> tuple[Explanation, ...]:
+def explanations(told: Told, columns: Columns, freedom: float) -> tuple[Explanation, ...]:
     """Return what may explain a change, the best first.
 
     `freedom` are the degrees of freedom from which the size of the noise was estimated.
@@ -194,9 +201,9 @@ class Columns:
     Parameters
     ----------
     chain : Chain
-    names : sequence of str
-        P parameters that information is about. Changes of others, which are gauge freedoms beside
-        these, show in them; those that are none do not show at all.
+    names : sequence of Parameter
+        P parameters that information is about. Changes of others show in these if they are gauge
+        freedoms beside them, and not at all otherwise.
     frames : sequence of str
         Frames that may have moved; others are free, and take up whatever they can.
     scaled : bool

@@ -80,7 +80,7 @@ class Difference(Shown):
                 'models lack; to find out, measure the same poses from the same place'
             )
         if self.changed and self.unexplained > changes.FALSE:
-            reasons = '; '.join(changes.reason_in_words(each) for each in self.changed)
+            reasons = changes.changes_in_words(self.changed)
             return f'{reasons}; nothing else: was it bumped? Predictions differ by {size}'
         return f'many parameters differ, by {size}: identify again, and inspect the robot'
 

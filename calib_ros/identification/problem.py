@@ -141,7 +141,7 @@ class Problem(Shown):
 
     def _check_sets(self) -> None:
         joints = len(self.chain.joints)
-        for observations in (*self.sets, *self.judging):
+        for observations in self.all_sets:
             if observations.joints.shape[1:] != (joints,):
                 raise InputError(
                     f'observations have {observations.joints.shape[1:]} joint values, chain '
@@ -223,6 +223,11 @@ class Problem(Shown):
         held_out = self.held_out or ()
         sets = (held_out,) if isinstance(held_out, Observations) else held_out
         return tuple(each for each in sets if len(each))
+
+    @property
+    def all_sets(self) -> tuple[Observations, ...]:
+        """Return the sets to fit, then those held out."""
+        return (*self.sets, *self.judging)
 
     @cached_property
     def configurations(self) -> tuple[NDArray[np.intp], ...]:

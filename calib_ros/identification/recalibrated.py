@@ -77,24 +77,20 @@ class Recalibration(Shown):
         }
 
     def in_words(self) -> str:
-        """Return what has changed."""
+        """Return whether it may be used, what has changed, and what to do."""
         text = (
             f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
             'new poses (each left out in turn)'
         )
         if self.accepted:
-            said = 'unchanged within the uncertainty, updated'
-            if self.changed:
-                said = self._causes()
-            return f'accepted: {said}; {text}'
+            said = changes.changes_in_words(self.changed)
+            return f'accepted: {said or "unchanged within the uncertainty, updated"}; {text}'
         if self.reused:
             why = f'{reused_in_words(self.reused)}, and give only those'
         elif self.scale is not None:
-            size, sigma = 1e6 * self.scale.change[0], 1e6 * self.scale.sigma[0]
             why = (
-                f'the scale of the measuring device changed, by {size:+.0f} ± '
-                f'{sigma:.0f} ppm; check it with a known length, and the temperature and pressure '
-                'set in it'
+                f'the scale of the measuring device changed, by {self.scale.size_in_words()}; '
+                'check it with a known length, and the temperature and pressure set in it'
             )
         elif self.odd:
             why = (
@@ -104,9 +100,10 @@ class Recalibration(Shown):
         elif self.unexplained <= changes.FALSE:
             why = 'no change of a few parameters explains the new poses; identify again'
         elif not self.determined:
+            causes = changes.changes_in_words(self.changed)
             before, after = 1e3 * self.known_before, 1e3 * self.known_after
             why = (
-                f'the new poses do not show well enough what has changed ({self._causes()}): the '
+                f'the new poses do not show well enough what has changed ({causes}): the '
                 f'arm would be known to {after:.3f} mm, before to {before:.3f} mm; measure more '
                 'poses, all over the joint range'
             )
@@ -118,6 +115,3 @@ class Recalibration(Shown):
         else:
             why = 'the new poses contradict each other; measure more'
         return f'NOT accepted: {why}. {text}'
-
-    def _causes(self) -> str:
-        return '; '.join(changes.reason_in_words(each) for each in self.changed)

@@ -44,7 +44,7 @@ from calib_ros.settings import GROWTH
 
 
 def years_since(record: Mapping[str, Any]) -> float:
-    """Return the age [years] of a calibration by its record; a year where that does not tell."""
+    """Return the age [years] of a calibration by its record; a year if that does not tell."""
     try:
         age = datetime.now(timezone.utc) - datetime.fromisoformat(str(record.get('created')))
     except (ValueError, TypeError):
@@ -89,7 +89,7 @@ def recalibrate(
         except np.linalg.LinAlgError:
             continue
         chain = others.calibration.chain
-        away = residuals(chain, (*problem.sets, *problem.judging)[number]).position[pose]
+        away = residuals(chain, problem.all_sets[number]).position[pose]
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
             where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
             held_out = 'held-out ' if number >= len(problem.sets) else ''
@@ -99,32 +99,29 @@ def recalibrate(
 
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
     """Yield set and pose of those with the largest errors by a chain, and all without it."""
-    sets = (*problem.sets, *problem.judging)
+    sets = problem.all_sets
     sizes = [norms(residuals(chain, each).position) for each in sets]
     order = np.argsort(-np.concatenate(sizes))
     if not len(order) >= IN_A_FRAME or any(each.pixels is not None for each in sets):
         return
-    owner = np.repeat(np.arange(len(sets)), [len(each) for each in sets])
-    first = np.cumsum([0, *(len(each) for each in sets)])
-    for k in order[:TRIED].tolist():
-        number = int(owner[k])
-        pose = k - int(first[number])
-        rest = [
-            each.select(np.arange(len(each)) != pose) if at == number else each
-            for at, each in enumerate(sets)
-        ]
+    places = [(number, pose) for number, each in enumerate(sets) for pose in range(len(each))]
+    for number, pose in (places[k] for k in order[:TRIED].tolist()):
+        rest = list(sets)
+        rest[number] = rest[number].select(np.arange(len(rest[number])) != pose)
         one, *more = (each for each in rest if len(each))
         left = {each.base for each in (one, *more)}
         apart = tuple(pair for pair in problem.separations if {*pair[:2]} <= left)
-        without = replace(problem, separations=apart)
-        yield number, pose, replace(without, observations=one, more=tuple(more), held_out=None)
+        without = replace(
+            problem, observations=one, more=tuple(more), held_out=None, separations=apart
+        )
+        yield number, pose, without
 
 
 def _recalibrated(
     previous: Calibration, problem: Problem, years: float, growth: float, new: Sequence[str]
 ) -> tuple[Recalibration, Chain]:
     """Return what comes of the poses of a problem, and the earlier arm in new frames."""
-    sets = (*problem.sets, *problem.judging)
+    sets = problem.all_sets
     arm = _Arm.of(previous, sets, years, growth)
     system = _system(problem, sets, previous)
     names = [name for frame in new for name in parameters_of(frame) if name in arm.names]
@@ -181,10 +178,14 @@ def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
 
     The travel of prismatic joints, which no parameter stretches, would not grow with it.
     """
-    bases = {each.base for each in sets}
-    free = len(bases) == 1 and not any(chain.frame(base).fixed for base in bases)
-    free = free and all(joint.type == 'revolute' for joint in chain.joints)
-    return free and all(
+    base, *others = {each.base for each in sets}
+    if (
+        others
+        or chain.frame(base).fixed
+        or any(joint.type != 'revolute' for joint in chain.joints)
+    ):
+        return False
+    return all(
         each.distances is None and each.pixels is None and not (each.socket or each.inverse)
         for each in sets
     )
@@ -358,7 +359,7 @@ def _updated(
         **made(),
         **about(chain, before, region),
         'previous': {key: previous.record.get(key) for key in ('created', 'table_sha256')},
-        'new_samples': sum(map(len, (*problem.sets, *problem.judging))),
+        'new_samples': sum(map(len, problem.all_sets)),
         'changed': [changes.reason_in_words(each) for each in changed],
     }
     return replace(
@@ -369,5 +370,5 @@ def _updated(
         covariance=found.covariance[np.ix_(own, own)],
         region=region,
         record=record,
-        rows=Fingerprint.of((*problem.sets, *problem.judging), previous.rows),
+        rows=Fingerprint.of(problem.all_sets, previous.rows),
     )

@@ -28,8 +28,8 @@ tell by how much one side of it is longer than stated, compared with the other; 
 together is as unsure, and the arm takes it on.
 
 Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
-the poses tell less of the arm than is known before. It is said where a sigma is larger than the
-errors that any result may leave, or the residuals are hardly any part of it.
+the poses tell less of the arm than is known before. A remark names a sigma that is larger than
+the errors that any result may leave, or of which the residuals are a small part.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXACT, EXCEPTION
 
 LEAST_SCALE = 0.5 * SCALE
-"""Of a device of which it is told: half of what those of good ones scatter by."""
+"""Of a device, from which it is remarked: half of what those of good ones scatter by."""
 LARGEST_SCALE = 10.0 * SCALE
-"""More than no arm grows by: 40 degrees do it, if all of it is of aluminium (23 ppm a degree)."""
+"""More than any arm grows by: 40 degrees do it, if all of it is of aluminium (23 ppm a degree)."""
 HARMFUL = 0.15
 """Probability of harm by the scale of the device from which a result is refused: of 607 good ones
 8 are; of 1,890 arms with such an error 64 are accepted and get worse (benchmarks/scale.py)."""
@@ -76,31 +76,34 @@ by which devices repeat better than they measure, while mm are thousandths."""
 SIMULATED = EXACT
 """Residuals [m or rad] below which no device measured them."""
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
-"""Standard deviations [m] of arms' own offsets of lengths that are tried."""
+"""Standard deviations [m] of arms' own offsets of lengths, to choose from."""
 
 
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
     """Return the result with what is suspicious in it, refused where it cannot be right.
 
-    `another` tells that no mistake is named already, which would come first.
+    `another` is false if a mistake is named already, which comes first.
     """
     if any(each.socket or each.plane for each in problem.sets):
         return result  # one place tells nothing of what follows
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
-    refusals = (*result.refusals, Reason(Rule.SCALE, scale)) if certain else result.refusals
     lens, imitated = _lens(problem, result) if another else ('', False)
+    board = '' if lens else _board(problem, result)
+    gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
+    refusals = list(result.refusals)
+    if certain:
+        refusals.append(Reason(Rule.SCALE, scale))
     if imitated:
-        refusals, another, lens = (Reason(Rule.MISTAKE, lens), *refusals), False, ''
-    sigmas = _sigmas(problem, result)
+        refusals.insert(0, Reason(Rule.MISTAKE, lens))
+        lens = ''
     if refusals and sigmas:
-        reason, sigmas = Reason(Rule.MISTAKE, sigmas), ''
-        refusals = (reason, *refusals) if another else (*refusals, reason)
-    board = '' if lens or imitated else _board(problem, result)
-    bent = _gravity(problem, result), _coupling(result)
-    found = (scale, sister, lens, board, *bent, sigmas)
+        first = another and not imitated
+        refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
+        sigmas = ''
+    found = (scale, sister, lens, board, gravity, _coupling(result), sigmas)
     said = (*result.remarks, *(each for each in found if each))
-    return replace(result, remarks=said, refusals=refusals)
+    return replace(result, remarks=said, refusals=tuple(refusals))
 
 
 def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:
@@ -187,8 +190,7 @@ def _sister(problem: Problem, result: Identification) -> str:
         return ''
     return (
         f'the identified arm is closer to the supplied {name} ({1e3 * distance:.2f} mm) than to '
-        'the '
-        f'nominal {problem.chain.name} ({1e3 * nominal:.2f} mm): is it the right chain file?'
+        f'the nominal {problem.chain.name} ({1e3 * nominal:.2f} mm): is it the right chain file?'
     )
 
 
@@ -299,7 +301,7 @@ def _board(problem: Problem, result: Identification) -> str:
     """Return in words that a board is wider or narrower for its height than stated."""
     for each, far in zip(problem.sets, result.distances, strict=True):
         kept = far < OUTLIER
-        if each.points is None or not kept.any():
+        if each.points is None or distinct(each.images[kept]) < 2:
             continue
         seen, points = each.select(kept), each.points[kept]
         _, shifts = seen_residuals(result.chain, seen)
@@ -316,9 +318,8 @@ def _board(problem: Problem, result: Identification) -> str:
             size = np.bincount(image, beside**2)
             stretched.append(np.bincount(image, beside * shift) / np.maximum(size, 1e-300))
         wider = stretched[0] - stretched[1]
-        error = wider.std(ddof=1) / np.sqrt(len(count)) if len(count) > 1 else np.inf
-        mean = float(wider.mean())
-        if abs(mean) > LARGEST_SCALE + special.stdtrit(max(len(count) - 1, 1), SURE) * error:
+        mean, error = float(wider.mean()), wider.std(ddof=1) / np.sqrt(len(count))
+        if abs(mean) > LARGEST_SCALE + special.stdtrit(len(count) - 1, SURE) * error:
             way = 'wider' if mean > 0.0 else 'narrower'
             return (
                 f'the board is {_percent(abs(mean))} % {way} for its height than stated: print it '

@@ -275,7 +275,7 @@ def _repeated(problem: Problem) -> NDArray[np.bool_]:
     """Return (N,) which held-out pairs are at configurations that are fitted."""
     if not problem.judging:
         return np.zeros(0, dtype=bool)
-    numbers = numbered((*problem.sets, *problem.judging))
+    numbers = numbered(problem.all_sets)
     count = len(problem.sets)
     return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
 

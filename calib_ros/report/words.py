@@ -13,7 +13,7 @@ import numpy as np
 
 import calib_ros
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import FALSE, reason_in_words
+from calib_ros.identification.changes import FALSE, changes_in_words
 from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.recalibrated import Recalibration
@@ -129,7 +129,7 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, nothing changed, and why in words."""
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
     if found.changed:
-        reasons = '; '.join(reason_in_words(each) for each in found.changed)
+        reasons = changes_in_words(found.changed)
         return False, (
             f'the calibration in use no longer fits, {reasons}: was it bumped? {text}; measure '
             'at least 8 poses and call ~/identify, or run calib_ros identify --previous'

@@ -81,7 +81,7 @@ class Filer:
         return self._file(row)
 
     def _about(self, problem: Problem, settings: Settings, *more: str) -> Filing:
-        sets = (*problem.sets, *problem.judging)
+        sets = problem.all_sets
         hashed = settings_hash(self._nominal, settings, *more)
         return Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
 
