@@ -9,8 +9,8 @@ charuco   columns x rows squares, black at the upper left, markers in the white 
 markers   columns x rows markers, `square` from one to the next; marker k has the corners
           4 k ... 4 k + 3, clockwise from its upper left
 
-The frame of the board has x to the right, y down and z away from who looks at it; its origin is
-the upper left corner of the first square, or of the first marker.
+The frame of the board has x to the right, y down and z away from the viewer; its origin is the
+upper left corner of the first square or marker.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
 HEADER = ('image', 'corner', 'u', 'v')
 SIZE = ('width', 'height')
-"""Columns of corners that may be missing: the size of the images [px]."""
+"""Optional columns of corners: the size of the images [px]."""
 DISTORTION = ('distortion_model', 'distortion_coefficients')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
 POSED = 'flange_pose'
@@ -155,7 +155,7 @@ def read_lens(path: Path, found: Detections | None = None) -> Lens:
 
 
 def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> None:
-    """Refuse intrinsics of images of another size than those that show some corners."""
+    """Refuse intrinsics of images of another size than those of the corners."""
     keys = [next((k for k in (f'image_{each}', each) if k in content), '') for each in SIZE]
     if not all(keys):
         return
@@ -291,9 +291,8 @@ def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
 def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, tuple[str, ...]]:
     """Read where the arm was at each image; return joint values (n,) by name, and if by poses.
 
-    Also warnings, of joints that the arm does not have.
-
-    A table with `image` and q1 ... qn, or with the flange's pose x y z qx qy qz qw.
+    Also warnings, of joints that the arm does not have. The table has `image` and q1 ... qn, or
+    the flange's pose x y z qx qy qz qw.
     """
     found = read_columns(path, ('image',))
     image, names = found.labels('image')
@@ -318,7 +317,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
 def observed(
     found: Detections, board: Board, places: Mapping[str, FloatArray], on_flange: bool
 ) -> tuple[Observations, tuple[str, ...]]:
-    """Return the corners of images at which the arm is known, stamped by line, and warnings.
+    """Return the corners of images with known joint values, stamped by line, and warnings.
 
     `places` are joint values (n,) by the names of images.
     """
@@ -326,7 +325,7 @@ def observed(
     if not known.any():
         raise InputError(
             'no image has joint values: the names in column "image" of both tables must match, '
-            f'but {next(iter(found.names), "")!r} and {next(iter(places), "")!r} do not'
+            f'but {found.names[0]!r} and {next(iter(places))!r} do not'
         )
     lost = [name for name, yes in zip(found.names, known.tolist(), strict=True) if not yes]
     told = (f'no joint values for {len(lost)} images: {", ".join(some(lost))}',) if lost else ()

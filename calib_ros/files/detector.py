@@ -87,9 +87,8 @@ def black_of(board: Board) -> FloatArray:
 class Detector:
     """Finds the corners of one board.
 
-    Markers are sought in an image of half the size or less, and those that must be in view and
-    were not found in larger ones. Corners are refined in the image as it is, of which it must show
-    the `fewest`.
+    Markers are sought in the image at half its size or less; those that must be in view and were
+    not found, at larger sizes. Corners are refined at full size; an image must show the `fewest`.
     """
 
     def __init__(self, board: Board, fewest: int = FEWEST) -> None:
@@ -111,8 +110,7 @@ class Detector:
             return Refusal('that cannot be decoded', 'OpenCV cannot read this image')
         width = _edge_width(self._cv2, image)
         if width > 8.0:
-            reason = f'it is blurred: its sharpest edges are {width:.0f} px wide'
-            return Refusal('blurred', reason)
+            return Refusal('blurred', f'it is blurred: its sharpest edges are {width:.0f} px wide')
         corners, ids = self._sought(image)
         found = self._judged(image, corners, ids)
         if not isinstance(found, Refusal):
@@ -179,21 +177,24 @@ class Detector:
         self, image: Image, corners: FloatArray, ids: NDArray[np.intp]
     ) -> Corners | Refusal:
         number, pixels = self._corners(image, corners, ids)
-        whole = len(self._board.corners)
         if len(number) < self._fewest:
-            reason = f'it shows {len(number)} of the {whole} corners, fewer than {self._fewest}, '
-            reason += f'and {len(ids)} markers: is only part of the board visible, or is it '
-            reason += 'another board?'
-            return Refusal('with too little of the board', reason)
+            return Refusal(
+                'with too little of the board',
+                f'it shows {len(number)} of the {len(self._board.corners)} corners, fewer than '
+                f'{self._fewest}, and {len(ids)} markers: is only part of the board visible, or '
+                'is it another board?',
+            )
         points = self._board.corners[number, :2]
         placed = self._placed(points, pixels, points)
         apart = np.inf if placed is None else np.linalg.norm(placed - pixels, axis=1).max()
         spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
         # Lens and board may bend a board by half of what a corner is refined in, or 10 %.
         if apart > max(0.5 * WIDEST, EXCEPTION * spacing):
-            reason = f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, '
-            reason += 'square and marker those of this board, and is it flat?'
-            return Refusal('whose corners do not fit the board', reason)
+            return Refusal(
+                'whose corners do not fit the board',
+                f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, '
+                'square and marker those of this board, and is it flat?',
+            )
         return number, pixels
 
     def _placed(
@@ -232,7 +233,7 @@ class Detector:
                 pixels, number, _, _ = detect_board(image, markerCorners=around, markerIds=shape)
             elif around:
                 _, pixels, number = aruco.interpolateCornersCharuco(around, shape, image, made)
-            if number is None or not len(number):
+            if number is None:
                 return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
             flat = np.asarray(pixels, dtype=float).reshape(-1, 2)
             return np.ravel(number).astype(np.intp), self._refined(image, flat, corners)
@@ -300,7 +301,7 @@ def detect(
 ) -> tuple[Detections, int]:
     """Return the corners of a board in named images, and how many of these are not used.
 
-    Those of another size than most are not: their lens would be another one.
+    Images of another size than most are not: their lens would be another one.
     """
     detector = Detector(board, fewest)
     used: list[tuple[str, tuple[int, int], Corners]] = []
@@ -321,9 +322,9 @@ def detect(
         heard(f'{name}: {len(found[0])} corners')
         used.append((name, (picture.shape[1], picture.shape[0]), found))
     if not used:
-        first = next(iter(refused), ': there is none')
+        first = next(iter(refused), 'there is none')
         raise InputError(f'no image can be used; {first}')
-    (most, _), *_ = Counter(size for _, size, _ in used).most_common(1)
+    ((most, _),) = Counter(size for _, size, _ in used).most_common(1)
     for name, size, _ in used:
         if size != most:
             refuse(name, 'it is of {} x {} px, and most are of {} x {}'.format(*size, *most))

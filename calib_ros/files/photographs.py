@@ -43,20 +43,20 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def read_image(path: Path) -> Image | Refusal:
-    """Return an image in grey, or why it cannot be read; without pixels where it is none."""
+    """Return an image in grey, without pixels if it is none, or why it cannot be read."""
     try:
         if path.stat().st_size > LARGEST_IMAGE:
-            return np.zeros((0, 0), dtype=np.uint8)
+            return Refusal('that cannot be read', f'it has more than {LARGEST_IMAGE / 1e6:.0f} MB')
         return decoded(np.frombuffer(path.read_bytes(), dtype=np.uint8))
     except OSError as err:
         return Refusal('that cannot be read', f'it cannot be read: {err.strerror}')
 
 
 def decoded(data: NDArray[np.uint8]) -> Image:
-    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) where it is none.
+    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) if it is none.
 
     As the sensor saw it: turned as its EXIF asks, it would not be the image that the lens made.
-    Of 10 to 16 bits, the eight from the highest that is used on.
+    Of 10 to 16 bits, the eight highest that are used.
     """
     cv2 = opencv()
     kind = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

@@ -149,7 +149,7 @@ def _recalibrated(
         _updated(arm, found, problem, changed),
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
-        *_judged(arm, found, system, sets),
+        *_judged(arm, earlier, found, system, sets),
         *_known(arm, before, found),
         previous.reused(sets),
         _left_out_by(system.rows, len(names)),
@@ -317,19 +317,19 @@ def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
 
 
 def _judged(
-    arm: _Arm, found: _Found, system: System, sets: Sequence[Observations]
+    arm: _Arm, earlier: Chain, found: _Found, system: System, sets: Sequence[Observations]
 ) -> tuple[ErrorFigures, ErrorFigures]:
-    """Return the errors of the new poses before, and by what the others tell."""
+    """Return the errors of the new poses by the earlier arm, and by what the other poses tell."""
     groups = numbered(sets)
     count = min(SOME_POSES, distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
     chain = arm.chain.with_offsets(dict(zip(arm.names, found.change, strict=True)))
-    start, chains = arm.changed(np.zeros(len(arm.names))), []
+    chains = []
     parts = products_of(chain, arm.names, system, folds).sum(axis=1)
     for products in parts.sum(axis=0) - parts:
         information = products[:-1, :-1]
         rest = Told(arm.names, information, products[:-1, -1] + information @ found.change)
-        chains.append((start, arm.changed(rest.mean(arm.square)[0])))
+        chains.append((earlier, arm.changed(rest.mean(arm.square)[0])))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
     return before.figures(every), after.figures(every)

@@ -75,6 +75,10 @@ LEAST_NOISE = NEARER * EXCEPTION
 by which devices repeat better than they measure, while mm are thousandths."""
 SIMULATED = EXACT
 """Residuals [m or rad] below which no device measured them."""
+COUPLED = (
+    'couplings of the last joints explain most of the residuals: are the joint values those '
+    'of the motors? If so, add the effects "coupling"'
+)
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
 """Standard deviations [m] of arms' own offsets of lengths, to choose from."""
 
@@ -101,7 +105,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         first = another and not imitated
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
-    found = (scale, sister, lens, board, gravity, _coupling(result), sigmas)
+    found = (scale, sister, lens, board, gravity, COUPLED if result.coupled else '', sigmas)
     said = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=said, refusals=tuple(refusals))
 
@@ -339,16 +343,6 @@ def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) 
         return 0.0
     share = _explained(problem, chain.with_effects([*known, *added]), names, added)
     return share if share >= EXPLAINED else 0.0
-
-
-def _coupling(result: Identification) -> str:
-    """Return in words that couplings of the wrist explain what is left."""
-    if not result.coupled:
-        return ''
-    return (
-        'couplings of the last joints explain most of the residuals: are the joint values those '
-        'of the motors? If so, add the effects "coupling"'
-    )
 
 
 def _explained(

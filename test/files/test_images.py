@@ -18,6 +18,7 @@ from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files import boards
 from calib_ros.files.detector import Detector, detect
 from calib_ros.files.photographs import decoded, read_image
+from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.pictures import Refusal
@@ -109,7 +110,10 @@ def test_images_of_another_size_than_most_are_refused():
 def test_what_cannot_be_read_is_not_used(tmp_path):
     (tmp_path / 'folder.png').mkdir()
     (tmp_path / 'gone.png').symlink_to(tmp_path / 'nowhere')
-    for name, reason in (('folder', 'Is a directory'), ('gone', 'No such file')):
+    with (tmp_path / 'huge.png').open('wb') as file:
+        file.truncate(LARGEST_IMAGE + 1)
+    huge = ('huge', 'it has more than')
+    for name, reason in (huge, ('folder', 'Is a directory'), ('gone', 'No such file')):
         found = read_image(tmp_path / f'{name}.png')
         assert isinstance(found, Refusal)
         assert reason in found.reason
