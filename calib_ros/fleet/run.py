@@ -110,12 +110,12 @@ def page_path(out: Path, row: Row) -> Path:
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
     """Return the identifications among rows of a robot that are by its present settings.
 
-    There is one for each content, and for each time, which a corrected file shares with the wrong
-    one: that of this version, or else the one filed last.
+    There is one for each content, and for each source and time, which a corrected file shares with
+    the wrong one: that of this version, or else the one filed last.
     """
     hashed = robot.settings_hash
     own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
-    return _once(_once(own, lambda row: row.inputs), lambda row: row.time)
+    return _once(_once(own, lambda row: row.inputs), lambda row: (row.source, row.time))
 
 
 def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:

@@ -127,8 +127,9 @@ class Standing:
 
 def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
     """Yield in words how many nights in the history are not by the settings of today."""
-    accepted = (row for row in rows if row.accepted and row.source and robot.compares(row.time))
-    if number := len({row.inputs for row in accepted}.difference(row.inputs for row in own)):
+    others = (row for row in rows if row.accepted and row.settings != robot.settings_hash)
+    nights = {row.inputs for row in others if row.source and robot.compares(row.time)}
+    if number := len(nights.difference(row.inputs for row in own)):
         yield (
             'nights in the history by other settings or another chain, not compared: '
             f'{number} (put their files back to identify them again)'

@@ -126,6 +126,22 @@ def test_a_night_whose_file_was_put_right_counts_once(plant, cluster, tmp_path):
         assert [row.verdict for row in results(plant[0], each)] == ['accepted', 'accepted']
 
 
+def test_sessions_without_stamps_are_nights_and_a_night_put_right_is_no_other_setting(
+    plant, tmp_path
+):
+    """Both sessions have the date of their table, and so its time."""
+    history, robot = History(tmp_path / 'history'), plant[0]
+    settings = robot.settings_hash
+    row = Row('A', 'identify', plants.when(0), 'accepted', '0', settings, 'a#A', chain=CHAIN)
+    corrected = replace(row, inputs='1', filed=row.filed + timedelta(hours=1))
+    other = replace(row, inputs='2', source='a#B')
+    for each in (row, corrected, other):
+        history.file(each)
+    assert {each.inputs for each in results(robot, history.rows('A'))} == {'1', '2'}
+    (standing,) = standings(plant[:1], history, Run(), 100.0)
+    assert standing.remarks == ()
+
+
 def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
     history, robot = History(tmp_path / 'history'), plant[0]
     day = timedelta(days=1)
