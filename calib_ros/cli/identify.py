@@ -19,9 +19,11 @@ from calib_ros.files import boards
 from calib_ros.files.history import identified as row_of
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.changes import reason_in_words
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
@@ -111,10 +113,36 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
     if options.json:
         screen.data(text)
     else:
-        screen.title(found.in_words(), found.accepted)
+        _show_update(found, screen)
         if options.out is not None:
             screen.say(common.written(options.out, contents))
     return 0 if found.accepted else common.Status.NOT_ACCEPTED
+
+
+def _show_update(found: Recalibration, screen: Screen) -> None:
+    """Print what came of bringing a calibration up to date, and what has changed."""
+    before, after = found.before, found.after
+    if found.accepted:
+        screen.title('accepted: the calibration is brought up to date', True)
+    else:
+        screen.title('NOT accepted: the earlier calibration stays as it was', False)
+    known = f'{1e3 * found.known_before:.3f} -> {1e3 * found.known_after:.3f} mm'
+    screen.table(
+        (
+            ('robot', found.calibration.chain.name),
+            ('new poses', f'{after.count}, each judged by the others'),
+            ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm'),
+            ('arm known to', f'{known} over the joint range (one sigma)'),
+        )
+    )
+    why, step = found.refusal()
+    if why:
+        screen.bullet(why, (step,))
+    elif not found.changed:
+        screen.bullet('unchanged within the uncertainty')
+    if found.accepted or not found.determined:
+        for reasons in found.changed:
+            screen.bullet(reason_in_words(reasons))
 
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:

@@ -66,6 +66,7 @@ class Recalibration(Shown):
         """Return it as plain values."""
         return {
             'accepted': self.accepted,
+            'refusal': ': '.join(filter(None, self.refusal())),
             'reused': self.reused,
             'changed': [changes.reasons_document(each) for each in self.changed],
             'unexplained': self.unexplained,
@@ -76,42 +77,29 @@ class Recalibration(Shown):
             'moved_mm': 1e3 * self.moved,
         }
 
-    def in_words(self) -> str:
-        """Return whether it may be used, what has changed, and what to do."""
-        text = (
-            f'RMS {self.before.rms_mm:.3f} -> {self.after.rms_mm:.3f} mm on {self.after.count} '
-            'new poses (each left out in turn)'
-        )
+    def refusal(self) -> tuple[str, str]:
+        """Return why it must not be used, and what to do; both empty if it is accepted."""
         if self.accepted:
-            said = changes.changes_in_words(self.changed)
-            return f'accepted: {said or "unchanged within the uncertainty, updated"}; {text}'
+            return '', ''
         if self.reused:
-            why = f'{reused_in_words(self.reused)}, and give only those'
-        elif self.scale is not None:
-            why = (
-                f'the scale of the measuring device changed, by {self.scale.size_in_words()}; '
-                'check it with a known length, and the temperature and pressure set in it'
+            why, _, step = reused_in_words(self.reused).rpartition(': ')
+            return why, f'{step}, and give only those'
+        if self.scale is not None:
+            return (
+                f'the scale of the measuring device changed, by {self.scale.size_in_words()}',
+                'check it with a known length, and the temperature and pressure set in it',
             )
-        elif self.odd:
-            why = (
-                f'{self.odd} contradicts all others, which would pass without it; measure it '
-                'again, or leave it out'
+        if self.odd:
+            why = f'{self.odd} contradicts all others, which would pass without it'
+            return why, 'measure it again, or leave it out'
+        if self.unexplained <= changes.FALSE:
+            return 'no change of a few parameters explains the new poses', 'identify again'
+        if not self.determined:
+            step = 'measure more poses, all over the joint range'
+            return 'the new poses do not show well enough what has changed', step
+        if self.anew > 1.0:
+            return (
+                'the earlier calibration, in new frames, fits the new poses better',
+                'keep it, or identify again from more poses',
             )
-        elif self.unexplained <= changes.FALSE:
-            why = 'no change of a few parameters explains the new poses; identify again'
-        elif not self.determined:
-            causes = changes.changes_in_words(self.changed)
-            before, after = 1e3 * self.known_before, 1e3 * self.known_after
-            why = (
-                f'the new poses do not show well enough what has changed ({causes}): the '
-                f'arm would be known to {after:.3f} mm, before to {before:.3f} mm; measure more '
-                'poses, all over the joint range'
-            )
-        elif self.anew > 1.0:
-            why = (
-                'the earlier calibration, in new frames, fits the new poses better; keep it, or '
-                'identify again from more poses'
-            )
-        else:
-            why = 'the new poses contradict each other; measure more'
-        return f'NOT accepted: {why}. {text}'
+        return 'the new poses contradict each other', 'measure more'

@@ -181,6 +181,7 @@ RESULTS = {
 }
 MORE = {
     'identify_refused': (3, 'identify', 'good_arm.csv', *UR5E),
+    'identify_previous': (0, 'identify', 'bumped.csv', *UR5E, '--previous', 'result'),
     'identify_of_a_program': (1, 'identify', 'result/report.html', *UR5E),
     'verify_of_a_bag': (3, 'verify', 'bag', *UR5E, '--calibration', 'result', '--tolerance', '1'),
     'identify_another_arm': (3, 'identify', 'measured.csv', '--chain', 'ur10'),
