@@ -82,10 +82,7 @@ class Explanation(Shown):
         (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
         if self.names == (SCALE_OF_DEVICE,):
             return f'{1e6 * change:+.0f} ± {1e6 * sigma:.0f} ppm'
-        unit = self.names[0].unit
-        if unit in SIZES:
-            return f'{1e3 * change:+.3f} ± {1e3 * sigma:.3f} m{unit}'
-        return f'{change:+.3f} ± {sigma:.3f} {unit}'
+        return f'{1e3 * change:+.3f} ± {1e3 * sigma:.3f} m{self.names[0].unit}'
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:
@@ -192,7 +189,7 @@ def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
 
 def _sizes(names: Sequence[Parameter]) -> FloatArray:
     """Return the typical sizes (k,) [m, rad] of changes."""
-    return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES.get(n.unit, 1.0) for n in names])
+    return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES[n.unit] for n in names])
 
 
 class Columns:
