@@ -150,35 +150,6 @@ def test_a_late_tracker_and_messages_out_of_order(tmp_path, recording, mode):
 # Messages that do not fit
 
 
-def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
-    some = pose_messages(recording.poses)
-    for message in some[80:]:
-        message.pose.position.z += 0.02
-    words = cell.listen(String, 'calibration_node/status')
-    cell.play(part(recording, 0.0, 20.0))
-    cell.spin_until(lambda: words and '; 18 poses' in words[-1].data)
-    assert 'fit' not in words[-1].data
-    joints = topics(recording)['joint_states'][1000:]
-    cell.play({'joint_states': joints, 'measured_pose': some[80:]})
-    said = 'does not fit the others, was the target moved?'
-    cell.spin_until(lambda: said in words[-1].data)
-
-
-def test_poses_in_different_frames_are_refused(cell, recording):
-    some = pose_messages(recording.poses)
-    for message in some[40:70]:
-        message.header.frame_id = 'camera'
-    words = cell.listen(String, 'calibration_node/status')
-    cell.play(topics(recording, measured_pose=some))
-    cell.spin_until(lambda: words and 'different frames (camera, tracker)' in words[-1].data)
-    answer = cell.refused('identify')
-    assert 'different frames (camera, tracker)' in answer.message
-    assert 'set frame_id' in answer.message
-    assert cell.set_parameters({'frame_id': 'tracker'})[0].successful
-    answer = cell.call('identify')  # the advice helps, at once
-    assert answer.success, answer.message
-
-
 def test_poses_in_another_frame_than_frame_id_are_dropped(tmp_path, recording):
     some = pose_messages(recording.poses)
     some[40].header.frame_id = 'camera'
@@ -207,24 +178,6 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     missing = recording.joint_names if all_renamed else recording.joint_names[5:]
     whole = f'{said}{", ".join(sorted(names))}, not {", ".join(missing)}; '
     cell.spin_until(lambda: heard and whole in heard[-1].status[0].message)
-
-
-def test_broken_messages_are_counted_by_cause(cell, recording):
-    joints, poses = topics(recording).values()
-    joints[3].position[2] = float('nan')
-    joints[4].position.pop()
-    joints[5].header.stamp.sec = joints[5].header.stamp.nanosec = 0
-    poses[8].pose.position.x = float('inf')
-    poses[9].pose.orientation.w = 3.0
-    poses[10].pose.orientation.x = float('nan')
-    cell.play({'joint_states': joints, 'measured_pose': poses})
-    assert cell.node.session.account().dropped == {
-        'joints: NaN or infinite joint value': 1,
-        'joints: names and positions differ in number': 1,
-        'joints: zero stamp (fill header.stamp where it is published)': 1,
-        'measurements: NaN or infinite position': 1,
-        'measurements: quaternion not of length 1 (normalise it where it is published)': 2,
-    }
 
 
 def test_poses_that_no_identification_takes_are_told_by_the_status(cell, recording):
