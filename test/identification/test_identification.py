@@ -83,51 +83,6 @@ def test_standard_deviations_are_honest():
     assert np.mean(np.abs(scores) < 1.96) == pytest.approx(0.95, abs=0.015)
 
 
-def test_each_sample_is_weighted_by_its_own_covariance():
-    rng = np.random.default_rng(5)
-    true = faulty(UR10E, Cell(), rng)
-    joints = UR10E.random_joints(80, rng)
-    bad = np.arange(80) % 2 == 0
-    clean, noisy = (measure(true, joints, rng, s, 3 * s) for s in (2e-5, 2e-3))
-    seen = replace(
-        clean,
-        positions=np.where(bad[:, None], noisy.positions, clean.positions),
-        rotations=np.where(bad[:, None, None], noisy.rotations, clean.rotations),
-    )
-    sigmas = np.where(bad, 2e-3, 2e-5)[:, None] * [1, 1, 1, 3, 3, 3]
-    weighted = replace(seen, covariance=np.einsum('ni,ij->nij', sigmas**2, np.eye(6)))
-
-    def fit(observations):
-        return identify(Problem(UR10E, observations, loss='none'))
-
-    error = [
-        worst_prediction(fit(each).chain, true, np.random.default_rng(9))[0]
-        for each in (seen, weighted)
-    ]
-    assert error[1] < error[0] / 10
-    assert identify(Problem(UR10E, weighted)).noise.position == pytest.approx(1.0, abs=0.15)
-
-
-def test_a_covariance_equal_to_the_settings_changes_nothing():
-    rng = np.random.default_rng(6)
-    seen = measure(faulty(UR10E, Cell(), rng), UR10E.random_joints(40, rng), rng, 1e-4, 1e-4)
-    sigmas = np.repeat([2e-4, 5e-4], 3)
-    explicit = replace(seen, covariance=np.tile(np.diag(sigmas**2), (40, 1, 1)))
-    first = identify(Problem(UR10E, seen, sigma_position=2e-4, sigma_orientation=5e-4))
-    second = identify(Problem(UR10E, explicit))
-    np.testing.assert_allclose(first.chain.table, second.chain.table, rtol=0, atol=1e-10)
-
-
-def test_fixed_parameters_stay_nominal():
-    rng = np.random.default_rng(10)
-    seen = measure(faulty(UR10E, Cell(), rng), UR10E.random_joints(50, rng), rng)
-    result = identify(Problem(UR10E, seen, fixed=('*.alpha', 'elbow_joint.a')))
-    assert result.rank == 30 - 5 - 1
-    status = {p.name: (p.status, p.offset) for p in result.parameters}
-    assert status['elbow_joint.a'] == ('fixed', 0.0)
-    assert status['wrist_1_joint.alpha'] == ('fixed', 0.0)
-
-
 def test_too_few_pairs_say_how_many_are_needed():
     rng = np.random.default_rng(13)
     seen = measure(UR10E, UR10E.random_joints(4, rng), rng)

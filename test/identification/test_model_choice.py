@@ -158,27 +158,6 @@ def test_verdicts_name_every_group_that_can_show(rng):
     } - {'compliance', 'gear', 'backlash'}
 
 
-def test_gross_errors_do_not_choose_the_model(rng):
-    """The spoiled samples lie where one joint stands: a harmonic would explain them."""
-    true = arm_with('', rng)
-    seen = observed(true, UR10E.random_joints(120, rng), rng)
-    positions = seen.positions.copy()
-    wrong = np.argsort(np.abs(seen.joints[:, 1] - 1.0))[:12]
-    positions[wrong] += [0.0, 0.0, 10e-3]
-    auto = identify_model(Problem(UR10E, replace(seen, positions=positions), **SIGMAS), 'auto')
-    assert auto.chain.effects == ()
-    assert {outlier.sample for outlier in auto.outliers} == set(wrong.tolist())
-
-
-def test_auto_judges_by_configurations_and_not_by_samples(rng):
-    """A pose measured twenty times over is no evidence of twenty poses."""
-    true = arm_with('', rng)
-    once = observed(true, UR10E.random_joints(40, rng), rng)
-    often = once.select(np.repeat(np.arange(40), 20))
-    auto = identify_model(Problem(UR10E, often, **SIGMAS), 'auto')
-    assert auto.chain.effects == ()
-
-
 def test_auto_takes_several_sessions(rng):
     true = arm_with('eccentricity', rng)
     first = observed(true, UR10E.random_joints(100, rng), rng)

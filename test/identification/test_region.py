@@ -193,7 +193,6 @@ def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
         held.append(((along**2).sum(axis=1) <= 1.0).mean())
         ratios.append((error**2).sum(axis=1).mean() / (found.region.sigma(used) ** 2).mean())
     assert len(held) > 12
-    print(np.mean(held), np.mean(ratios))
     assert np.mean(held) > 0.9
     assert np.mean(ratios) < 1.25
 
