@@ -7,7 +7,7 @@ import shlex
 
 import numpy as np
 import pytest
-from recorded import MS, STORAGES, TYPES, header, pose, record, session_of, standing
+from recorded import MS, TYPES, header, pose, record, session_of, standing, storages
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_transforms import TIMES, frame, link, tf
@@ -16,7 +16,6 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.messages import JOINT_STATE, parse_source
 
-storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 MOCAP = 'mocap4r2_msgs/msg/RigidBodies'
 NAMED = 'motion_capture_tracking_interfaces/msg/NamedPoseArray'
 TEXTS = {

@@ -253,13 +253,3 @@ def test_a_recording_played_again_counts_one_jump_however_it_comes(seed):
             (seen, stamps(measured) + shift, where[:, :3, 3], where[:, :3, :3]),
         )
         assert session.account().notes.get('the clock jumped back', 0) == again
-
-
-def test_what_is_held_back_is_in_the_account(rng):
-    given = messages(rng)[:200]
-    session = CalibrationSession(ARM, Settings(lateness=0.5))
-    take(session, *(of_joints(message) for message in given if hasattr(message, 'position')))
-    take(session, (TRACKER, POSE, shifted(given[1], 500)))
-    account = session.account()
-    assert (account.poses, account.waiting) == (1, 1)
-    assert account.dropped == {}

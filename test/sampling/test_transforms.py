@@ -9,7 +9,6 @@ import pytest
 from recorded import (
     ARM,
     MS,
-    STORAGES,
     TYPES,
     TYPESTORE,
     joint_state,
@@ -17,6 +16,7 @@ from recorded import (
     record,
     session_of,
     standing,
+    storages,
     transform_stamped,
 )
 
@@ -29,7 +29,6 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.transforms import Linked, Links
 from calib_ros.settings import Settings
 
-storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 PLAIN = '/tf parent=world child=tool'
 TIMES = [105, 205, 333, 601]
 
