@@ -208,19 +208,6 @@ def test_a_device_out_of_scale_does_not_spoil_an_arm_of_small_errors(seed):
     assert identify(Problem(UR10E, seen)).accepted
 
 
-def test_the_region_is_kept_with_the_calibration(local, folder):
-    q = UR10E.random_joints(400, np.random.default_rng(3))
-    covered = local.region.covers(q)
-    assert 0.1 < covered.mean() < 0.9
-    for path in (folder, folder / 'calibration.yaml'):
-        read = load_calibration(path, UR10E).region
-        np.testing.assert_allclose(read.sigma(q), local.region.sigma(q), rtol=1e-6)
-        assert read.limit == local.region.limit
-        assert read.share == local.region.share
-        np.testing.assert_array_equal(read.covers(q), covered)
-        assert (read.base, read.tool) == (local.region.base, local.region.tool)
-
-
 @pytest.mark.parametrize(
     'change',
     [
