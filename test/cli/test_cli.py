@@ -99,25 +99,6 @@ def test_out_writes_every_file(written):
     assert 'wrist_1_joint.theta' in files['report.md'].decode()
 
 
-def test_nothing_is_overwritten_without_force(run, table, tmp_path):
-    out, there = tmp_path / 'out', 'report.md'
-    out.mkdir()
-    (out / there).write_text('precious')
-    (out / 'notes.txt').write_text('mine')
-    before = contents(out)
-    arguments = ('identify', '--csv', table, '--chain', 'ur5e', '--out', out)
-    status, said, err = run(*arguments)
-    assert (status, said) == (1, '')
-    assert there in err
-    assert '--force' in err
-    assert contents(out) == before
-    assert run(*arguments, '--force')[0] == 0
-    after = contents(out)
-    assert after.keys() == {*RESULT_FILES, 'notes.txt'}
-    assert after['notes.txt'] == b'mine'
-    assert after[there] != b'precious'
-
-
 def test_the_corrected_chain_is_a_chain_that_predicts(identified, table, written):
     out, _ = written
     corrected = load_chain(out / 'calibration.yaml')

@@ -2,15 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy when something goes wrong: dead sources, wrong messages."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_cell import (
-    STOPS,
     Cell,
     assert_same,
     direct,
@@ -106,28 +103,6 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     wait_for(silent, wanted=False)
     alive.clear()
     wait_for('no more messages on /joint_states')
-
-
-def test_a_bag_that_is_played_again(cell, recording):
-    cell.play(topics(recording))
-    cell.node.session.problem()
-    before = {sample.stamp_ns for sample in cell.node.session.samples}
-    hour = 3_600_000_000_000
-    earlier = replace(
-        recording,
-        joint_stamps_ns=recording.joint_stamps_ns - hour,
-        poses=recording.poses.at(recording.poses.stamps_ns - hour),
-    )
-    for jumps, played, new in ((1, recording, 1), (2, earlier, STOPS)):
-        cell.play(topics(played))
-        cell.node.session.problem()
-        account = cell.node.session.account()
-        assert account.notes['the clock jumped back'] == jumps
-        fresh = {sample.stamp_ns for sample in cell.node.session.samples} - before
-        # The measurements before the jump shows are lost: the first stop gets another stamp.
-        assert new - 1 <= len(fresh) <= new
-        before |= fresh
-    cell.done('identify')
 
 
 @pytest.mark.parametrize('mode', ['dwell', 'continuous'])

@@ -174,30 +174,6 @@ def test_a_bag_tells_what_stands_still_even_at_its_end(tmp_path, rng, storage):
     assert session.account().dropped == {}
 
 
-def test_names_with_a_slash_before_them_are_the_same(tmp_path, rng):
-    moving = [tf(link('/world', '/tool', 105 * MS, frame(rng)))]
-    found, _ = poses_of(
-        record(tmp_path / 'bag', events(rng, moving)), '/tf parent=/world child=tool'
-    )
-    assert len(found) == 1
-
-
-def test_several_targets_on_one_topic(tmp_path, rng):
-    both = [
-        tf(link('world', 'a', ms * MS, frame(rng)), link('world', 'b', ms * MS, frame(rng)))
-        for ms in TIMES
-    ]
-    path = record(tmp_path / 'bag', events(rng, both))
-    session, _ = session_of(
-        path, sources=('/tf parent=world child=a', '/tf parent=world child=b validation=true')
-    )
-    fitted, judging = (
-        [each.target for each in session.samples if each.validation is held]
-        for held in (False, True)
-    )
-    assert (fitted, judging) == (['a'] * 4, ['b'] * 4)
-
-
 def refusal(path, *sources):
     with pytest.raises(InputError) as caught:
         session_of(path, sources=sources or (PLAIN,))
