@@ -12,6 +12,7 @@ from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, U
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.robust import LOSSES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 
@@ -102,6 +103,9 @@ def test_problems_that_make_no_sense_are_refused():
         Problem(UR10E, seen, fixed=('base.x',))
     with pytest.raises(ConfigError, match='sigma_position'):
         Problem(UR10E, seen, sigma_position=0.0)
+    with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
+        Problem(UR10E, seen, loss='hubert')
+    assert caught.value.alternatives == LOSSES
     with pytest.raises(InputError, match='6 joints'):
         Problem(UR10E, Observations.from_arrays(np.zeros((5, 7)), np.zeros((5, 3))))
 
@@ -236,18 +240,13 @@ def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given():
         ('folds', 2.5),
         ('fixed', 'shoulder_pan_joint.a'),
         ('effects', 'gravity'),
+        ('more', Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3)))),  # is no list
     ],
 )
 def test_settings_of_another_type_are_refused(setting, value):
     _, _, seen = measured_arm(1, 12)
     with pytest.raises(ConfigError, match=setting):
         Problem(UR10E, seen, **{setting: value})
-
-
-def test_one_set_is_no_list_of_further_ones():
-    _, _, seen = measured_arm(1, 12)
-    with pytest.raises(ConfigError, match='more must be a list'):
-        Problem(UR10E, seen, more=seen)
 
 
 def test_velocities_of_an_arm_that_stands_are_none():

@@ -9,7 +9,6 @@ from fits import NO_PRIOR, NOISE, SIGMAS, UR10E, fitted, measured_arm, rms
 from scipy import special, stats
 
 from calib_ros.apply.simulation import measure, random_frame
-from calib_ros.errors import UnknownNameError
 from calib_ros.identification import robust
 from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import System, minimise
@@ -250,13 +249,6 @@ def test_the_noise_and_the_uncertainty_are_those_of_the_good_samples(unsearched)
     assert result.noise.consistent
     ratio = result.pose_covariance(unseen) / best.pose_covariance(unseen)
     assert np.median(np.abs(ratio)) == pytest.approx(1.0, abs=0.05)
-
-
-def test_an_unknown_loss_is_named():
-    *_, seen, _ = cell(0)
-    with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
-        Problem(UR10E, seen, loss='hubert')
-    assert caught.value.alternatives == LOSSES
 
 
 def test_weights_that_swing_come_to_rest(monkeypatch):

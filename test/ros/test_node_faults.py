@@ -9,8 +9,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_cell import (
     Cell,
-    assert_same,
-    direct,
     joint_messages,
     part,
     pose_messages,
@@ -103,23 +101,6 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     wait_for(silent, wanted=False)
     alive.clear()
     wait_for('no more messages on /joint_states')
-
-
-@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
-def test_a_late_tracker_and_messages_out_of_order(tmp_path, recording, mode):
-    expected = direct(recording, mode=mode).problem().observations
-    parameters = {'chain': 'ur10e', 'mode': mode, 'data_dir': str(tmp_path)}
-    with Cell(**parameters) as cell:
-        cell.play(topics(recording), late_ns=200_000_000)
-        assert_same(expected, cell.node.session.problem().observations)
-        account = cell.node.session.account()
-        assert (account.dropped, account.notes) == ({}, {})
-        cell.done('clear')
-        cell.play(topics(recording), jitter=np.random.default_rng(4))
-        assert_same(expected, cell.node.session.problem().observations)
-        account = cell.node.session.account()
-        assert account.dropped == {}
-        assert account.notes['joints with a stamp older than the one before'] > 100
 
 
 # Messages that do not fit
