@@ -68,9 +68,9 @@ def transform_stamped(
     return kind(header(stamp_ns), child, transform)
 
 
-def pose_with_covariance(stamp_ns, covariance):
+def pose_with_covariance(stamp_ns, covariance, where=()):
     covariance = np.array(covariance, dtype=float).ravel()
-    with_covariance = TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(), covariance)
+    with_covariance = TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(*where), covariance)
     kind = TYPES['geometry_msgs/msg/PoseWithCovarianceStamped']
     return kind(header(stamp_ns), with_covariance)
 

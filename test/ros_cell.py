@@ -187,37 +187,20 @@ class Cell:
             self._publishers[key] = publisher
         return self._publishers[key]
 
-    def play(
-        self,
-        streams,
-        reliability=ReliabilityPolicy.RELIABLE,
-        node=None,
-        late_ns=0,
-        jitter=None,
-    ):
+    def play(self, streams, reliability=ReliabilityPolicy.RELIABLE, node=None):
         """Publish messages by topic in the order of their stamps, as a bag or a robot does.
 
-        All but joint states come `late_ns` later than their stamps; a generator `jitter` makes
-        everything come up to 0.3 s late. Returns when the node has taken all; a node in a child
-        process is not waited for.
+        Returns when the node has taken all; a node in a child process is not waited for.
         """
         node = node or self.node
         queue = []
         for topic, messages in streams.items():
             publisher = self.publisher(type(messages[0]), topic, reliability)
             stream = 'joints' if isinstance(messages[0], JointState) else 'measurements'
-            late = 0 if stream == 'joints' else late_ns
-            queue += [(stamp_ns(m) + late, stream, publisher, m) for m in messages]
-        burst_ns = BURST_NS - late_ns
-        if jitter is not None:
-            burst_ns -= 300_000_000
-            late = jitter.integers(0, 300_000_000, len(queue))
-            queue = [
-                (item[0] + int(more), *item[1:]) for item, more in zip(queue, late, strict=True)
-            ]
+            queue += [(stamp_ns(m), stream, publisher, m) for m in messages]
         queue.sort(key=lambda item: item[0])
         with self.without_reports():
-            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // burst_ns):
+            for _, burst in itertools.groupby(queue, key=lambda item: item[0] // BURST_NS):
                 wanted = node.session.received.copy() if node else {}
                 for _, stream, publisher, message in burst:
                     publisher.publish(message)

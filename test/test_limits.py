@@ -5,20 +5,16 @@
 import itertools
 import os
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
 
-from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
 from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.programs import read_program
 from calib_ros.files.tables import read_journal, read_table
-from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
@@ -224,17 +220,6 @@ def test_a_covariance_that_is_none_is_refused_everywhere(tmp_path, bad):
     with pytest.raises(InputError, match=r'line 2: c11 \.\.\. c66: covariance'):
         read_table(table(tmp_path, upper(bad)), 2)
     assert any('covariance' in cause for cause in fault(bad))
-
-
-def test_a_covariance_of_the_position_alone_is_identified(rng):
-    q = ARM.random_joints(30, rng)
-    plain = measure(ARM.with_offsets({'b.a': 1e-3}), q, rng, 1e-5, 1e-4)
-    found = []
-    for rotation in (0.0, 1e-8):
-        covariance = np.tile(np.diag([1e-10] * 3 + [rotation] * 3), (30, 1, 1))
-        problem = Problem(ARM, replace(plain, covariance=covariance), sigma_orientation=1e-4)
-        found.append(identify(problem).chain.value('b.a'))
-    assert found[0] == pytest.approx(found[1], abs=1e-12)
 
 
 @pytest.mark.parametrize(

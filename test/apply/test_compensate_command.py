@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from commanded import ROBOTS, UR, UR_TRUE, regular
+from commanded import UR, UR_TRUE, regular
 
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
@@ -18,7 +18,6 @@ from calib_ros.files.programs import joints_csv, read_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
-from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
@@ -98,23 +97,6 @@ def test_the_whole_way_from_identification_to_program(run, tmp_path, oriented):
         np.linalg.norm(true.forward(each)[:, :3, 3] - wanted, axis=1) for each in (joints, q)
     )
     assert np.sqrt(np.mean(after**2)) < 2e-4 < 1e-3 < before.max()
-
-
-def test_other_calibrations_are_refused(run, tmp_path):
-    """Of chains given the wrong way round the correction would double the error.
-
-    From a cousin a tenth of the poses could be corrected, by centimetres.
-    """
-    (tmp_path / 'nominal.yaml').write_text(dump_chain(UR))
-    status, _, err = run(TABLE, '--calibration', 'nominal.yaml', chain='calibration.yaml')
-    assert status == 1
-    assert 'is a chain, but not a calibration' in err
-    record = {'accepted': True, 'nominal': nominal_document(ROBOTS['ur10'])}
-    (tmp_path / 'calibration.yaml').write_text(dump_chain(ROBOTS['ur10'], record))
-    status, _, err = run(TABLE)
-    assert status == 1
-    assert 'identified from another nominal chain' in err
-    assert not (tmp_path / 'out.csv').exists()
 
 
 def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):

@@ -244,6 +244,7 @@ def test_what_a_redundant_arm_reaches_within_its_limits_is_not_refused(name):
     reached &= (np.abs(found.correction) <= compensator.largest).all(axis=1)
     assert not reached[[each.sample for each in found.refusals]].any()
     too_far = [each.reason for each in found.refusals if 'would need' in each.reason]
+    assert too_far
     assert all('more than 0.1 rad' in each for each in too_far)
     assert not any('leave 0.0000 mm and 0.0000 mrad' in each.reason for each in found.refusals)
 

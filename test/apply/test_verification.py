@@ -283,13 +283,6 @@ def test_a_target_that_was_mounted_anew(cell, arm, oriented):
         verify(arm, [seen[0].select(np.arange(7))], 3e-4, new_base=True, new_tool=True)
 
 
-def test_a_new_target_alone(cell, arm):
-    true = cell[0]
-    moved = replace(true, tool=simulation.random_frame(np.random.default_rng(10), 0.3))
-    joints = UR.random_joints(40, np.random.default_rng(3))
-    assert verify(arm, [measured(moved, joints)], 3e-4, new_tool=True).verdict == 'PASS'
-
-
 def test_the_better_calibration_wins_on_a_session_of_its_own(cell, arm):
     """With a tool of an earlier session, the worse one may look better."""
     true, result, _ = cell

@@ -7,17 +7,15 @@ import numpy as np
 import pytest
 from surveyed import TASK, UR, calibrated, identified
 
-from calib_ros.apply import simulation, workspace
+from calib_ros.apply import workspace
 from calib_ros.apply.workspace import regions, survey
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.files.programs import csv_of, read_joints, read_poses
 from calib_ros.identification.calibration import Calibration, load_calibration
-from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
-from calib_ros.kinematics.se3 import to_quat, transform
+from calib_ros.kinematics.se3 import to_quat
 
 # What is removed and what remains
 
@@ -222,19 +220,3 @@ def test_workspace_refuses_what_makes_no_sense(run, folder, tmp_path, arguments,
     assert (status, out) == (1, '')
     assert text in err
     assert not (tmp_path / 'map').exists()
-
-
-def test_a_program_that_the_calibration_does_not_know_is_told(rng):
-    """Positions of a target on the last axis tell next to nothing of the flange's orientation."""
-    true = replace(
-        simulation.faulty(UR, simulation.Cell(), rng),
-        tool=Frame(transform(np.eye(3), np.array([0.0, 0.0, 0.1]))),
-    )
-    for oriented, known in ((True, True), (False, False)):
-        seen = simulation.measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4, oriented)
-        arm = Calibration.of(identify(Problem(UR, seen)))
-        words, warning = arm.knowledge(UR.random_joints(5, rng), np.full(5, 1e-3))
-        assert words.startswith('the calibration knows these poses to 0.')
-        assert ('does not know the orientation' in warning) is not known
-    alone = replace(arm, names=(), covariance=None)
-    assert alone.knowledge(UR.random_joints(5, rng), np.full(5, 1e-3)) == ('', '')

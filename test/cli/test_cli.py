@@ -10,12 +10,11 @@ import pytest
 import yaml
 from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 
-from calib_ros.apply import simulation
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
 from calib_ros.identification.calibration import load_calibration
-from calib_ros.kinematics.chain_file import dump_chain, load_chain
+from calib_ros.kinematics.chain_file import load_chain
 
 
 @pytest.fixture(scope='module')
@@ -100,25 +99,6 @@ def test_out_writes_every_file(written):
     assert 'wrist_1_joint.theta' in files['report.md'].decode()
 
 
-def test_nothing_is_overwritten_without_force(run, table, tmp_path):
-    out, there = tmp_path / 'out', 'report.md'
-    out.mkdir()
-    (out / there).write_text('precious')
-    (out / 'notes.txt').write_text('mine')
-    before = contents(out)
-    arguments = ('identify', '--csv', table, '--chain', 'ur5e', '--out', out)
-    status, said, err = run(*arguments)
-    assert (status, said) == (1, '')
-    assert there in err
-    assert '--force' in err
-    assert contents(out) == before
-    assert run(*arguments, '--force')[0] == 0
-    after = contents(out)
-    assert after.keys() == {*RESULT_FILES, 'notes.txt'}
-    assert after['notes.txt'] == b'mine'
-    assert after[there] != b'precious'
-
-
 def test_the_corrected_chain_is_a_chain_that_predicts(identified, table, written):
     out, _ = written
     corrected = load_chain(out / 'calibration.yaml')
@@ -129,20 +109,6 @@ def test_the_corrected_chain_is_a_chain_that_predicts(identified, table, written
     _, document = identified('--csv', table, '--chain', out / 'calibration.yaml')
     before, after = (document['validation'][when]['rms_mm'] for when in ('before', 'after'))
     assert before == pytest.approx(after, abs=1e-4)
-
-
-def test_rows_marked_test_never_influence_the_fit(unsearched, identified, tmp_path):
-    rows = rows_of(measured())
-    _, expected = identified('--csv', write_csv(tmp_path / 'a.csv', rows), '--chain', 'ur5e')
-    rng = np.random.default_rng(1)
-    for row in rows[TRAIN:]:
-        row.update({key: float(rng.uniform(-3.0, 3.0)) for key in ('q1', 'q4', 'x', 'y', 'z')})
-        row.update(qx=0.0, qy=1.0, qz=0.0, qw=0.0)
-    status, wild = identified('--csv', write_csv(tmp_path / 'b.csv', rows), '--chain', 'ur5e')
-    assert status == Status.NOT_ACCEPTED
-    for key in ('parameters', 'fitted', 'rank', 'unidentifiable', 'iterations', 'noise_in_sigma'):
-        assert wild[key] == expected[key]
-    assert wild['validation']['after']['rms_mm'] > 100.0
 
 
 @pytest.mark.parametrize(
@@ -223,18 +189,6 @@ def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, wri
     assert 'no gain on held-out poses' in (out / 'report.md').read_text()
 
 
-def test_one_joint_that_never_moved_is_named(run, tmp_path):
-    rng = np.random.default_rng(2)
-    joints = UR.random_joints(30, rng)
-    joints[:, 3] = 0.7
-    table = write_csv(
-        tmp_path / 'cell.csv', rows_of(simulation.measure(TRUE, joints, rng, 5e-5, 2e-4), 0)
-    )
-    status, out, _ = run('identify', '--csv', table, '--chain', 'ur5e')
-    assert status == Status.NOT_ACCEPTED
-    assert 'the poses do not determine' in out
-
-
 def test_fixed_parameters_stay_nominal(identified, table):
     _, document = identified('--csv', table, '--chain', 'ur5e', '--fixed', '*.alpha,elbow*.a')
     parameters = document['parameters']
@@ -244,38 +198,6 @@ def test_fixed_parameters_stay_nominal(identified, table):
         assert parameters[name]['offset'] == 0.0
         assert parameters[name]['value'] == UR.value(name)
         assert name not in document['unidentifiable']
-
-
-def test_one_session_of_several(identified, run, tmp_path):
-    rows = [{'session': 'A', **row} for row in rows_of(measured())]
-    rows += [{'session': 'B', **row} for row in rows_of(measured(UR, seed=8))]
-    table = write_csv(tmp_path / 'cell.csv', rows)
-    status, _, err = run('identify', '--csv', table, '--chain', 'ur5e')
-    assert status == 1
-    assert 'A, B' in err
-    assert identified('--csv', table, '--chain', 'ur5e', '--session', 'A')[0] == 0
-    status, *_ = identified('--csv', table, '--chain', 'ur5e', '--session', 'B')
-    assert status == Status.NOT_ACCEPTED
-
-
-def test_joint_names_map_those_of_the_bag_to_the_chain(run, identified, table, tmp_path):
-    renamed = dump_chain(UR)
-    for name in UR.joint_names:
-        renamed = renamed.replace(name, f'dh_{name[:-6]}')
-    (tmp_path / 'dh.yaml').write_text(renamed)
-    run('csv2bag', table, tmp_path / 'bag', '--chain', 'ur5e')
-    status, _, err = run('identify', tmp_path / 'bag', '--chain', 'dh.yaml')
-    assert status == 1
-    assert 'none of the joints in the message' in err
-    assert 'joint_names' in err
-    _, expected = identified(tmp_path / 'bag', '--chain', 'ur5e')
-    _, found = identified(
-        tmp_path / 'bag', '--chain', 'dh.yaml', '--joint-names', ','.join(UR.joint_names)
-    )
-    assert 'dh_elbow.a' in found['parameters']
-    for old, new in zip(expected['parameters'].items(), found['parameters'].items(), strict=True):
-        assert new[0].replace('dh_', '') == old[0].replace('_joint', '')
-        assert new[1] == old[1]
 
 
 def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_path):

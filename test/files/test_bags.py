@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from collections import Counter
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from recorded import (
-    ARM,
     MS,
     account_of,
     assert_equal,
@@ -28,10 +26,8 @@ from recorded import (
 from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
-from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag
-from calib_ros.sampling.messages import JOINT_STATE, reading
-from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.messages import JOINT_STATE
 
 
 @storages
@@ -322,25 +318,3 @@ def test_stamps_going_backwards_lose_nothing_and_are_noted(tmp_path):
     note = 'measurements with a stamp older than the one before'
     assert session.account().notes == {note: 2}
     assert f'note: 2 x {note}' in str(session.account())
-
-
-def test_a_session_that_does_not_record_counts_what_it_leaves_out(tmp_path):
-    path = record(tmp_path / 'bag', standing([pose_stamped(105 * MS)]))
-    session = CalibrationSession(ARM)
-    session.recording = False
-    replay(path, session)
-    assert session.account().unused == {
-        'joints: not recording': 100,
-        'measurements: not recording': 1,
-    }
-
-
-def test_messages_are_read_by_their_attributes_only():
-    # What rclpy delivers is another class with the same attributes.
-    stamp = SimpleNamespace(sec=1, nanosec=5)
-    message = SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp, frame_id='tracker'),
-        point=SimpleNamespace(x=1, y=2, z=3),
-    )
-    found = reading('geometry_msgs/msg/PointStamped', message)
-    assert found == (1_000_000_005, ('tracker',), (1, 2, 3))

@@ -1,12 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -261,40 +256,18 @@ def test_what_a_crash_left_behind_the_last_row_is_cut_off(tmp_path, tail):
     assert path.read_bytes() == rows
 
 
-WRITER = """
-import sys
-from pathlib import Path
-import numpy as np
-from calib_ros.files.archive import Journal
-from calib_ros.sampling.sample import Sample
-journal = Journal(Path(sys.argv[1]), 3)
-for number in range(1, 10**7):
-    journal.add(Sample(number, np.full(3, 0.1 * number), position=np.full(3, 1.0 / number)))
-    if number == 20:
-        print('running', flush=True)
-"""
-
-
-def test_a_killed_process_leaves_all_whole_rows(tmp_path):
-    path = tmp_path / 'cell.csv'
-    for attempt in range(2):
-        process = subprocess.Popen(
-            [sys.executable, '-c', WRITER, path],
-            stdout=subprocess.PIPE,
-            env=os.environ | {'PYTHONPATH': str(Path(__file__).parents[2])},
-        )
-        assert process.stdout.readline() == b'running\n'
-        time.sleep(0.03 * attempt)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        process.stdout.close()
-        found, warnings = read_journal(path, JOINTS)
-        assert warnings == ()
-        assert [each.stamp_ns for each in found] == list(range(1, len(found) + 1))
-        assert len(found) >= 20
-        last = found[-1]
-        assert last.position.tolist() == [1.0 / last.stamp_ns] * 3
-        path.unlink()
+def test_each_row_is_written_by_one_call_and_at_once(tmp_path, monkeypatch):
+    """So that a process that is killed leaves whole rows, and all of them."""
+    calls, write = [], os.write
+    monkeypatch.setattr(os, 'write', lambda file, data: calls.append(data) or write(file, data))
+    journal = Journal(tmp_path / 'cell.csv', JOINTS)
+    for number in (1, 2):
+        journal.add(plain(number))
+        assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0][number - 1 :], [plain(number)])
+    journal.close()
+    assert b''.join(calls) == (tmp_path / 'cell.csv').read_bytes()
+    assert [data.count(b'\n') for data in calls] == [1, 1, 1]  # the header's, too
+    assert all(data.endswith(b'\n') for data in calls)
 
 
 @pytest.mark.parametrize('room', [0, 1, 50])

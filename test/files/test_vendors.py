@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from urdfs import PANDA, UR10E, by_kinpy
+from urdfs import PANDA, UR10E, ZERO, Z, arm as serial_arm, by_kinpy, ur10e
 
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import ConfigError
@@ -34,56 +34,23 @@ def arm(chain):
     return replace(chain, base=Frame(), tool=Frame(), frames=(), effects=())
 
 
-def joint(name, kind, parent, child, pose, axis=''):
-    x, y, z, roll, pitch, yaw = (pose[key] for key in NUMBERS)
-    limit = '<limit lower="-3" upper="3" effort="1" velocity="1"/>' if axis else ''
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{x!r} {y!r} {z!r}" rpy="{roll!r} {pitch!r} {yaw!r}"/>{axis}{limit}</joint>'
-    )
-
-
-def pose(**values):
-    return dict.fromkeys(NUMBERS, 0.0) | values
+def origins(rows):
+    values = ([row[key] for key in NUMBERS] for row in rows)
+    return [(each[:3], each[3:]) for each in values]
 
 
 def ur_description(text):
     """Return the URDF that ur_description makes of a file, without what is drawn."""
     poses = yaml.safe_load(text)['kinematics']
-    z = '<axis xyz="0 0 1"/>'
-    links = ['base_link', 'base_link_inertia']
-    links += [f'{key}_link' for key in vendors.UR.keys]
-    parts = [joint('base', 'fixed', links[0], links[1], pose(yaw=np.pi))]
-    for k, (name, key) in enumerate(zip(vendors.UR.joints, vendors.UR.keys, strict=True)):
-        parts.append(joint(name, 'revolute', links[k + 1], links[k + 2], poses[key], z))
-    parts.append(
-        joint('flange', 'fixed', 'wrist_3_link', 'flange', pose(pitch=-np.pi / 2, yaw=-np.pi / 2))
-    )
-    turn = pose(roll=np.pi / 2, yaw=np.pi / 2)
-    parts.append(joint('tool', 'fixed', 'flange', 'tool0', turn))
-    return described([*links, 'flange', 'tool0'], parts)
+    return ur10e(origins(poses[key] for key in vendors.UR.keys))
 
 
 def franka_description(text, name):
-    poses = yaml.safe_load(text)
-    links = [f'link{k}' for k in range(9)]
-    parts = [
-        joint(
-            f'{name}_joint{k}',
-            'revolute' if k < 8 else 'fixed',
-            links[k - 1],
-            links[k],
-            poses[f'joint{k}']['kinematic'],
-            '<axis xyz="0 0 1"/>' if k < 8 else '',
-        )
-        for k in range(1, 9)
-    ]
-    return described(links, parts)
-
-
-def described(links, parts):
-    parts = [*(f'<link name="{name}"/>' for name in links), *parts]
-    return f'<robot name="r">{"".join(parts)}</robot>'
+    poses, links = yaml.safe_load(text), [f'link{k}' for k in range(8)]
+    *moving, last = origins(poses[f'joint{k}']['kinematic'] for k in range(1, 9))
+    joints, ends = [f'{name}_joint{k}' for k in range(1, 8)], [(-3.0, 3.0)] * 7
+    flange = (f'{name}_joint8', 'fixed', 'link7', 'link8', *last, ZERO)
+    return serial_arm(name, links, [Z] * 7, moving, joints, ends, flange)
 
 
 def poses_of(text, names, q):
@@ -206,7 +173,7 @@ def test_the_hash_is_that_of_the_robot_or_of_the_numbers():
 
 def test_a_file_that_differs_is_refused(monkeypatch):
     nominal = load_chain('ur10e')
-    monkeypatch.setattr(vendors.export, 'xyz_rpy', lambda matrix: pose())
+    monkeypatch.setattr(vendors.export, 'xyz_rpy', lambda matrix: dict.fromkeys(NUMBERS, 0.0))
     with pytest.raises(ExportError, match=r'ur_kinematics\.yaml, read back, differs'):
         vendor_files(nominal, nominal)
 

@@ -41,15 +41,6 @@ def test_no_gain_is_claimed_where_there_is_none():
     assert by_chance
 
 
-def test_the_chain_file_of_another_robot_is_not_accepted():
-    rng = np.random.default_rng(15)
-    true = faulty(load_chain('ur5e'), Cell(), rng)
-    seen = measure(true, UR10E.random_joints(60, rng), rng, 2e-5, 5e-5)
-    result = identify(Problem(UR10E, seen))
-    assert not result.accepted
-    assert Rule.COMMON_SENSE in {each.rule for each in result.refusals}
-
-
 def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():
     rng = np.random.default_rng(17)
     true = faulty(UR10E, Cell(), rng)

@@ -150,10 +150,9 @@ def test_a_nominal_chain_with_other_effects_is_another(document):
 
 @pytest.mark.parametrize('told', ['no', 0, None])
 def test_what_is_neither_accepted_nor_refused_is_refused(told):
-    nominal = load_chain('ur10e')
-    text = calibrated_text(nominal, {'nominal': nominal_document(nominal), 'accepted': told})
+    text = calibrated_text(UR, {'nominal': nominal_document(UR), 'accepted': told})
     with pytest.raises(ConfigError, match=r'c\.yaml: calibration\.accepted must be true or false'):
-        parse_calibration(text, 'c.yaml', nominal)
+        parse_calibration(text, 'c.yaml', UR)
 
 
 def calibrated_text(nominal, record):
@@ -162,13 +161,12 @@ def calibrated_text(nominal, record):
 
 
 def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
-    nominal = load_chain('ur10e')
-    record = {'accepted': True, 'nominal': nominal_document(nominal)}
-    (tmp_path / 'calibration.yaml').write_text(calibrated_text(nominal, record))
+    record = {'accepted': True, 'nominal': nominal_document(UR)}
+    (tmp_path / 'calibration.yaml').write_text(calibrated_text(UR, record))
     for path in (tmp_path, tmp_path / 'calibration.yaml', str(tmp_path)):
-        found = load_calibration(path, nominal)
+        found = load_calibration(path, UR)
         assert found.record == record
-        assert found.chain.joints[1].a == pytest.approx(nominal.joints[1].a + 1e-3, abs=1e-12)
+        assert found.chain.joints[1].a == pytest.approx(UR.joints[1].a + 1e-3, abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -192,14 +190,13 @@ def test_what_is_no_calibration_of_a_nominal_chain_is_refused(nominal, record, m
 
 def test_a_record_in_another_convention_is_taken_as_it_is():
     """Its numbers cannot be compared with those of the nominal chain."""
-    nominal = load_chain('ur10e')
     record = {'nominal': nominal_document(load_chain('franka_fr3'))}
     assert record['nominal']['convention'] == 'modified'
-    found = parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    found = parse_calibration(calibrated_text(UR, record), 'c.yaml', UR)
     assert found.record == record
-    assert found.chain.joint_names == nominal.joint_names
+    assert found.chain.joint_names == UR.joint_names
     with pytest.raises(ConfigError, match='give that with --chain'):
-        parse_calibration(calibrated_text(nominal, record), 'c.yaml')
+        parse_calibration(calibrated_text(UR, record), 'c.yaml')
 
 
 def test_a_calibration_too_far_from_its_nominal_chain_is_refused():
@@ -241,11 +238,10 @@ def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identi
     ],
 )
 def test_a_record_by_which_nothing_can_be_judged_is_refused(key, value):
-    nominal = load_chain('ur10e')
-    record = {'nominal': nominal_document(nominal), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
-    parse_calibration(calibrated_text(nominal, record), 'c.yaml', nominal)
+    record = {'nominal': nominal_document(UR), 'rms_mm_after': 0.1, 'world_frame': 'tracker'}
+    parse_calibration(calibrated_text(UR, record), 'c.yaml', UR)
     with pytest.raises(ConfigError, match=f'c.yaml: calibration.{key} must be'):
-        parse_calibration(calibrated_text(nominal, record | {key: value}), 'c.yaml', nominal)
+        parse_calibration(calibrated_text(UR, record | {key: value}), 'c.yaml', UR)
 
 
 @pytest.mark.parametrize('rows', [['1', '2', '3 4 5'], ['1', '2 3', '4 5'], ['1', '2 3']])

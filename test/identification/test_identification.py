@@ -12,6 +12,7 @@ from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, U
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.robust import LOSSES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 
@@ -83,51 +84,6 @@ def test_standard_deviations_are_honest():
     assert np.mean(np.abs(scores) < 1.96) == pytest.approx(0.95, abs=0.015)
 
 
-def test_each_sample_is_weighted_by_its_own_covariance():
-    rng = np.random.default_rng(5)
-    true = faulty(UR10E, Cell(), rng)
-    joints = UR10E.random_joints(80, rng)
-    bad = np.arange(80) % 2 == 0
-    clean, noisy = (measure(true, joints, rng, s, 3 * s) for s in (2e-5, 2e-3))
-    seen = replace(
-        clean,
-        positions=np.where(bad[:, None], noisy.positions, clean.positions),
-        rotations=np.where(bad[:, None, None], noisy.rotations, clean.rotations),
-    )
-    sigmas = np.where(bad, 2e-3, 2e-5)[:, None] * [1, 1, 1, 3, 3, 3]
-    weighted = replace(seen, covariance=np.einsum('ni,ij->nij', sigmas**2, np.eye(6)))
-
-    def fit(observations):
-        return identify(Problem(UR10E, observations, loss='none'))
-
-    error = [
-        worst_prediction(fit(each).chain, true, np.random.default_rng(9))[0]
-        for each in (seen, weighted)
-    ]
-    assert error[1] < error[0] / 10
-    assert identify(Problem(UR10E, weighted)).noise.position == pytest.approx(1.0, abs=0.15)
-
-
-def test_a_covariance_equal_to_the_settings_changes_nothing():
-    rng = np.random.default_rng(6)
-    seen = measure(faulty(UR10E, Cell(), rng), UR10E.random_joints(40, rng), rng, 1e-4, 1e-4)
-    sigmas = np.repeat([2e-4, 5e-4], 3)
-    explicit = replace(seen, covariance=np.tile(np.diag(sigmas**2), (40, 1, 1)))
-    first = identify(Problem(UR10E, seen, sigma_position=2e-4, sigma_orientation=5e-4))
-    second = identify(Problem(UR10E, explicit))
-    np.testing.assert_allclose(first.chain.table, second.chain.table, rtol=0, atol=1e-10)
-
-
-def test_fixed_parameters_stay_nominal():
-    rng = np.random.default_rng(10)
-    seen = measure(faulty(UR10E, Cell(), rng), UR10E.random_joints(50, rng), rng)
-    result = identify(Problem(UR10E, seen, fixed=('*.alpha', 'elbow_joint.a')))
-    assert result.rank == 30 - 5 - 1
-    status = {p.name: (p.status, p.offset) for p in result.parameters}
-    assert status['elbow_joint.a'] == ('fixed', 0.0)
-    assert status['wrist_1_joint.alpha'] == ('fixed', 0.0)
-
-
 def test_too_few_pairs_say_how_many_are_needed():
     rng = np.random.default_rng(13)
     seen = measure(UR10E, UR10E.random_joints(4, rng), rng)
@@ -147,6 +103,9 @@ def test_problems_that_make_no_sense_are_refused():
         Problem(UR10E, seen, fixed=('base.x',))
     with pytest.raises(ConfigError, match='sigma_position'):
         Problem(UR10E, seen, sigma_position=0.0)
+    with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
+        Problem(UR10E, seen, loss='hubert')
+    assert caught.value.alternatives == LOSSES
     with pytest.raises(InputError, match='6 joints'):
         Problem(UR10E, Observations.from_arrays(np.zeros((5, 7)), np.zeros((5, 3))))
 
@@ -281,18 +240,13 @@ def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given():
         ('folds', 2.5),
         ('fixed', 'shoulder_pan_joint.a'),
         ('effects', 'gravity'),
+        ('more', Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3)))),  # is no list
     ],
 )
 def test_settings_of_another_type_are_refused(setting, value):
     _, _, seen = measured_arm(1, 12)
     with pytest.raises(ConfigError, match=setting):
         Problem(UR10E, seen, **{setting: value})
-
-
-def test_one_set_is_no_list_of_further_ones():
-    _, _, seen = measured_arm(1, 12)
-    with pytest.raises(ConfigError, match='more must be a list'):
-        Problem(UR10E, seen, more=seen)
 
 
 def test_velocities_of_an_arm_that_stands_are_none():

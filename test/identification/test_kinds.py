@@ -132,20 +132,53 @@ def test_distances_of_gross_error_are_named_and_do_no_harm(count, share, errors)
         assert error < 1.1 * least
 
 
-def test_distances_and_poses_in_one_problem(rng):
-    """The wire leaves from somewhere else than the tracker's origin, to another point."""
-    true = framed(rng, base_wire=2.0, tool_hook=0.2)
-    poses = between(true, 40, rng)
-    lengths = wire(true, 60, rng, 'base_wire', 'tool_hook')
-    result = identify(Problem(UR10E, poses, more=(lengths,)))
+def posed(base='base', tool='tool', oriented=True):
+    return lambda chain, count, rng: between(chain, count, rng, base, tool, oriented=oriented)
+
+
+def wired(base='base', tool='tool'):
+    return lambda chain, count, rng: wire(chain, count, rng, base, tool)
+
+
+TARGETS = ('tool', 'tool_2', 'tool_3')
+
+
+@pytest.mark.parametrize(
+    ('reach', 'kinds', 'rank'),
+    [
+        ({'tool_2': 0.3, 'tool_3': 0.3}, [posed(tool=each) for each in TARGETS], 30 + 2 * 6),
+        (
+            {'tool_2': 0.3, 'tool_3': 0.3},
+            [posed(tool=each, oriented=False) for each in TARGETS],
+            27 + 2 * 3,
+        ),
+        ({'base_B': 2.0}, [posed(), posed('base_B')], 30 + 6),
+        ({'base_B': 2.0}, [posed(oriented=False), posed('base_B', oriented=False)], 27 + 6),
+        # a wire from somewhere else than the tracker's origin, to another point
+        (
+            {'base_wire': 2.0, 'tool_hook': 0.2},
+            [posed(), wired('base_wire', 'tool_hook')],
+            30 + 3 + 3,
+        ),
+        # session A by pose, B by position of another target, B by a wire to the first one
+        (
+            {'base_B': 2.0, 'tool_2': 0.3},
+            [posed(), posed('base_B', 'tool_2', oriented=False), wired('base_B')],
+            30 + 6 + 3,
+        ),
+        # a set that knows nothing of the frames named base and tool
+        ({'base_B': 2.0, 'tool_2': 0.3}, [posed('base_B', 'tool_2')], 30),
+    ],
+)
+def test_targets_sessions_and_kinds_in_one_problem(reach, kinds, rank, rng):
+    true = framed(rng, **reach)
+    first, *more = (seen(true, 50, rng) for seen in kinds)
+    result = identify(Problem(UR10E, first, more=more))
     assert result.converged
-    assert result.rank == 30 + 3 + 3
-    turns = {f'{frame}.r{axis}' for frame in ('base_wire', 'tool_hook') for axis in 'xyz'}
-    assert turns <= set(result.unidentifiable)
+    assert result.rank == rank
     assert not result.not_excited
-    assert_exact(
-        result.chain, between(true, 100, rng), wire(true, 100, rng, 'base_wire', 'tool_hook')
-    )
+    assert len(result.fitted.judged) == 50 * len(kinds)
+    assert_exact(result.chain, *(seen(true, 100, rng) for seen in kinds))
 
 
 def test_distances_sharpen_what_few_poses_leave_open():
@@ -163,58 +196,6 @@ def test_distances_sharpen_what_few_poses_leave_open():
             errors[-1].append(np.sqrt((error**2).sum(axis=1).mean()))
     alone, together = np.median(errors, axis=0)
     assert together < 0.8 * alone
-
-
-@pytest.mark.parametrize('oriented', [True, False])
-def test_several_targets_on_one_flange(oriented, rng):
-    true, tools = framed(rng, tool_2=0.3, tool_3=0.3), ('tool', 'tool_2', 'tool_3')
-    sets = [between(true, 30, rng, tool=each, oriented=oriented) for each in tools]
-    result = identify(Problem(UR10E, sets[0], more=sets[1:]))
-    assert result.rank == (30 + 2 * 6 if oriented else 27 + 2 * 3)
-    assert not result.not_excited
-    unseen = [between(true, 100, rng, tool=each, oriented=oriented) for each in tools]
-    assert_exact(result.chain, *unseen)
-
-
-@pytest.mark.parametrize('oriented', [True, False])
-def test_several_sessions_with_bases_of_their_own(oriented, rng):
-    true = framed(rng, base_B=2.0)
-    first, second = (
-        between(true, 40, rng, base=base, oriented=oriented) for base in ('base', 'base_B')
-    )
-    result = identify(Problem(UR10E, first, more=(second,)))
-    assert result.rank == (36 if oriented else 33)
-    assert not result.not_excited
-    unseen = [between(true, 100, rng, base=base, oriented=oriented) for base in ('base', 'base_B')]
-    assert_exact(result.chain, *unseen)
-    assert len(result.fitted.judged) == 80
-
-
-def test_both_ends_change_and_kinds_are_mixed(rng):
-    """Session A by pose, B by position of another target, B by a wire to the first one."""
-    true = framed(rng, base_B=2.0, tool_2=0.3)
-
-    def sets(count):
-        return [
-            between(true, count, rng),
-            between(true, count, rng, 'base_B', 'tool_2', oriented=False),
-            wire(true, count, rng, 'base_B', 'tool'),
-        ]
-
-    first, *more = sets(40)
-    result = identify(Problem(UR10E, first, more=more))
-    assert result.converged
-    assert result.rank == 30 + 6 + 3
-    assert_exact(result.chain, *sets(100))
-
-
-def test_sessions_need_not_come_in_the_order_of_the_frames(rng):
-    """The first set knows nothing of the frames named base and tool."""
-    true = framed(rng, base_B=2.0, tool_2=0.3)
-    seen = between(true, 60, rng, 'base_B', 'tool_2')
-    result = identify(Problem(UR10E, seen))
-    assert result.rank == 30
-    assert_exact(result.chain, between(true, 100, rng, 'base_B', 'tool_2'))
 
 
 def test_a_known_frame_of_a_second_session_is_kept(rng):

@@ -17,7 +17,6 @@ from measured import write_csv
 
 from calib_ros.apply.simulation import Cell, drive, faulty, random_frame
 from calib_ros.cli.main import main
-from calib_ros.files.archive import Journal
 from calib_ros.files.bags import replay
 from calib_ros.identification.validation import residuals
 from calib_ros.kinematics import se3
@@ -149,18 +148,6 @@ def test_all_kinds_in_one_table(identified, tmp_path, seed):
     assert together < error(corrected(alone), cell)
 
 
-def test_rows_of_several_kinds_can_judge(identified, tmp_path):
-    cell = Workcell(4)
-    rows = rows_of(cell, COUNTS)
-    for kind in ('pose', 'point', 'wire'):
-        for row in [row for row in rows if row['kind'] == kind][-8:]:
-            row['split'] = 'test'
-    document = identified('--csv', write_csv(tmp_path / 'cell.csv', rows))
-    assert document['samples']['held_out'] == 24
-    assert document['validation']['after']['count'] == 24
-    assert document['validation']['after']['rms_mm'] < 2.0 * np.sqrt(3.0) * 1e3 * NOISE[0]
-
-
 # The same from a bag
 
 
@@ -237,27 +224,6 @@ def test_all_sources_of_one_bag(identified, bag):
     assert error(chain, cell, tool='tool_plate') < NOISE[0]
     ground = {'true_base': 'base_wire', 'true_tool': 'tool_ball'}
     assert error(chain, cell, 'base_ground', 'tool_base', **ground) < NOISE[0]
-
-
-def test_the_journal_of_a_session_gives_the_same(identified, bag, tmp_path):
-    """What the node keeps can be identified by itself, without samples that were taken back."""
-    _, path = bag
-    journal = Journal(tmp_path / 'journal.csv', 6)
-    session = CalibrationSession(UR10E, settings(), on_sample=journal.add)
-    replay(path, session)
-    for _ in range(7):
-        journal.add(session.remove_last(), removed=True)
-    journal.close()
-    result = session.identify()
-    document = identified('--csv', tmp_path / 'journal.csv')
-    assert document['samples']['samples'] == len(session.samples) == 5 * 35 - 7
-    assert document['rank'] == result.rank
-    for parameter in result.parameters:
-        found = document['parameters'][parameter.name]
-        assert found['value'] == pytest.approx(parameter.value, abs=1e-9)
-        assert found['status'] == parameter.status
-        if parameter.std is not None:
-            assert found['std'] == pytest.approx(parameter.std, rel=1e-6)
 
 
 def test_poses_that_were_not_used_are_predicted(bag):

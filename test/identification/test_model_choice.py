@@ -113,20 +113,6 @@ def test_all_harmonics_leave_nothing_behind(rng):
     assert model.judge([], GEAR, '') == before
 
 
-def test_effects_of_several_kinds_are_found_together():
-    rng = np.random.default_rng(5)
-    true = arm_with('eccentricity', rng).with_effect_values(dict.fromkeys(GEAR, 3e-4))
-    ratios = effects.members(UR10E, 'ratio')
-    true = true.with_effect_values(dict.fromkeys(ratios, 2e-4))
-    seen = observed(true, UR10E.random_joints(200, rng), rng)
-    problem = Problem(UR10E, seen, **SIGMAS)
-    auto = identify_model(problem, 'auto')
-    assert {'eccentricity', 'ratio', 'gear'} <= chosen(auto)
-    unseen = UR10E.random_joints(500, rng)
-    best = identify(replace(problem, effects=('eccentricity', 'ratio', *GEAR)))
-    assert rms(auto.chain, true, unseen) < 1.3 * rms(best.chain, true, unseen)
-
-
 def test_nothing_is_chosen_on_a_purely_geometric_arm():
     """Six arms times a dozen trials each, at a confidence of 99.9 %: none, by these seeds."""
     for seed in range(6):
@@ -139,44 +125,6 @@ def test_nothing_is_chosen_on_a_purely_geometric_arm():
         assert not any(verdict.pays for verdict in auto.verdicts)
     plain = identify(Problem(LOADED, seen, **SIGMAS))
     np.testing.assert_array_equal(auto.chain.table, plain.chain.table)
-
-
-def test_verdicts_name_every_group_that_can_show(rng):
-    true = arm_with('ratio', rng)
-    q = LOADED.random_joints(120, rng)
-    came = rng.choice([-1.0, 1.0], q.shape)
-    seen = observed(true, q, rng, came)
-    everything = identify_model(Problem(LOADED, seen, **SIGMAS), 'auto').verdicts
-    assert {verdict.what for verdict in everything if verdict.what in effects.GROUPS} == set(
-        effects.GROUPS
-    )
-    # without masses, ratios of gears or the signs of the approach there is nothing to try
-    bare = replace(seen, approach=None)
-    few = identify_model(Problem(UR10E, bare, **SIGMAS), 'auto').verdicts
-    assert {verdict.what for verdict in few if verdict.what in effects.GROUPS} == {
-        *effects.GROUPS
-    } - {'compliance', 'gear', 'backlash'}
-
-
-def test_gross_errors_do_not_choose_the_model(rng):
-    """The spoiled samples lie where one joint stands: a harmonic would explain them."""
-    true = arm_with('', rng)
-    seen = observed(true, UR10E.random_joints(120, rng), rng)
-    positions = seen.positions.copy()
-    wrong = np.argsort(np.abs(seen.joints[:, 1] - 1.0))[:12]
-    positions[wrong] += [0.0, 0.0, 10e-3]
-    auto = identify_model(Problem(UR10E, replace(seen, positions=positions), **SIGMAS), 'auto')
-    assert auto.chain.effects == ()
-    assert {outlier.sample for outlier in auto.outliers} == set(wrong.tolist())
-
-
-def test_auto_judges_by_configurations_and_not_by_samples(rng):
-    """A pose measured twenty times over is no evidence of twenty poses."""
-    true = arm_with('', rng)
-    once = observed(true, UR10E.random_joints(40, rng), rng)
-    often = once.select(np.repeat(np.arange(40), 20))
-    auto = identify_model(Problem(UR10E, often, **SIGMAS), 'auto')
-    assert auto.chain.effects == ()
 
 
 def test_auto_takes_several_sessions(rng):

@@ -96,15 +96,6 @@ def test_rotations_rounded_to_two_digits_are_rotations(rng):
     assert seen.oriented.all()
 
 
-def test_select_keeps_the_rows_together(rng):
-    rotations = np.tile(np.eye(3), (5, 1, 1))
-    whole = Observations.from_arrays(rng.normal(size=(5, 2)), rng.normal(size=(5, 3)), rotations)
-    part = whole.select(np.array([False, True, False, True, False]))
-    np.testing.assert_array_equal(part.joints, whole.joints[[1, 3]])
-    np.testing.assert_array_equal(part.positions, whole.positions[[1, 3]])
-    assert part.stamps_ns.tolist() == [2_000_000_000, 4_000_000_000]
-
-
 def test_a_joint_that_stands_at_half_a_turn_is_one_configuration():
     joints = np.array([[3.14159], [-3.14159], [3.14159], [3.0]])
     assert configurations(joints).tolist() == [0, 0, 0, 1]

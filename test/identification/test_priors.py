@@ -142,27 +142,6 @@ def test_narrow_priors_hold_and_wide_ones_let_go(rng):
     )
 
 
-@pytest.mark.parametrize('sigma', [1e-4, 1e-3])
-def test_cross_validation_with_priors_is_that_of_separate_fits(sigma, rng):
-    *_, seen = measured_arm(rng, 30)
-    priors = {f'{name}.*': sigma for name in UR10E.joint_names}
-    result = identify(Problem(UR10E, seen, priors=priors, loss='none', **SIGMAS))
-    folds = seen.configurations % 5
-    wanted = np.empty((30, 3))
-    for fold in range(5):
-        inside = folds == fold
-        part = Problem(
-            UR10E,
-            seen.select(~inside),
-            held_out=seen.select(inside),
-            priors=priors,
-            loss='none',
-            **SIGMAS,
-        )
-        wanted[inside] = identify(part).validation.after.position
-    np.testing.assert_allclose(result.validation.after.position, wanted, rtol=0, atol=2e-6)
-
-
 def test_priors_that_make_no_sense_are_refused(rng):
     seen = measure(UR10E, UR10E.random_joints(20, rng), rng)
     with pytest.raises(UnknownNameError, match=r'elbow_joint\.a'):

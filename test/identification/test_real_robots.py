@@ -16,7 +16,7 @@ from calib_ros.files.bags import replay
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
-from calib_ros.kinematics.chain_file import load_chain, parse_chain
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
 
 pytestmark = needs_data
@@ -123,33 +123,6 @@ def test_table_and_bag_give_the_same_parameters(tmp_path, name, session):
     written = ['csv2bag', folder / 'uniform.csv', bag, *chain, '--session', session]
     assert main([str(argument) for argument in written]) == 0
     assert_same_result(by_table(name, session), run_json('identify', bag, *chain))
-
-
-def test_table_and_running_node_give_the_same_parameters(unsearched, tmp_path):
-    from geometry_msgs.msg import PoseStamped
-    from ros_cell import LATCHED, Cell, joint_messages, pose_messages
-    from std_msgs.msg import String
-
-    from calib_ros.files.recording import Recording
-
-    name = 'fr3_camera_eyeinhand'
-    path = DATA / name / 'chain.yaml'
-    chain = load_chain(path)
-    (fitted,) = read_table(DATA / name / 'uniform.csv', len(chain.joints)).fitted
-    fitted = fitted.select(np.arange(45))
-    table = identify(Problem(chain, fitted))
-    recording = Recording.of_dwells(chain.joint_names, fitted, np.zeros(len(fitted), bool))
-    parameters = {'chain': str(path), 'data_dir': str(tmp_path)}
-    with Cell(**parameters) as cell:
-        joints, poses = joint_messages(recording), pose_messages(recording.poses, PoseStamped)
-        cell.play({'joint_states': joints, 'measured_pose': poses})
-        texts = cell.listen(String, 'calibration_node/calibration', LATCHED)
-        answer = cell.call('identify')
-        assert answer.success, answer.message
-        cell.spin_until(lambda: texts)
-        live = parse_chain(texts[0].data)
-    for each in table.parameters:
-        assert live.value(each.name) == pytest.approx(each.value, abs=1e-9)
 
 
 def test_the_real_recordings_replay_alike():

@@ -26,7 +26,7 @@ GRAVITY = {
 
 def seen_of(true, seed=0, count=60, oriented=True):
     rng = np.random.default_rng(seed)
-    return measure(true, UR.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+    return measure(true, true.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
 
 
 def scaled(observations, ppm):
@@ -41,9 +41,8 @@ def arm(seed=0, errors=1.0, chain=UR):
 @pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14'])
 @pytest.mark.parametrize('oriented', [True, False])
 def test_the_scale_of_a_device_is_found(name, oriented):
-    chain, rng = load_chain(name), np.random.default_rng(0)
-    true = faulty(chain, Cell(length_error=0.0, angle_error=0.0), rng)
-    seen = measure(true, chain.random_joints(60, rng), rng, 5e-5, 2e-4, oriented)
+    chain = load_chain(name)
+    seen = seen_of(arm(0, 0.0, chain), oriented=oriented)
     problem = Problem(chain, scaled(seen, 3000.0))
     result = identify(problem)
     scale, std, freedom = scale_of(problem, result)
@@ -113,29 +112,24 @@ def test_an_arm_on_a_wall_is_noticed(gravity, axis):
 @pytest.mark.parametrize('oriented', [True, False])
 def test_sigmas_in_millimetres_are_named(sigma, oriented):
     """They make the arm's errors smaller than any noise: nothing else may be blamed for it."""
-    rng = np.random.default_rng(3)
-    chain = load_chain('ur10e')
-    true = faulty(chain, Cell(), rng)
-    seen = measure(true, chain.random_joints(40, rng), rng, 5e-5, 2e-4, oriented=oriented)
+    seen = seen_of(arm(3), count=40, oriented=oriented)
     sigmas = {'sigma_position': sigma, 'sigma_orientation': 4.0 * sigma}
-    result = identify(Problem(chain, seen, **sigmas))
+    result = identify(Problem(UR, seen, **sigmas))
     said = result.remarks[-1] if result.accepted else result.refusals[0]
     assert f'sigma_position is {sigma:g} m, and only' in said
     assert said.count('meant?') == 1 + oriented
     assert result.accepted or result.refusals[0].rule is Rule.MISTAKE
     for good in (5e-5, 5e-4):
         sigmas = {'sigma_position': good, 'sigma_orientation': 4.0 * good}
-        result = identify(Problem(chain, seen, **sigmas))
+        result = identify(Problem(UR, seen, **sigmas))
         assert result.accepted
         assert not any('sigma' in each for each in result.remarks)
 
 
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
-    rng = np.random.default_rng(0)
-    chain = load_chain('ur10e')
-    seen = measure(faulty(chain, Cell(), rng), chain.random_joints(40, rng), rng, 1e-4, 3e-4)
+    seen = seen_of(arm(), count=40)
     turned = replace(seen, joints=seen.joints * [1, 1, 1, 1, 1, -1])
-    result = identify(Problem(chain, turned, sigma_position=0.1, sigma_orientation=0.4))
+    result = identify(Problem(UR, turned, sigma_position=0.1, sigma_orientation=0.4))
     first, *_, last = result.refusals
     assert first.startswith('wrist_3_joint counts the other way round')
     assert last.startswith('sigma_position is 0.1 m, and only')
@@ -144,29 +138,23 @@ def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
 @pytest.mark.parametrize('turns', [5e-3, 1e-2])
 def test_orientations_far_worse_than_their_sigma_are_named(turns):
     """Of a camera or a small rigid body of markers: by default they spoil the positions."""
-    rng = np.random.default_rng(4)
-    chain = load_chain('ur10e')
-    true = faulty(chain, Cell(), rng)
-    seen = measure(true, chain.random_joints(40, rng), rng, 1e-4, turns)
-    result = identify(Problem(chain, seen))
+    rng, true = np.random.default_rng(4), arm(4)
+    seen = measure(true, UR.random_joints(40, rng), rng, 1e-4, turns)
+    result = identify(Problem(UR, seen))
     said = result.remarks[-1] if result.accepted else result.refusals[0]
     assert 'the orientations outweigh the positions and spoil them' in said
     value = float(said.rpartition(' ')[2])
     assert value == pytest.approx(turns, rel=0.2)
-    mended = identify(Problem(chain, seen, sigma_orientation=value))
+    mended = identify(Problem(UR, seen, sigma_orientation=value))
     assert mended.accepted
     assert not any('sigma' in each for each in mended.remarks)
-    q = chain.random_joints(300, rng)
+    q = UR.random_joints(300, rng)
     assert rms(mended.chain, true, q) < 0.4 * rms(result.chain, true, q)
 
 
 def test_covariances_in_square_millimetres_are_named():
-    rng = np.random.default_rng(3)
-    chain = load_chain('ur10e')
-    true = faulty(chain, Cell(), rng)
-    seen = measure(true, chain.random_joints(40, rng), rng, 5e-5, 2e-4)
-    wrong = np.tile(np.diag([2.5e-3] * 3 + [4e-8] * 3), (40, 1, 1))
-    result = identify(Problem(chain, replace(seen, covariance=wrong)))
+    wrong = np.tile(np.diag([2.5e-3] * 3 + [4e-8] * 3), (60, 1, 1))
+    result = identify(Problem(UR, replace(seen_of(arm(3)), covariance=wrong)))
     assert not result.accepted
     assert result.refusals[0].rule is Rule.MISTAKE
     assert 'by the covariances the position is known to 0.05 m, and only' in result.refusals[0]

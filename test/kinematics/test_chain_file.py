@@ -299,15 +299,12 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path, content):
         load_chain(path)
 
 
-def test_a_folder_does_not_hide_the_robot_of_the_same_name(tmp_path, monkeypatch):
+def test_a_robot_is_no_path_and_a_path_no_robot(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match='ur10e'):
+        load_chain(tmp_path / 'ur10e')
     (tmp_path / 'ur10e').mkdir()
     monkeypatch.chdir(tmp_path)
     assert load_chain('ur10e').name == 'ur10e'
-
-
-def test_a_path_to_nothing_is_not_taken_for_a_robot(tmp_path):
-    with pytest.raises(ConfigError, match='ur10e'):
-        load_chain(tmp_path / 'ur10e')
 
 
 def test_the_hash_of_a_table_stays_what_older_files_hold():

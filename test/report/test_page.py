@@ -206,30 +206,27 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
     assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == (state == 'info')
 
 
-def test_what_follows_from_a_wrong_setting_sends_nobody_elsewhere():
-    rules = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.OUTLIERS)
+@pytest.mark.parametrize(
+    ('rules', 'steps', 'last'),
+    [
+        (
+            (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.OUTLIERS),
+            (True, True, False),
+            'LARGEST_ERROR; GAIN',
+        ),
+        ((Rule.MOVED, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
+        ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
+        ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
+        ((Rule.OUTLIERS,), (True,), 'OUTLIERS'),
+    ],
+)
+def test_what_follows_from_another_reason_sends_nobody_elsewhere(rules, steps, last):
+    """From a wrong setting, a bump, or a joint that hardly moved."""
     here = advice.Situation(left=1000.0)
     told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
-    assert [bool(each.steps) for each in told] == [True, True, False]
-    assert told[-1].refusal == 'LARGEST_ERROR; GAIN'
+    assert tuple(bool(each.steps) for each in told) == steps
+    assert told[-1].refusal == last
     assert told[0].heading in told[-1].heading
-
-
-@pytest.mark.parametrize('cause', [Rule.MOVED, Rule.ENCODER])
-def test_a_bump_explains_why_many_poses_do_not_fit(cause):
-    moved, outliers = advice.advice([Reason(cause, 'at pose 36'), Reason(Rule.OUTLIERS, '42 %')])
-    assert moved.steps
-    assert not outliers.steps
-    assert moved.heading in outliers.heading
-    (alone,) = advice.advice([Reason(Rule.OUTLIERS, '42 %')])
-    assert alone.steps
-
-
-def test_joints_that_hardly_moved_explain_that_nothing_was_gained():
-    rules = (Rule.EXCITATION, Rule.GAIN)
-    excited, gain = advice.advice([Reason(rule, rule.name) for rule in rules])
-    assert excited.steps
-    assert not gain.steps
 
 
 def test_an_accepted_page_says_that_the_robot_is_not_changed_yet(solved):

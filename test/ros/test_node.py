@@ -28,7 +28,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Float64MultiArray, String
 
-from calib_ros.apply.simulation import Cell as SimulatedCell, faulty, measure, random_frame
+from calib_ros.apply.simulation import Cell as SimulatedCell, faulty, measure
 from calib_ros.cli.main import main
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag
@@ -195,51 +195,6 @@ def test_every_kind_of_measurement_is_heard(cell, recording):
             assert sample.covariance is None
 
 
-def test_two_children_of_a_transform_are_two_targets(cell, recording, truth):
-    other = replace(truth, tool=random_frame(np.random.default_rng(8), 0.2))
-    rng = np.random.default_rng(9)
-    poses = recording.poses
-    second = measure(other, poses.joints, rng, 2e-5, 1e-4).at(poses.stamps_ns)
-    both = pose_messages(poses, TransformStamped, child='left')
-    both += pose_messages(second, TransformStamped, child='right')
-    cell.play({'joint_states': joint_messages(recording), 'measured_transform': both})
-    cell.done('identify')
-    chain = cell.node.session.calibration.chain
-    assert {'base', 'tool', 'tool_right'} <= set(chain.frame_names)
-    unseen = truth.random_joints(100, rng)
-    for tool, true in (('tool', truth), ('tool_right', other)):
-        error = (chain.forward(unseen, tool=tool) - true.forward(unseen))[:, :3, 3]
-        assert np.linalg.norm(error, axis=1).max() < 1e-4
-
-
-def test_a_camera_on_the_flange_and_a_draw_wire_as_sources(tmp_path, recording, truth):
-    poses = recording.poses
-    seen = poses.inverted()
-    lengths = np.linalg.norm(poses.positions - [0.5, 0.2, -0.3], axis=1)
-    sources = ['camera/target type=PoseStamped eye_in_hand=true target=board', 'wire type=Range']
-    noise = {'sigma_position': 2e-5, 'sigma_orientation': 1e-4}
-    parameters = {'chain': 'ur10e', 'data_dir': str(tmp_path), 'sources': sources, **noise}
-    with Cell(**parameters) as cell:
-        cell.play(
-            {
-                'joint_states': joint_messages(recording),
-                'camera/target': pose_messages(seen, frame_id='camera'),
-                'wire': pose_messages(poses, Range, distances=lengths, frame_id='wire'),
-            }
-        )
-        cell.done('identify')
-        kinds = [
-            (each.distances is not None, len(each)) for each in cell.node.session.problem().sets
-        ]
-        assert kinds == [(False, STOPS), (True, STOPS)]
-        chain = cell.node.session.calibration.chain
-    unseen = truth.random_joints(200, np.random.default_rng(3))
-    found, true = chain.forward(unseen), truth.forward(unseen)
-    # The board's frame is the world; only what two poses have between them can be compared.
-    error = np.linalg.inv(found[0]) @ found[1:] - np.linalg.inv(true[0]) @ true[1:]
-    assert np.linalg.norm(error[:, :3, 3], axis=1).max() < 3e-4
-
-
 def test_joint_states_in_two_parts(tmp_path, recording):
     whole = joint_messages(recording)
     parts = [
@@ -258,17 +213,6 @@ def test_joint_states_in_two_parts(tmp_path, recording):
         assert_same(
             direct(recording).problem().observations, cell.node.session.problem().observations
         )
-
-
-def test_validation_topics_are_never_fitted(cell, recording):
-    poses = pose_messages(recording.poses)
-    last = STOPS - 6
-    cell.play(
-        topics(recording, measured_pose=poses[: 4 * last], validation_pose=poses[4 * last :])
-    )
-    answer = cell.done('identify')
-    assert f'{last} poses' in answer.message
-    assert '6 held-out poses' in answer.message
 
 
 # Names, time, several robots, the end

@@ -2,18 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real node in real rclpy when something goes wrong: dead sources, wrong messages."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from ros_cell import (
-    STOPS,
     Cell,
-    assert_same,
-    direct,
     joint_messages,
     part,
     pose_messages,
@@ -108,75 +103,7 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     wait_for('no more messages on /joint_states')
 
 
-def test_a_bag_that_is_played_again(cell, recording):
-    cell.play(topics(recording))
-    cell.node.session.problem()
-    before = {sample.stamp_ns for sample in cell.node.session.samples}
-    hour = 3_600_000_000_000
-    earlier = replace(
-        recording,
-        joint_stamps_ns=recording.joint_stamps_ns - hour,
-        poses=recording.poses.at(recording.poses.stamps_ns - hour),
-    )
-    for jumps, played, new in ((1, recording, 1), (2, earlier, STOPS)):
-        cell.play(topics(played))
-        cell.node.session.problem()
-        account = cell.node.session.account()
-        assert account.notes['the clock jumped back'] == jumps
-        fresh = {sample.stamp_ns for sample in cell.node.session.samples} - before
-        # The measurements before the jump shows are lost: the first stop gets another stamp.
-        assert new - 1 <= len(fresh) <= new
-        before |= fresh
-    cell.done('identify')
-
-
-@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
-def test_a_late_tracker_and_messages_out_of_order(tmp_path, recording, mode):
-    expected = direct(recording, mode=mode).problem().observations
-    parameters = {'chain': 'ur10e', 'mode': mode, 'data_dir': str(tmp_path)}
-    with Cell(**parameters) as cell:
-        cell.play(topics(recording), late_ns=200_000_000)
-        assert_same(expected, cell.node.session.problem().observations)
-        account = cell.node.session.account()
-        assert (account.dropped, account.notes) == ({}, {})
-        cell.done('clear')
-        cell.play(topics(recording), jitter=np.random.default_rng(4))
-        assert_same(expected, cell.node.session.problem().observations)
-        account = cell.node.session.account()
-        assert account.dropped == {}
-        assert account.notes['joints with a stamp older than the one before'] > 100
-
-
 # Messages that do not fit
-
-
-def test_a_target_that_was_moved_shows_in_the_status(cell, recording):
-    some = pose_messages(recording.poses)
-    for message in some[80:]:
-        message.pose.position.z += 0.02
-    words = cell.listen(String, 'calibration_node/status')
-    cell.play(part(recording, 0.0, 20.0))
-    cell.spin_until(lambda: words and '; 18 poses' in words[-1].data)
-    assert 'fit' not in words[-1].data
-    joints = topics(recording)['joint_states'][1000:]
-    cell.play({'joint_states': joints, 'measured_pose': some[80:]})
-    said = 'does not fit the others, was the target moved?'
-    cell.spin_until(lambda: said in words[-1].data)
-
-
-def test_poses_in_different_frames_are_refused(cell, recording):
-    some = pose_messages(recording.poses)
-    for message in some[40:70]:
-        message.header.frame_id = 'camera'
-    words = cell.listen(String, 'calibration_node/status')
-    cell.play(topics(recording, measured_pose=some))
-    cell.spin_until(lambda: words and 'different frames (camera, tracker)' in words[-1].data)
-    answer = cell.refused('identify')
-    assert 'different frames (camera, tracker)' in answer.message
-    assert 'set frame_id' in answer.message
-    assert cell.set_parameters({'frame_id': 'tracker'})[0].successful
-    answer = cell.call('identify')  # the advice helps, at once
-    assert answer.success, answer.message
 
 
 def test_poses_in_another_frame_than_frame_id_are_dropped(tmp_path, recording):
@@ -207,24 +134,6 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     missing = recording.joint_names if all_renamed else recording.joint_names[5:]
     whole = f'{said}{", ".join(sorted(names))}, not {", ".join(missing)}; '
     cell.spin_until(lambda: heard and whole in heard[-1].status[0].message)
-
-
-def test_broken_messages_are_counted_by_cause(cell, recording):
-    joints, poses = topics(recording).values()
-    joints[3].position[2] = float('nan')
-    joints[4].position.pop()
-    joints[5].header.stamp.sec = joints[5].header.stamp.nanosec = 0
-    poses[8].pose.position.x = float('inf')
-    poses[9].pose.orientation.w = 3.0
-    poses[10].pose.orientation.x = float('nan')
-    cell.play({'joint_states': joints, 'measured_pose': poses})
-    assert cell.node.session.account().dropped == {
-        'joints: NaN or infinite joint value': 1,
-        'joints: names and positions differ in number': 1,
-        'joints: zero stamp (fill header.stamp where it is published)': 1,
-        'measurements: NaN or infinite position': 1,
-        'measurements: quaternion not of length 1 (normalise it where it is published)': 2,
-    }
 
 
 def test_poses_that_no_identification_takes_are_told_by_the_status(cell, recording):

@@ -7,7 +7,7 @@ import shlex
 
 import numpy as np
 import pytest
-from recorded import MS, STORAGES, TYPES, header, pose, record, session_of, standing
+from recorded import MS, TYPES, header, pose, record, session_of, standing, storages
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_transforms import TIMES, frame, link, tf
@@ -16,7 +16,6 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.messages import JOINT_STATE, parse_source
 
-storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 MOCAP = 'mocap4r2_msgs/msg/RigidBodies'
 NAMED = 'motion_capture_tracking_interfaces/msg/NamedPoseArray'
 TEXTS = {
@@ -119,16 +118,6 @@ def test_several_bodies_are_several_targets(tmp_path, rng):
     assert sorted(found) == [('base', True)] * len(TIMES) + [('tool', False)] * len(TIMES)
 
 
-def test_bodies_that_are_not_seen_are_counted(tmp_path, rng):
-    _, come = measured(rng, MOCAP)
-    path = write(tmp_path / 'bag', standing(come, '/bodies'))
-    session, _ = session_of(path, sources=(line(MOCAP), line(MOCAP, 'lost')))
-    assert session.account().poses == len(TIMES) + len(TIMES) // 2
-    assert session.account().dropped == {
-        'measurements: NaN or infinite position': len(TIMES) // 2,
-    }
-
-
 @storages
 @pytest.mark.parametrize('kind', [MOCAP, NAMED])
 def test_a_bag_without_named_sources_lists_the_bodies(tmp_path, rng, kind, storage):
@@ -195,21 +184,6 @@ def test_another_message_of_that_name_is_told(tmp_path, rng, text):
     path = defined_by(tmp_path / 'bag', text, come)
     _, (warning,) = session_of(path, sources=(line(MOCAP),))
     assert 'a message on /bodies cannot be decoded' in warning
-
-
-def test_messages_that_cannot_be_decoded_are_told(tmp_path, rng):
-    _, come = measured(rng, MOCAP)
-    bad = STORE.types['std_msgs/msg/String']('no bodies')
-    path = tmp_path / 'bag'
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=STORE)
-        bodies = writer.add_connection('/bodies', MOCAP, typestore=STORE)
-        for k, (topic, each) in enumerate([*standing(come, '/bodies'), ('/bodies', bad)]):
-            data = STORE.serialize_cdr(each, each.__msgtype__)
-            writer.write(joints if topic == '/joint_states' else bodies, k + 1, data)
-    session, (warning,) = session_of(path, sources=(line(MOCAP),))
-    assert 'a message on /bodies cannot be decoded' in warning
-    assert session.account().samples == len(TIMES)
 
 
 def test_bodies_need_their_names():

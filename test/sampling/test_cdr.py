@@ -3,16 +3,24 @@
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
-from rosbags.typesys import Stores, get_typestore
+from recorded import (
+    TYPES,
+    TYPESTORE,
+    distance,
+    header,
+    odometry,
+    point_stamped,
+    pose_stamped,
+    pose_with_covariance,
+    transform_stamped,
+)
 
 from calib_ros.sampling.cdr import alike, trajectory_size
 from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Readings, reading, usable
 
-STORE = get_typestore(Stores.ROS2_JAZZY)
-TYPES = STORE.types
 NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 NUMBERS = st.floats(-1e6, 1e6)
-SECONDS, NANOSECONDS = st.integers(0, 2**31 - 1), st.integers(0, 999_999_999)
+STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 
 
 def decode(kind, blobs):
@@ -25,84 +33,55 @@ def assert_decoded(kind, blobs):
     """At once as one by one."""
     found = decode(kind, blobs)
     for k, blob in enumerate(blobs):
-        stamp_ns, strings, numbers = reading(kind, STORE.deserialize_cdr(blob, kind))
+        stamp_ns, strings, numbers = reading(kind, TYPESTORE.deserialize_cdr(blob, kind))
         assert (stamp_ns, strings) == (found.stamps_ns[k], found.strings)
         np.testing.assert_array_equal(numbers, found.numbers[k])
 
 
-def header(seconds, nanoseconds, frame_id):
-    time = TYPES['builtin_interfaces/msg/Time'](seconds, nanoseconds)
-    return TYPES['std_msgs/msg/Header'](time, frame_id)
-
-
-def pose(numbers):
-    point = TYPES['geometry_msgs/msg/Point'](*numbers[:3])
-    return TYPES['geometry_msgs/msg/Pose'](
-        point, TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
-    )
-
-
 def message(kind, head, child, numbers):
-    cls = TYPES[kind]
-    covariance = np.arange(36.0) + numbers[0]
-    if kind == 'geometry_msgs/msg/PoseStamped':
-        return cls(head, pose(numbers))
-    if kind == 'geometry_msgs/msg/PointStamped':
-        return cls(head, TYPES['geometry_msgs/msg/Point'](*numbers[:3]))
-    if kind == 'sensor_msgs/msg/Range':
-        return cls(head, 0, *np.float32(numbers[:5]))
-    if kind == 'geometry_msgs/msg/TransformStamped':
-        shift = TYPES['geometry_msgs/msg/Vector3'](*numbers[:3])
-        turn = TYPES['geometry_msgs/msg/Quaternion'](*numbers[3:7])
-        return cls(head, child, TYPES['geometry_msgs/msg/Transform'](shift, turn))
-    with_covariance = TYPES['geometry_msgs/msg/PoseWithCovariance'](pose(numbers), covariance)
-    if kind == 'nav_msgs/msg/Odometry':
-        zero = TYPES['geometry_msgs/msg/Vector3'](0.0, 0.0, 0.0)
-        twist = TYPES['geometry_msgs/msg/Twist'](zero, zero)
-        return cls(
-            head,
-            child,
-            with_covariance,
-            TYPES['geometry_msgs/msg/TwistWithCovariance'](twist, covariance),
-        )
-    return cls(head, with_covariance)
+    where, covariance = (numbers[:3], numbers[3:]), np.arange(36.0) + numbers[0]
+    made = {
+        'geometry_msgs/msg/PoseStamped': lambda: pose_stamped(0, *where),
+        'geometry_msgs/msg/PointStamped': lambda: point_stamped(0, where[0]),
+        'geometry_msgs/msg/PoseWithCovarianceStamped': lambda: pose_with_covariance(
+            0, covariance, where
+        ),
+        'geometry_msgs/msg/TransformStamped': lambda: transform_stamped(0, *where, child),
+        'nav_msgs/msg/Odometry': lambda: odometry(0, covariance, child, where),
+        'sensor_msgs/msg/Range': lambda: distance(0, np.float32(numbers[0])),
+    }[kind]()
+    made.header = head
+    return made
 
 
 @given(
     st.sampled_from(sorted(DECODERS)),
     NAMES,
     NAMES,
-    st.lists(
-        st.tuples(SECONDS, NANOSECONDS, st.lists(NUMBERS, min_size=7, max_size=7)),
-        min_size=1,
-        max_size=5,
-    ),
+    st.lists(st.tuples(STAMPS, st.lists(NUMBERS, min_size=7, max_size=7)), min_size=1, max_size=5),
 )
 def test_measurements_are_decoded_as_by_rosbags(kind, frame_id, child, rows):
-    made = [message(kind, header(s, ns, frame_id), child, n) for s, ns, n in rows]
-    assert_decoded(kind, [bytes(STORE.serialize_cdr(each, kind)) for each in made])
+    made = [message(kind, header(stamp, frame_id), child, n) for stamp, n in rows]
+    assert_decoded(kind, [bytes(TYPESTORE.serialize_cdr(each, kind)) for each in made])
 
 
 @given(
     NAMES,
     st.lists(NAMES, max_size=8),
-    st.lists(st.tuples(SECONDS, NANOSECONDS, NUMBERS), min_size=1, max_size=5),
+    st.lists(st.tuples(STAMPS, NUMBERS), min_size=1, max_size=5),
 )
 def test_joint_states_are_decoded_as_by_rosbags(frame_id, names, rows):
-    empty = np.zeros(0)
     blobs = []
-    for seconds, nanoseconds, value in rows:
+    for stamp, value in rows:
         positions = value + np.arange(float(len(names)))
-        head = header(seconds, nanoseconds, frame_id)
-        given_ = TYPES[JOINT_STATE](head, names, positions, positions, empty)
-        blobs.append(bytes(STORE.serialize_cdr(given_, JOINT_STATE)))
+        blobs.append(joint_blob(names, positions, frame_id, stamp, positions))
     assert_decoded(JOINT_STATE, blobs)
 
 
-def joint_blob(names, positions, frame_id=''):
-    empty = np.zeros(0)
-    given_ = TYPES[JOINT_STATE](header(1, 0, frame_id), names, np.array(positions), empty, empty)
-    return bytes(STORE.serialize_cdr(given_, JOINT_STATE))
+def joint_blob(names, positions, frame_id='', stamp_ns=10**9, velocities=()):
+    head, velocities = header(stamp_ns, frame_id), np.array(velocities, dtype=float)
+    given_ = TYPES[JOINT_STATE](head, names, np.array(positions), velocities, np.zeros(0))
+    return bytes(TYPESTORE.serialize_cdr(given_, JOINT_STATE))
 
 
 def test_messages_of_one_length_are_told_apart_by_their_names():
@@ -153,8 +132,8 @@ def trajectory(frame_id, names, points):
     row, none = np.zeros(len(names)), np.zeros(0)
     point = TYPES['trajectory_msgs/msg/JointTrajectoryPoint'](row, none, none, none, duration)
     kind = 'trajectory_msgs/msg/JointTrajectory'
-    message = TYPES[kind](header(1, 2, frame_id), names, [point] * points)
-    return [bytes(STORE.serialize_cdr(message, kind, little_endian=e)) for e in (True, False)]
+    message = TYPES[kind](header(1_000_000_002, frame_id), names, [point] * points)
+    return [bytes(TYPESTORE.serialize_cdr(message, kind, little_endian=e)) for e in (True, False)]
 
 
 @given(NAMES, st.lists(NAMES, max_size=8), st.integers(0, 20))

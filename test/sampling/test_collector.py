@@ -83,60 +83,12 @@ def test_measuring_begins_after_the_arm_has_settled(settle, count):
     assert (made.unused[CALM] > 0) == (settle > 0.0)
 
 
-def test_a_stop_that_is_too_short_is_no_sample():
-    made, samples = toured(shortest_stop=1.6)
-    assert samples == []
-    assert made.unused['measurements: the stop was too short'] > 200
-
-
-def test_of_a_long_stop_only_the_beginning_is_used():
-    motion = stops(STOPS[:3], 1.0, 6.0)
-    made = collector(longest_stop=2.0)
-    samples = play(made, joint_events(motion, 20.0), pose_events(motion, 20.0))
-    assert len(samples) == 3
-    for k, sample in enumerate(samples):
-        assert sample.count == pytest.approx(1.9 * 50, abs=4)
-        assert 1e-9 * (sample.stamp_ns - START) == pytest.approx(7.0 * k + 1.05, abs=0.2)
-    assert made.unused[REST] == pytest.approx(3 * 4 * 50, abs=20)
-
-
 def test_a_long_stop_is_sampled_while_it_lasts():
     motion = stops(STOPS[:1], 1.0, 60.0)
     made = collector(longest_stop=2.0)
     events = joint_events(motion, 4.0), pose_events(motion, 4.0)
     assert len(play(made, *events, finish=False)) == 1
     assert made.state() == 'the arm stands and its pose is measured: move on'
-
-
-def test_a_measurement_while_the_arm_vibrates_is_left_out():
-    motion = tour()
-    made = collector()
-    noise = np.random.default_rng(4).normal(scale=NOISE, size=(950, 3))
-    events = []
-    for time, more in zip(np.arange(950) * 0.01, noise, strict=True):
-        since = time % (MOVE + STAND)
-        swing = 2e-3 * np.exp(-since / 0.08) * np.sin(50.0 * since)
-        seen = place(motion([time]))[0] + swing + more
-        events.append((time, POSE, int(stamps(time)), seen))
-    samples = play(made, joint_events(motion, 9.5), events)
-    assert len(samples) == 5
-    assert made.dropped['measurements: still vibrating, or a spike'] > 20
-    for sample, where in zip(samples, STOPS, strict=True):
-        error = np.abs(sample.position - place(where[np.newaxis])[0]).max()
-        assert error < 5.0 * NOISE / np.sqrt(sample.count)
-
-
-def test_a_stop_at_which_the_target_moves_is_dropped_and_counted():
-    motion = tour()
-    made = collector()
-    events = [
-        (time, POSE, int(stamps(time)), np.array([1.0, 2.0, 3.0 + 5e-3 * time]))
-        for time in np.arange(0.0, 9.5, 0.02).tolist()
-    ]
-    assert play(made, joint_events(motion, 9.5), events) == []
-    assert made.dropped == {
-        'measurements: a stop with more spread than noise': pytest.approx(270, abs=10)
-    }
 
 
 def test_joints_are_those_of_the_time_of_the_measurements():

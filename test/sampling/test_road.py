@@ -196,24 +196,6 @@ def assert_same_samples(first, second):
         np.testing.assert_array_equal(one.position, other.position)
 
 
-@pytest.mark.parametrize('mode', ['dwell', 'continuous'])
-@pytest.mark.parametrize('off', [-10_000, 3, 10_000, 10_000_000])
-def test_two_stray_stamps_cost_two_messages(rng, mode, off):
-    given = messages(rng)
-    stray = [shifted(given[k], off) for k in (960, 961)]
-    expected = session_of(given, mode=mode)
-    found = session_of([*given[:962], *stray, *given[962:]], mode=mode)
-    assert_same_samples(expected, found)
-    cause = 'stamp far from those before and after'
-    of = ['joints' if hasattr(each, 'position') else 'measurements' for each in stray]
-    kinds = {f'{kind}: {cause}' for kind in of}
-    assert {key for key in found.account().dropped if cause in key} == kinds
-    others = {key: n for key, n in found.account().dropped.items() if cause not in key}
-    assert others == expected.account().dropped
-    assert found.account().notes == expected.account().notes
-    assert found.delay == expected.delay
-
-
 @pytest.mark.parametrize('off', [10_000, -10_000])
 def test_the_first_messages_may_be_the_stray_ones(rng, off):
     given = messages(rng)
@@ -253,13 +235,3 @@ def test_a_recording_played_again_counts_one_jump_however_it_comes(seed):
             (seen, stamps(measured) + shift, where[:, :3, 3], where[:, :3, :3]),
         )
         assert session.account().notes.get('the clock jumped back', 0) == again
-
-
-def test_what_is_held_back_is_in_the_account(rng):
-    given = messages(rng)[:200]
-    session = CalibrationSession(ARM, Settings(lateness=0.5))
-    take(session, *(of_joints(message) for message in given if hasattr(message, 'position')))
-    take(session, (TRACKER, POSE, shifted(given[1], 500)))
-    account = session.account()
-    assert (account.poses, account.waiting) == (1, 1)
-    assert account.dropped == {}

@@ -14,16 +14,6 @@ from calib_ros.settings import Settings
 # Settings and words
 
 
-def test_settings_change_without_losing_anything():
-    made = session(samples())
-    made.change(replace(made.settings, fixed=('*.alpha',)))
-    result = made.identify()
-    assert len(made.samples) == 30
-    assert {p.name for p in result.parameters if p.status == 'fixed'} == {
-        f'{name}.alpha' for name in UR5E.joint_names
-    }
-
-
 def test_the_way_of_a_stop_can_be_changed_while_it_runs():
     made = CalibrationSession(UR5E, Settings(**SIGMAS))
     where = UR5E.random_joints(3, np.random.default_rng(1))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from recorded import (
     MS,
-    STORAGES,
     TYPES,
     joint_state,
     observations_of,
@@ -14,12 +13,11 @@ from recorded import (
     record,
     session_of,
     standing,
+    storages,
     text_message,
 )
 
 from calib_ros.errors import InputError
-
-storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 
 
 def table():

@@ -9,7 +9,6 @@ import pytest
 from recorded import (
     ARM,
     MS,
-    STORAGES,
     TYPES,
     TYPESTORE,
     joint_state,
@@ -17,6 +16,7 @@ from recorded import (
     record,
     session_of,
     standing,
+    storages,
     transform_stamped,
 )
 
@@ -29,7 +29,6 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.transforms import Linked, Links
 from calib_ros.settings import Settings
 
-storages = pytest.mark.parametrize('storage', sorted(STORAGES))
 PLAIN = '/tf parent=world child=tool'
 TIMES = [105, 205, 333, 601]
 
@@ -173,30 +172,6 @@ def test_a_bag_tells_what_stands_still_even_at_its_end(tmp_path, rng, storage):
     found, session = poses_of(record(tmp_path / 'bag', content, storage))
     np.testing.assert_allclose(found, [known @ each for each in matrices], rtol=0, atol=1e-12)
     assert session.account().dropped == {}
-
-
-def test_names_with_a_slash_before_them_are_the_same(tmp_path, rng):
-    moving = [tf(link('/world', '/tool', 105 * MS, frame(rng)))]
-    found, _ = poses_of(
-        record(tmp_path / 'bag', events(rng, moving)), '/tf parent=/world child=tool'
-    )
-    assert len(found) == 1
-
-
-def test_several_targets_on_one_topic(tmp_path, rng):
-    both = [
-        tf(link('world', 'a', ms * MS, frame(rng)), link('world', 'b', ms * MS, frame(rng)))
-        for ms in TIMES
-    ]
-    path = record(tmp_path / 'bag', events(rng, both))
-    session, _ = session_of(
-        path, sources=('/tf parent=world child=a', '/tf parent=world child=b validation=true')
-    )
-    fitted, judging = (
-        [each.target for each in session.samples if each.validation is held]
-        for held in (False, True)
-    )
-    assert (fitted, judging) == (['a'] * 4, ['b'] * 4)
 
 
 def refusal(path, *sources):
