@@ -5,8 +5,9 @@
     python benchmarks/fleet.py [--quick] [--json] [--part PART] [--robots N]
 
 nights: 200 robots x 30 nights x 60 poses (0.05 mm, 0.2 mrad). Five robots are bumped in some night
-but the first three: one parameter of the arm moves by 0.1 mm or 0.2 mrad. Found: the joint named
-within two nights. A second run has nothing to do. workers: throughput of one and two workers on
+but the first three: one parameter of the arm moves by 0.1 mm or 0.2 mrad. Five others: parameters
+of two joints move by twice as much. Found: the joint, or both or one of two, named within two
+nights. A second run has nothing to do. workers: throughput of one and two workers on
 tables of 25,000 poses, over a second each, beside that of one and two processes without dask: what
 the machine can do. scheduler: its time and the client's for each task. kills: ten runs in which a
 worker, then the client is killed with SIGKILL; the history must hold each result once.
@@ -46,19 +47,24 @@ from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.kinematics.chain_file import load_chain
 
 POSES, BEFORE = 60, 3
+LENGTHS = ('.a', '.d')
 PEERS = ('processes', 'workers')
 
 
 def bumps_of(serials, nights, number, rng):
-    """Return the night and the offset of one parameter of some robots."""
+    """Return night and offsets of some robots: one parameter each, then those of two joints."""
     chain = load_chain('ur10e')
     names = structurally_independent(chain, chain.parameter_names)
     own = [name for name in map(str, names) if name.partition('.')[0] in chain.joint_names]
     found = {}
-    for serial in rng.choice(serials, number, replace=False).tolist():
-        name = str(rng.choice(own))
-        size = rng.choice((-1, 1)) * (1e-4 if name.endswith(('.a', '.d')) else 2e-4)
-        found[serial] = (int(rng.integers(BEFORE, nights - 1)), {name: float(size)})
+    for k, serial in enumerate(rng.choice(serials, 2 * number, replace=False).tolist()):
+        bumped = 1 + k // number
+        by_joint = {str(name).partition('.')[0]: str(name) for name in rng.permutation(own)}
+        offsets = {
+            name: float(rng.choice((-1, 1)) * bumped * (1e-4 if name.endswith(LENGTHS) else 2e-4))
+            for name in list(by_joint.values())[:bumped]
+        }
+        found[serial] = (int(rng.integers(BEFORE, nights - 1)), offsets)
     return found
 
 
@@ -101,21 +107,24 @@ def nights_part(folder, robots, nights, number, cluster):
         if name == 'first':
             parts['work_s'] = done.seconds / max(1, done.filed)
             parts['filed'] = done.filed
-    found, false, said = set(), 0, []
+    found, false, said = dict.fromkeys((1, 2), frozenset()), 0, []
     for each in stood:
         serial = each.robot.serial
         for change in each.watched.changes:
             night, offsets = bumps.get(serial, (-9, {}))
-            (name,) = offsets or ('',)
+            bumped = {name.partition('.')[0] for name in offsets}
             seen = (change.seen - plants.when(0)) / timedelta(days=1)
-            right = change.joint == name.partition('.')[0] and night <= round(seen) <= night + 1
+            named = {*change.pair} or {change.joint}
+            right = named <= bumped and night <= round(seen) <= night + 1
             said.append(f'{serial} night {round(seen)}: {change}; true: {night} {offsets}')
-            found |= {serial} if right else set()
+            if right:
+                found[len(bumped)] |= {serial}
             false += not right
     files = [path.stat().st_size for path in (folder / 'history').rglob('*.parquet')]
     pages = [path.stat().st_size for path in out.glob('robots/*/*.html')]
     return {
-        'found_share': len(found) / number,
+        'found_share': len(found[1]) / number,
+        'pairs_found_share': len(found[2]) / number,
         'false_alarms': false,
         'second_run_share': spans[1] / spans[0],
         'first_run_s': spans[0],

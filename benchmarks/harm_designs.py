@@ -43,6 +43,7 @@ class Design:
     robots: tuple = SIX + SEVEN
     model: str = 'geometric'
     bends: tuple = ('',)
+    lens_off: float | None = None
     counts: tuple = (60,)
 
 
@@ -96,6 +97,10 @@ DESIGNS = (
     *(
         Design(f'by {what}', 60, errors=SIZES, what=what, bends=('', 'ripple', 'soft', 'wavy'))
         for what in SENSORS
+    ),
+    *(
+        Design(f'lens off by 1 %, {what}', 60, errors=SIZES, what=what, lens_off=0.01)
+        for what in ('fixed camera', 'camera on the flange')
     ),
     Design('board 0.3 % too large', 60, errors=SIZES, what='camera on the flange', size=3e-3),
     Design('auto', 40, ORDERS, model='auto'),
@@ -153,7 +158,9 @@ def measured_by(design, arm, q, rng):
     what, size = design.what, design.size
     if what in SENSORS:
         (seen, *more), options = SENSORS[what](arm, rng, size)
-        return arm, lambda chain: Problem(in_view(chain, what), seen, more=more, **options)
+        return arm, lambda chain: Problem(
+            in_view(chain, what, design.lens_off), seen, more=more, **options
+        )
     oriented = rng.random() > 1.0 / 3.0
     options = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
     if what in ('test repeats', 'repeats'):

@@ -163,8 +163,16 @@ SENSORS = {
 }
 
 
-def in_view(chain, what):
-    """Return the chain with the lens of a camera where the sensor is one."""
+def in_view(chain, what, off=None):
+    """Return the chain with the lens of a camera where the sensor is one.
+
+    It is nearly right and fitted, or held at values that are `off` by a share.
+    """
+    lens = TOLD
+    if off is not None:
+        shift = off * LENS['fx']
+        wrong = {key: LENS[key] + shift for key in ('fx', 'fy', 'cx', 'cy')}
+        lens = Lens(**LENS | wrong, fixed=True)
     if what == 'fixed camera':
-        return replace(chain, base=Frame(lens=TOLD))
-    return replace(chain, tool=Frame(lens=TOLD)) if what.startswith('camera') else chain
+        return replace(chain, base=Frame(lens=lens))
+    return replace(chain, tool=Frame(lens=lens)) if what.startswith('camera') else chain

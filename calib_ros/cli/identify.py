@@ -141,8 +141,9 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
     elif not found.changed:
         screen.bullet('unchanged within the uncertainty')
     if found.accepted or not found.determined:
+        perhaps = 'perhaps ' if why else ''
         for reasons in found.changed:
-            screen.bullet(reason_in_words(reasons))
+            screen.bullet(perhaps + reason_in_words(reasons))
 
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:

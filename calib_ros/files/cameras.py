@@ -52,15 +52,14 @@ class BoardCamera:
         lens = self._lens
         if isinstance(lens, Refusal):
             return lens
-        try:
-            image = image_of(message)
-            if image.size and all(self._size) and image.shape != self._size:
-                sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, self._size))
-                reason = f'it and its CameraInfo are of {sizes} px: set both alike'
-                return Refusal('of another size than its CameraInfo', reason)
-            found = self._detector.of(image)
-        except CalibrationError as err:
-            return Refusal('that cannot be decoded', str(err))
+        image = image_of(message)
+        if isinstance(image, Refusal):
+            return image
+        if image.size and all(self._size) and image.shape != self._size:
+            sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, self._size))
+            reason = f'it and its CameraInfo are of {sizes} px: set both alike'
+            return Refusal('of another size than its CameraInfo', reason)
+        found = self._detector.of(image)
         if isinstance(found, Refusal):
             return found
         number, pixels = found
@@ -90,12 +89,15 @@ def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
     return {source.topic: BoardCamera(source) for source in sources}
 
 
-def image_of(message: Any) -> Image:
-    """Return a sensor_msgs/Image or CompressedImage in grey."""
+def image_of(message: Any) -> Image | Refusal:
+    """Return a sensor_msgs/Image or CompressedImage in grey, or why it cannot be decoded."""
     data = np.frombuffer(message.data, dtype=np.uint8)
     if hasattr(message, 'format'):
         return decoded(data)
-    return grey(data, message.height, message.width, message.step, message.encoding)
+    try:
+        return grey(data, message.height, message.width, message.step, message.encoding)
+    except CalibrationError as err:
+        return Refusal('that cannot be decoded', str(err))
 
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,8 @@ def files_of(folder: Path) -> list[Path]:
 def read_image(path: Path) -> Image | Refusal:
     """Return an image in grey, without pixels if it is none, or why it cannot be read."""
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # to read from a pipe would never end
+            return Refusal('that cannot be read', 'it is not a file')
         if path.stat().st_size > LARGEST_IMAGE:
             return Refusal('that cannot be read', f'it has more than {LARGEST_IMAGE / 1e6:.0f} MB')
         return decoded(np.frombuffer(path.read_bytes(), dtype=np.uint8))

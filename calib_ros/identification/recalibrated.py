@@ -53,8 +53,13 @@ class Recalibration(Shown):
 
     @property
     def determined(self) -> bool:
-        """Tell whether the arm is known about as well as before, or far better than it changed."""
-        return self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
+        """Tell whether other poses confirm a change, and the arm is then known well enough.
+
+        That is about as well as before, or far better than it changed.
+        """
+        confirmed = not self.changed or self.after.rms_mm < self.anew * self.before.rms_mm
+        known = self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
+        return confirmed and known
 
     @property
     def scale(self) -> Explanation | None:

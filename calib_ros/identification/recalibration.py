@@ -279,7 +279,15 @@ class _Arm:
         for _ in range(4):  # of changes by millimetres the second moves nothing any more
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
             plain, cross, doubtful = told_of(
-                chain, self.names, system, 1.0, {}, {}, True, None, system.count
+                chain,
+                self.names,
+                system,
+                noise=1.0,
+                doubts={},
+                lengths={},
+                by_device=True,
+                known=None,
+                most=system.count,
             )
             products = plain - cross @ np.linalg.solve(doubtful, cross.T)
             matrix, gradient = products[:-1, :-1], products[:-1, -1]

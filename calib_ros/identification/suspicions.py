@@ -46,7 +46,7 @@ from calib_ros.identification.configurations import distinct
 from calib_ros.identification.fitting import fit
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
-from calib_ros.identification.levels import CLEARLY, NEARER, SCALE, SURE
+from calib_ros.identification.levels import CLEARLY, NEARER, SCALE, SURE, chance_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import SHELL
@@ -257,11 +257,11 @@ def _sigmas(problem: Problem, result: Identification) -> str:
 
 
 def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
-    """Return in words that other intrinsics than those given explain most of what is left.
+    """Return in words that other intrinsics than those given explain what is left.
 
-    Also whether the arm found imitates them: fitted with them it is another one, by as much as
-    it may be nearer to the nominal. The points of an image share its pose, so each image counts
-    for the freedoms of that only.
+    Most of it, or more than chance does where the arm found imitates them: fitted with them it is
+    another one, by as much as it may be nearer to the nominal. Whether it does, too. The points
+    of an image share its pose, so each image counts for the freedoms of that only.
     """
     if not result.converged or (result.step is not None and result.step.harmful):
         return '', False
@@ -275,13 +275,17 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
         if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
             continue
         left = 1.0 - _explained(problem, result.chain, result.names, names)
-        share = 1.0 - left * freedom / (freedom - len(names))
-        if share > EXPLAINED:
+        rest = freedom - len(names)
+        if chance_of((1.0 - left) / max(left, EXACT) * rest, len(names), rest) > 1.0 - SURE:
+            continue
+        fitted = replace(frame, lens=replace(frame.lens, fixed=False))
+        imitated = _imitated(problem, result, problem.chain.with_frame(camera, fitted))
+        share = 1.0 - left * freedom / rest
+        if imitated or share > EXPLAINED:
             lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
             text = f'other intrinsics of the camera than those given explain {100.0 * share:.0f} %'
             text += f' of what is left: {lens}, or calibrate the camera as it is used'
-            fitted = replace(frame, lens=replace(frame.lens, fixed=False))
-            return text, _imitated(problem, result, problem.chain.with_frame(camera, fitted))
+            return text, imitated
     return '', False
 
 

@@ -72,6 +72,7 @@ def cell(tmp_path_factory):
         write_csv(folder / 'new.csv', rows_of(measured(seed=11))[:TEST])
         bumped = TRUE.with_offsets(BUMP)
         write_csv(folder / 'bumped.csv', rows_of(measured(bumped, seed=7)))
+        write_csv(folder / 'one.csv', rows_of(measured(bumped, seed=7))[:1])
         plants.write_plant(folder, ['0042', '0043'], 3, bumps={'0043': (2, BUMP)})
         table = ['measured.csv', '--chain', 'ur5e']
         filed = ['--history', 'history', '--serial', '0042']
@@ -182,6 +183,7 @@ RESULTS = {
 MORE = {
     'identify_refused': (3, 'identify', 'good_arm.csv', *UR5E),
     'identify_previous': (0, 'identify', 'bumped.csv', *UR5E, '--previous', 'result'),
+    'identify_previous_refused': (3, 'identify', 'one.csv', *UR5E, '--previous', 'result'),
     'identify_of_a_program': (1, 'identify', 'result/report.html', *UR5E),
     'verify_of_a_bag': (3, 'verify', 'bag', *UR5E, '--calibration', 'result', '--tolerance', '1'),
     'identify_another_arm': (3, 'identify', 'measured.csv', '--chain', 'ur10'),

@@ -4,6 +4,7 @@
 
 import csv
 import json
+import os
 import re
 import struct
 import zlib
@@ -109,11 +110,14 @@ def test_images_of_another_size_than_most_are_refused():
 
 def test_what_cannot_be_read_is_not_used(tmp_path):
     (tmp_path / 'folder.png').mkdir()
+    os.mkfifo(tmp_path / 'pipe.png')  # which nobody will ever write to
     (tmp_path / 'gone.png').symlink_to(tmp_path / 'nowhere')
     with (tmp_path / 'huge.png').open('wb') as file:
         file.truncate(LARGEST_IMAGE + 1)
     huge = ('huge', 'it has more than')
-    for name, reason in (huge, ('folder', 'Is a directory'), ('gone', 'No such file')):
+    other = 'it is not a file'
+    gone = ('gone', 'No such file')
+    for name, reason in (huge, ('folder', other), ('pipe', other), gone):
         found = read_image(tmp_path / f'{name}.png')
         assert isinstance(found, Refusal)
         assert reason in found.reason

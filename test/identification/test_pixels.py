@@ -356,9 +356,12 @@ def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
     assert words in str(result.refusals[0])
 
 
-@pytest.mark.parametrize('kind', ['degrees', 'mirrored', 'mount'])
-def test_a_fit_that_runs_away_is_told_in_figures(kind):
-    wrong = MISTAKES[kind][0](scene(0, False)[1])
+@pytest.mark.parametrize(
+    ('kind', 'seed', 'on_flange'),
+    [('degrees', 1, False), ('sign', 4, False), ('shift', 2, False)],
+)
+def test_a_fit_that_runs_away_is_told_in_figures(kind, seed, on_flange):
+    wrong = MISTAKES[kind][0](scene(seed, on_flange)[1])
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         result = identify(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))

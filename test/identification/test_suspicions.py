@@ -245,6 +245,19 @@ def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, erro
             assert result.accepted == (errors > 0.0 and not harmful)
 
 
+def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little():
+    """An arm follows so much of a wrong lens that less than half is left for other intrinsics."""
+    rng, camera = np.random.default_rng(5), Camera()
+    true = before_camera(arm(5, 0.2), camera, POINTS, False, rng)
+    seen = photograph(true, camera, POINTS, False, 25, rng, 0.1)
+    off = camera.lens.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 3.0))
+    for lens, refused in ((camera.lens, False), (off, True)):
+        chain = UR.with_frame('base', Frame(lens=lens))
+        result = identify(Problem(chain, seen, sigma_pixel=0.1))
+        assert result.accepted == (not refused)
+        assert any('--lens fitted' in each for each in result.refusals) == refused
+
+
 @pytest.mark.parametrize('on_flange', [True, False])
 def test_a_board_that_is_stretched_is_told(on_flange):
     rng, camera = np.random.default_rng(3), Camera()
