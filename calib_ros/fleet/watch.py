@@ -45,7 +45,7 @@ from calib_ros.files.history import Row
 from calib_ros.identification.changes import (
     Columns,
     Explanation,
-    Told,
+    Information,
     explanations,
     likely,
     reason_in_words,
@@ -197,8 +197,8 @@ def _cause(
     if two.min(initial=1.0) < level * (one.min() if one.min() < level else 1.0):
         return lag, (), tests.groups[len(one) + int(two.argmin())]
     columns = Columns(row.corrected(), tests.names)
-    told = Told(tests.names, tests.weight[lag, k], tests.pull[lag, k])
-    return lag, likely(explanations(told, columns, float(tests.freedom[k]))), ()
+    information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
+    return lag, likely(explanations(information, columns, float(tests.freedom[k]))), ()
 
 
 class _Tests(NamedTuple):

@@ -2,21 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rules of acceptance: what a result must show before it may replace the nominal parameters.
 
-1. The fit has converged.
-2. The rank is full apart from gauges: no parameter that other poses would determine is left out.
-3. The RMS position error on held-out poses is lower than before, by more than its uncertainty
-   (one-sided 95 %, Student's t over configurations; see `log_gain`). The orientation must not get
-   worse by the same measure.
-4. The gain is not drift: time-shifted residuals are not explained equally well (`drift.py`; 95 %).
-5. No DH parameter is certainly (by three standard deviations) further from nominal than
-   `largest_length` or `largest_angle`, and at most `largest_error` remains: otherwise it is
-   another robot, not a faulty one.
-6. At most a share of MOST_OUTLIERS of the pairs to judge on are outliers.
-7. Nothing moved during the session (`steps.py`).
-8. Outliers are not the arm's own behaviour (`misfits.py`), and the error including them does not
-   get worse: neither its mean, nor with 99 % confidence its RMS.
-9. Rounding of the joint values does not explain the gain as well (`rounding.py`).
-10. The calibration improves the arm at the measured poses at least (`region.py`).
+docs/model.md (Judgement) lists and explains them.
 """
 
 from __future__ import annotations
@@ -43,10 +29,11 @@ def refusals(
     may_be_rounding: bool,
     sized: bool,
 ) -> tuple[Reason, ...]:
-    """Return the rules of acceptance that fail, in words.
+    """Return the acceptance rules that fail.
 
-    By the result, by what else explains the gain (`misfits.py`, `rounding.py`), and by whether
-    anything that was measured tells the size of the arm.
+    `own_behaviour` describes outliers that are the arm's own (`misfits.py`), `may_be_rounding` is
+    the verdict of `rounding.py`, and `sized` tells whether the measurements fix the size of the
+    arm.
     """
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
@@ -69,18 +56,18 @@ def refusals(
 def _of_the_fit(
     problem: Problem, result: Identification, own_behaviour: str | None
 ) -> Iterator[Reason]:
-    """Yield what is wrong whatever the error on poses left out."""
+    """Yield failed rules that do not depend on held-out poses."""
     if result.step is not None and result.step.harmful:
         yield result.step.reason
     if own_behaviour is not None:
         yield Reason(Rule.OWN_BEHAVIOUR, own_behaviour)
     if not result.converged:
         yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
-    if untold := result.not_excited:
+    if missing := result.not_excited:
         kinds: dict[str, list[str]] = {}
-        for each in untold:
+        for each in missing:
             kinds.setdefault(each.owner, []).append(each.kind)
-        named = ', '.join(f'{owner} ({", ".join(of)})' for owner, of in kinds.items())
+        named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
         yield Reason(Rule.EXCITATION, f'the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
@@ -92,7 +79,7 @@ def _of_the_fit(
 def _gain(
     validation: Comparison, part: str, which: NDArray[np.bool_], *confidence: float
 ) -> tuple[float, float]:
-    """Return the `log_gain` of errors of `position` or `orientation` of pairs (N,)."""
+    """Return the `log_gain` in `position` or `orientation` of pairs by a mask (N,)."""
     before, after = (getattr(each, part)[which] for each in (validation.before, validation.after))
     return log_gain(before, after, validation.after.configurations[which], *confidence)
 
@@ -100,7 +87,7 @@ def _gain(
 def _of_the_gain(
     problem: Problem, result: Identification, validation: Comparison, sized: bool
 ) -> Iterator[Reason]:
-    """Yield why the error on poses left out does not show that the arm got better."""
+    """Yield why held-out poses do not show an improvement of the arm."""
     before, after = validation.figures
     if after.rms_mm > 1e3 * problem.largest_error:
         yield Reason(
@@ -139,7 +126,6 @@ def _of_the_gain(
 
 
 def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
-    """Yield what got worse, or may be no gain of the arm."""
     if validation.outliers:
         first, second = validation.figures_of_all
         gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
@@ -166,10 +152,10 @@ def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
 
 
 def _loss_by_chance(validation: Comparison) -> float:
-    """Return how large chance could make the logarithm of RMS after / RMS before, with outliers.
+    """Return the log of RMS after / RMS before, outliers included, that chance could cause.
 
-    A gross error far larger than the correction gets larger or smaller by it as chance will have
-    it: Student's t of the differences of squares, to which one outlier is one.
+    A correction makes a much larger gross error bigger or smaller at random. Student's t of the
+    differences of squares accounts for that, even with a single outlier.
     """
     before, after = validation.before, validation.after
     means = mean_squares(before.position, after.position, after.configurations)
@@ -182,14 +168,15 @@ def _loss_by_chance(validation: Comparison) -> float:
 
 
 def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
-    """Return what is suspicious about a result that is not refused for it.
+    """Return what is suspicious about a result but no reason to refuse it.
 
-    `coarse` are the steps [rad or m] of rounded joint values.
+    `coarse` holds the steps [rad or m] of rounded joint values.
     """
     found = [] if step is None or step.harmful else [str(step)]
     units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
     steps = [f'{name} ({1e3 * size:.3g} m{units[name]})' for name, size in coarse.items()]
     if steps:
-        listed = ', '.join(steps)
-        found.append(f'joint values are multiples of a step: {listed}; record more digits')
+        found.append(
+            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
+        )
     return tuple(found)

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A calibration, saved and loaded whole: a chain file with a record of its origin.
+"""A calibration: a chain file with a record of its origin.
 
-What it removes at q is the distance between the nominal arm, in fitted frames, and the calibrated
-one. What remains is predicted by the expected squares C of the parameters' errors, with J the rows
-of position of the error model, and by the RMS error r on poses that were not fitted,
+It removes at q the distance between the nominal arm, in fitted frames, and the calibrated one. The
+remaining error is predicted from the expected squares C of the parameter errors, with J the
+position rows of the error model, and the RMS error r on held-out poses:
 
     removed(q) = |p_nominal - p|      sigma(q)^2 = tr J C J^T      remaining(q)^2 = sigma^2 + r^2
 
-The arm is expected to miss by the root of removed^2 + remaining^2 if commanded by its nominal
-model, by `remaining` if by its calibrated one.
+Commanded by its nominal model the arm is expected to miss by the root of removed^2 + remaining^2,
+by its calibrated model by `remaining`.
 """
 
 from __future__ import annotations
@@ -56,25 +56,24 @@ class Calibration(Shown):
     before: Chain
     """The nominal chain in fitted frames."""
     names: tuple[str, ...] = ()
-    """Parameters that were fitted, (P,)."""
+    """Fitted parameters, (P,)."""
     covariance: FloatArray | None = None
-    """Theirs, (P, P)."""
+    """Of the fitted parameters, (P, P)."""
     freedom: float = np.inf
-    """Degrees of freedom from which it was estimated."""
+    """Degrees of freedom of the covariance estimate."""
     residual: float | None = None
-    """RMS position error [m] on poses that were not fitted."""
+    """RMS position error [m] on held-out poses."""
     noise: Noise | None = None
-    """Of the measurements."""
     region: Region | None = None
     """Where the calibration may be used."""
     world_frame: str = ''
-    """Frame in which the poses were measured."""
+    """Frame of the measured poses."""
     owners: Mapping[str, records.Owner] = field(default_factory=dict)
     """Session, device or target of each frame (`sampling.sample.Frames`)."""
     record: Mapping[str, Any] = field(default_factory=dict)
-    """Where the numbers come from, as in the file, without covariance and rows."""
+    """Origin of the numbers, as in the file, without covariance and rows."""
     rows: records.Fingerprint | None = None
-    """Of the measurements that were fitted."""
+    """Of the fitted measurements."""
 
     @classmethod
     def of(
@@ -87,7 +86,7 @@ class Calibration(Shown):
         """Return the calibration of an identification; `origin` describes the `fitted` samples."""
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
-        rms_mm = round(after.rms_mm, 6)  # one that was loaded knows the same
+        rms_mm = round(after.rms_mm, 6)  # as in the file
         record = {
             **made(),
             'accepted': result.accepted,
@@ -119,7 +118,7 @@ class Calibration(Shown):
         )
 
     def dump(self) -> str:
-        """Return the text of a chain file, which can be used as input."""
+        """Return the text of the chain file."""
         record = dict(self.record)
         if self.covariance is not None:
             record['covariance'] = {
@@ -132,7 +131,7 @@ class Calibration(Shown):
         return HEAD + dump_chain(self.chain, record)
 
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return distance (N,) [m] and angle (N,) [rad] between before and after at (N, n)."""
+        """Return the correction at joint values (N, n): distance (N,) [m] and angle (N,) [rad]."""
         before, after = self.before.forward(joints), self.chain.forward(joints)
         turn = se3.log_rotation(before[:, :3, :3] @ np.swapaxes(after[:, :3, :3], 1, 2))
         shift = before[:, :3, 3] - after[:, :3, 3]
@@ -157,11 +156,11 @@ class Calibration(Shown):
         return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
 
     def remaining(self, joints: FloatArray) -> FloatArray:
-        """Return the error (N,) [m] expected to remain at (N, n); NaN if unknown."""
+        """Return the expected remaining error (N,) [m] at joint values (N, n); NaN if unknown."""
         return np.hypot(self.sigma(joints), self.residual or 0.0)
 
     def expected(self, joints: FloatArray, model: Model) -> FloatArray:
-        """Return the error (N,) [m] expected when a model commands the arm to (N, n)."""
+        """Return the expected error (N,) [m] of a model at joint values (N, n)."""
         if model not in MODELS:
             raise UnknownNameError('model', model, MODELS)
         left = self.remaining(joints)
@@ -175,22 +174,22 @@ class Calibration(Shown):
         return left
 
     def holds(self, rms: float) -> bool | None:
-        """Tell whether the RMS error [m] of new poses agrees with the one before, if known."""
+        """Tell whether the RMS error [m] of new poses agrees with the earlier one, if known."""
         return None if self.residual is None else rms <= ALIKE * self.residual
 
     def reused(self, sets: Sequence[Observations]) -> float:
-        """Return the share of measurements to which it was fitted, as far as known."""
+        """Return the share of measurements that this calibration was fitted to, if known."""
         return 0.0 if self.rows is None else self.rows.share(sets)
 
     def commanded_by(self, model: Model) -> Chain:
-        """Return the chain by which a model turns poses into joint values."""
+        """Return the chain that converts poses to joint values for a model."""
         return self.chain if model == 'corrected' else self.before
 
     def knowledge(self, joints: FloatArray, turned: FloatArray) -> tuple[str, str]:
-        """Return how well the poses of a program at (N, n) are known, and a warning if not enough.
+        """Return how well a program's poses at joint values (N, n) are known, and a warning.
 
-        `turned` (N,) [rad] are the errors of orientation to correct. Both are empty where the
-        covariance is not known, or nothing is to be warned about.
+        `turned` (N,) [rad] are the orientation errors to correct. Both texts are empty if there is
+        nothing to say.
         """
         if self.covariance is None:
             return '', ''
@@ -209,13 +208,13 @@ class Calibration(Shown):
 
 
 def made() -> dict[str, str]:
-    """Return when and by what a calibration is made, for its record."""
+    """Return the time and software version, for the record."""
     now = datetime.now(timezone.utc).isoformat(timespec='seconds')
     return {'created': now, 'software': f'calib_ros {calib_ros.__version__}'}
 
 
 def about(chain: Chain, before: Chain, region: Region | None) -> dict[str, Any]:
-    """Return of what arms a calibration is, and where it holds, for its record."""
+    """Return the identity of the arm and its region, for the record."""
     return {
         'table_sha256': table_hash(chain),
         'nominal': records.nominal_document(before) | frames_document(before),
@@ -224,7 +223,7 @@ def about(chain: Chain, before: Chain, region: Region | None) -> dict[str, Any]:
 
 
 def calibration_file(path: str | os.PathLike[str]) -> Path:
-    """Return the file of a calibration, which may be in the folder of an identification."""
+    """Return the calibration file at a path or in an identification's folder."""
     file = Path(path)
     return file / 'calibration.yaml' if file.is_dir() else file
 
@@ -240,21 +239,19 @@ def load_calibration(
 def parse_calibration(
     text: str, where: str, nominal: Chain | None = None, settings: Settings | None = None
 ) -> Calibration:
-    """Turn the text of a calibration into what it says; `where` names it in errors.
+    """Parse the text of a calibration; errors name it `where`.
 
-    A correction by the wrong chain moves the arm anywhere. So the record must be present, as in
-    all files of calib_ros, and must agree with a given nominal chain; nor may the numbers differ
-    from it by more than `largest_length` and `largest_angle` of the settings. Without settings the
-    identification has judged that, if it records the numbers of this chain. Without a nominal
-    chain the recorded one is used; without its frames, those that bring it closest to the
-    corrected one.
+    A correction by the wrong chain moves the arm anywhere, so the record must be present and must
+    agree with a given nominal chain. With settings, the parameters may differ from it by at most
+    `largest_length` and `largest_angle`; without, the recorded identification has judged that.
+    Without a nominal chain the recorded one is used; without recorded frames, those closest to the
+    corrected arm.
 
     Raises
     ------
     ConfigError
-        If the text is not a chain file, has no record, or is a calibration that was not accepted
-        or was identified from another nominal chain.
-
+        If the text is no chain file, has no record, was not accepted, or was identified from
+        another nominal chain.
     """
     chain = parse_chain(text, where)
     if nominal is not None:

@@ -2,23 +2,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Search for the few parameters of an arm that have changed.
 
-The information about the change x of all parameters is a normal likelihood with the information
-matrix A and the vector b = A x^ (A may be singular: some poses determine only some parameters).
-Changes that need no explanation, x ~ N(0, K), such as the uncertainty of an earlier calibration,
-are marginalised first:
+Information about the change x of all parameters is a normal likelihood with matrix A and vector
+b = A x^ (A may be singular: some poses determine only some parameters). Expected changes
+x ~ N(0, K), such as the uncertainty of an earlier calibration, are marginalised first:
 
     A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
-An explanation states x = G z: one parameter has changed, or all of a joint (a bent link) or of a
-frame (the device or the target was moved), or the device measures in another scale. It gains of
-chi-squared, with as many degrees of freedom as z,
+An explanation is x = G z: one parameter, all of a joint (a bent link) or of a frame (a moved
+device or target), or the scale of the device has changed. It reduces chi-squared, with as many
+degrees of freedom as z, by
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
-A change is claimed if chance, over all explanations tried, gains as much in at most FALSE of the
-cases (Bonferroni). Explanations are compared by their evidence with z ~ N(0, S), S the typical
-size of changes, which penalises additional parameters (MacKay 1992). Those whose share of it
-exceeds 1 - CONFIDENT cannot be distinguished from the best one.
+A change is claimed if chance gains as much, over all explanations tried, with probability FALSE at
+most (Bonferroni). Explanations are compared by their evidence with z ~ N(0, S), S the typical size
+of changes, which penalises additional parameters (MacKay 1992). Those with a share above
+1 - CONFIDENT are indistinguishable from the best.
 """
 
 from __future__ import annotations
@@ -41,25 +40,25 @@ from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
 FALSE = 0.5 * (1.0 - CERTAIN)
-"""Probability of claiming a change of an arm that has not changed, one side of what is certain
+"""False-alarm probability for an unchanged arm: one side of CERTAIN
 (benchmarks/recalibration.py)."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
-"""Size [m, rad] of changes by a collision or a motor that was replaced; a factor of three either
-way costs half a unit of the evidence's logarithm."""
+"""Typical size [m, rad] of changes by a collision or a replaced motor; a factor of three either
+way costs half a unit of log evidence."""
 SCALE_OF_DEVICE = Parameter('device', 'ratio')
-"""Growth of all that a device measures: of the lengths of the arm, and of the way to it."""
+"""Scale of all measured lengths: of the arm, and of the distance to it."""
 ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
-"""Kinds in the order in which they are named where two of a joint do the same."""
+"""Order in which a joint's parameters are named if two have the same effect."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Explanation(Shown):
-    """What may have changed, by how much, and how well that explains what was seen.
+    """A possible change, its size, and how well it explains the measurements.
 
-    k parameters `names` of a joint or frame, the `owner`, have changed by `change` (k,) with
-    standard deviations `sigma` (k,) [m, rad]. That gains so much of chi-squared with k degrees of
-    freedom. `chance` is the probability of so large a gain for any explanation if nothing has
-    changed, `share` that of the evidence of all explanations.
+    The k parameters `names` of a joint or frame (`owner`) change by `change` (k,) with standard
+    deviations `sigma` (k,) [m, rad], which reduces chi-squared by `gain`. `chance` is the
+    probability of such a gain for any explanation if nothing has changed, `share` the share of the
+    evidence of all explanations.
     """
 
     owner: str
@@ -71,14 +70,14 @@ class Explanation(Shown):
     sigma: FloatArray
 
     def in_words(self) -> str:
-        """Return what has changed, and by how much where it is one parameter."""
+        """Return the changed parameter and its size, or the changed parameters."""
         if len(self.names) > 1:
             return f'{self.owner} ({", ".join(name.kind for name in self.names)})'
         what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
         return f'{what} by {self.size_in_words()}'
 
     def size_in_words(self) -> str:
-        """Return by how much its one parameter has changed."""
+        """Return the size of the change of a single parameter."""
         (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
         if self.names == (SCALE_OF_DEVICE,):
             return f'{1e6 * change:+.0f} ± {1e6 * sigma:.0f} ppm'
@@ -86,14 +85,14 @@ class Explanation(Shown):
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:
-    """Return what has changed, with what cannot be told apart from it."""
+    """Return the best explanation and those indistinguishable from it."""
     first, *others = (each.in_words() for each in reasons)
     text = f'changed: {first}'
     return f'{text}, indistinguishable from {" or ".join(others)}' if others else text
 
 
 def changes_in_words(changed: Sequence[Sequence[Explanation]]) -> str:
-    """Return changes one after the other, each with what cannot be told apart from it."""
+    """Return several changes, each with its indistinguishable explanations."""
     return '; '.join(map(reason_in_words, changed))
 
 
@@ -113,32 +112,32 @@ def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Told(Shown):
-    """Information (P, P) and vector (P,) about the change of parameters `names`."""
+class Information(Shown):
+    """Matrix (P, P) and vector (P,) of the information about changes of parameters `names`."""
 
     names: tuple[Parameter, ...]
-    information: FloatArray
+    matrix: FloatArray
     vector: FloatArray
 
-    def beside(self, square: FloatArray) -> Told:
-        """Return what is told beside changes that need no explanation, of covariance (P, P)."""
+    def marginalised(self, square: FloatArray) -> Information:
+        """Return the information after marginalising expected changes of covariance (P, P)."""
         mean, covariance = self.mean(square)
-        left = self.information - self.information @ covariance @ self.information
-        return Told(self.names, left, self.vector - self.information @ mean)
+        left = self.matrix - self.matrix @ covariance @ self.matrix
+        return Information(self.names, left, self.vector - self.matrix @ mean)
 
     def mean(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean (P,) and covariance (P, P) of changes that were N(0, square) before."""
+        """Return posterior mean (P,) and covariance (P, P) of changes with prior N(0, square)."""
         scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
         sizes, directions = linalg.eigh(square / np.outer(scale, scale))
         root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
-        inner = np.eye(len(scale)) + root.T @ self.information @ root
+        inner = np.eye(len(scale)) + root.T @ self.matrix @ root
         factor = linalg.cholesky(inner, lower=True)
         left = linalg.solve_triangular(factor, root.T, lower=True)
         return left.T @ (left @ self.vector), left.T @ left
 
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
-        """Return the gain by changes along columns (P, k), these, their covariance, its rank."""
-        inner = columns.T @ self.information @ columns
+        """Return gain, changes, their covariance and its rank for columns (P, k)."""
+        inner = columns.T @ self.matrix @ columns
         scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
         covariance = scale[:, np.newaxis] * linalg.pinvh(inner * np.outer(scale, scale), rtol=1e-9)
         covariance = covariance * scale
@@ -148,64 +147,65 @@ class Told(Shown):
         return float(seen @ values), values, covariance, rank
 
     def evidence(self, columns: FloatArray, sizes: FloatArray) -> float:
-        """Return the logarithm of the evidence of changes along columns (P, k), of sizes (k,)."""
+        """Return the log evidence of changes along columns (P, k) of sizes (k,)."""
         scaled = columns * sizes
-        inner = np.eye(len(sizes)) + scaled.T @ self.information @ scaled
+        inner = np.eye(len(sizes)) + scaled.T @ self.matrix @ scaled
         seen = scaled.T @ self.vector
         gain = float(seen @ np.linalg.solve(inner, seen))
         return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
 
 
-def explanations(told: Told, columns: Columns, freedom: float) -> tuple[Explanation, ...]:
-    """Return what may explain a change, the best first.
+def explanations(
+    information: Information, columns: Columns, freedom: float
+) -> tuple[Explanation, ...]:
+    """Return the possible explanations of a change, best first.
 
-    `freedom` are the degrees of freedom from which the size of the noise was estimated.
+    `freedom` are the degrees of freedom of the noise estimate.
     """
     if not columns.sets:
         return ()
-    logs = [told.evidence(columns.of(names), _sizes(names)) for _, names in columns.sets]
+    logs = [information.evidence(columns.of(names), _sizes(names)) for _, names in columns.sets]
     found = []
     for (owner, names), share in zip(columns.sets, special.softmax(logs).tolist(), strict=True):
-        gain, change, covariance, rank = told.explained(columns.of(names))
+        gain, change, covariance, rank = information.explained(columns.of(names))
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         chance = min(1.0, len(logs) * chance_of(gain, rank, freedom))
         found.append(Explanation(owner, names, gain, chance, share, change, sigma))
     return tuple(sorted(found, key=lambda each: -each.share))
 
 
-def reasons_of(told: Told, columns: Columns, freedom: float) -> tuple[Explanation, ...]:
-    """Return the best explanation of a change and those that cannot be told apart from it.
-
-    None where chance explains it as well.
+def reasons_of(
+    information: Information, columns: Columns, freedom: float
+) -> tuple[Explanation, ...]:
+    """Return the best explanation and those indistinguishable from it; none if chance may explain
+    it.
     """
-    found = explanations(told, columns, freedom)
+    found = explanations(information, columns, freedom)
     return likely(found) if any(each.chance <= FALSE for each in found) else ()
 
 
 def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
-    """Return the best of some explanations, and those that cannot be told apart from it."""
+    """Return the best explanation and those indistinguishable from it."""
     return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or tuple(found[:1])
 
 
 def _sizes(names: Sequence[Parameter]) -> FloatArray:
-    """Return the typical sizes (k,) [m, rad] of changes."""
     return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES[n.unit] for n in names])
 
 
 class Columns:
-    """How changes of an arm's parameters show in those that information is about.
+    """Effects of an arm's changes on the parameters with information.
 
     Parameters
     ----------
     chain : Chain
     names : sequence of Parameter
-        P parameters that information is about. Changes of others show in these if they are gauge
-        freedoms beside them, and not at all otherwise.
+        The P parameters with information. Changes of others show in these if they are gauge
+        freedoms beside them, otherwise not at all.
     frames : sequence of str
-        Frames that may have moved; others are free, and take up whatever they can.
+        Frames that may have moved; others are free and absorb what they can.
     scaled : bool
-        The device may measure in another scale than before.
-
+        Whether the scale of the device may have changed.
     """
 
     def __init__(
@@ -223,7 +223,7 @@ class Columns:
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
         for joint in chain.joint_names:
-            own = self._unlike(parameters_of(joint, ORDER))
+            own = self._distinct(parameters_of(joint, ORDER))
             sets += [(joint, (name,)) for name in own]
             sets += [(joint, own)] if len(own) > 1 else []
         for frame in frames:
@@ -236,8 +236,8 @@ class Columns:
             sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
         self.sets = tuple(sets)
 
-    def _unlike(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:
-        """Return which of some parameters show and do not do the same as one before."""
+    def _distinct(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:
+        """Return the observable parameters, without those equivalent to an earlier one."""
         units: dict[Parameter, FloatArray] = {}
         for name in names:
             if name in self._columns:
@@ -251,7 +251,7 @@ class Columns:
         return np.array([self._columns[name] for name in names]).T
 
     def spread(self, reasons: Sequence[Explanation]) -> FloatArray:
-        """Return the covariance (P, P) of changes whose sizes are left to the data."""
+        """Return the prior covariance (P, P) of changes whose sizes the data determine."""
         parts = [self.of(each.names) * (SPREAD * _sizes(each.names)) for each in reasons]
         square = np.hstack(parts)
         return np.asarray(square @ square.T)
@@ -260,10 +260,10 @@ class Columns:
 def gauged(
     chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter], free: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how changes of other parameters show in those named, with `free` frames.
+    """Return how changes of other parameters show in the named ones, with `free` frames.
 
-    The first (P, K) are the changes of P parameters that move the arm as a unit of each of the K
-    others does, at poses all over the joint range; the second (K,) the share of it that is left.
+    The first array (P, K) holds the changes of P parameters that best reproduce a unit change of
+    each of K others over the joint range, the second (K,) the share that is left.
     """
     rng = np.random.default_rng(0)
     q = chain.random_joints(SOME_POSES, rng)
@@ -276,7 +276,7 @@ def gauged(
 
 
 def predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
-    """Return V (P, P) [m^2]: d^T V d is the mean squared difference of positions by d.
+    """Return V (P, P) [m^2], where d^T V d is the mean squared position change by d.
 
     Over the joint range, in the best frames.
     """

@@ -17,43 +17,43 @@ from calib_ros.kinematics.se3 import FloatArray, cos_sin
 from calib_ros.settings import Settings
 
 STILL = 2.0 * Settings.still
-"""Joint values [rad or m] that differ by less are one configuration: both may leave it."""
+"""Joint values [rad or m] that differ by less are one configuration: both may deviate from it."""
 SCATTER = 0.02
-"""Distance [rad or m] up to which visits of one configuration may scatter (benchmarks/harm.py)."""
+"""Largest scatter [rad or m] of visits to one configuration (benchmarks/harm.py)."""
 
 
 def distinct(numbers: NDArray[np.intp]) -> int:
-    """Return how many different numbers (N,) of configurations there are."""
+    """Return the number of different configurations in (N,)."""
     return int(np.count_nonzero(np.bincount(numbers)))
 
 
 def stops(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (N,) the number of the stop at which joint values (N, n) in sequence were taken."""
+    """Return the stop number (N,) of consecutive joint values (N, n)."""
     moved = np.zeros(len(joints), dtype=np.intp)
     moved[1:] = ~_still(np.diff(joints, axis=0))
     return np.cumsum(moved)
 
 
 def _still(change: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which changes (N, n) of joint values are none; angles modulo a turn."""
+    """Return which changes (N, n) of joint values are within STILL (N,), modulo a turn."""
     change = np.abs(change) % (2.0 * np.pi)
     return np.asarray(np.minimum(change, 2.0 * np.pi - change).max(axis=1) <= STILL)
 
 
 def configurations(joints: FloatArray) -> NDArray[np.intp]:
-    """Return (N,) the number of the configuration that joint values (N, n) belong to.
+    """Return the configuration number (N,) of joint values (N, n).
 
-    Values within STILL of each other are one configuration, whenever they were taken: a program
-    that runs in a loop visits it again, it does not measure another one. So are those that lie
-    as close together beside their distance from all others. Angles count modulo a full turn.
+    Values within STILL of each other are one configuration, whenever they were taken: a program in
+    a loop revisits it instead of measuring another. So are values that are close together compared
+    with their distance to all others. Angles count modulo a full turn.
     """
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
     number = stops(joints)
     standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
-    place = np.concatenate(cos_sin(standing), axis=1)  # which knows no turns
+    place = np.concatenate(cos_sin(standing), axis=1)  # modulo a turn
     close = _pairs(place, SCATTER)
-    # what stands still is nearer than visits may scatter
+    # STILL < SCATTER, so `close` holds all these pairs
     near = close[_still(standing[close[:, 0]] - standing[close[:, 1]])]
     links = _graph(np.ones(len(near)), near[:, 0], near[:, 1], len(standing))
     _, label = connected_components(links, directed=False)
@@ -64,10 +64,10 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
 
 
 def _repeats(place: FloatArray) -> NDArray[np.intp]:
-    """Return (N,) which places (N, 2 n) are visits of one configuration that scatter.
+    """Return the configuration number (N,) of places (N, 2 n), where scattered visits are one.
 
-    Where the distances of nearest values leave a gap, from so much to CLEARLY times as much, those
-    below it are visits, as long as each configuration is as small as they are.
+    If the distances between nearest places have a gap of a factor of CLEARLY, those below it are
+    visits, provided that each configuration is as small as they are.
     """
     count = len(place)
     apart = np.arange(count)
@@ -94,15 +94,16 @@ def _repeats(place: FloatArray) -> NDArray[np.intp]:
 def _graph(
     lengths: FloatArray, first: NDArray[np.integer], second: NDArray[np.integer], count: int
 ) -> coo_array:
-    """Return edges (K,) between nodes, whose numbers scipy 1.11 wants in 32 bits."""
+    """Return edges (K,) between nodes, with the 32-bit indices that scipy 1.11 needs."""
     ends = (first.astype(np.int32), second.astype(np.int32))
     return coo_array((lengths, ends), shape=(count, count))
 
 
 def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:
-    """Return (K, 2) the rows of (N, D) that are no further apart than a reach.
+    """Return the pairs (K, 2) of rows of (N, D) within reach of each other.
 
-    In a projection on three directions they are as near; trees of more dimensions are slow.
+    Searched in a projection to three directions, which keeps all pairs: trees of more dimensions
+    are slow.
     """
     along = place @ _directions(place.shape[1])
     tree = cKDTree(along, balanced_tree=False, compact_nodes=False)
@@ -112,6 +113,5 @@ def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:
 
 
 @lru_cache
-def _directions(size: int) -> FloatArray:
-    """Return (D, 3 at most) orthonormal directions, seeded."""
+def _directions(size: int) -> FloatArray:  # (D, 3 at most), orthonormal
     return np.linalg.qr(np.random.default_rng(0).normal(size=(size, min(size, 3))))[0]

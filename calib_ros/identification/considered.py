@@ -1,18 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that are not fitted but considered: unmodelled effects, and errors of the device.
+"""Errors that are considered, not fitted: unmodelled effects and device errors.
 
-Effects that an arm may have, and the scale of the device, are columns of the posterior with their
-own sizes (`evidence.py`). Smooth errors of the device, and rounded joint values, have known sizes
-s. Their columns N are eliminated from the products of the other columns A: A^T A becomes
+Possible effects of an arm and the scale of the device are columns of the posterior with their own
+sizes (`evidence.py`). Smooth device errors and rounded joint values have known sizes s. Their
+columns N are eliminated from the products of the other columns A: A^T A becomes
 A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 + s^2 N N^T were the covariance of the
-measurements (Schmidt 1966).
-
-A scale error stretches all lengths L alike; positions are linear in them, so its column is the sum
-of L dp/dL. Axes that are not square, a lens, and misplaced mirrors or markers distort space, as
-arms do. No number of poses averages that out, and held-out poses share it. A device that is
-accurate to its sigma may have all of it in this form: second-order polynomials in the measured
-position, for each coordinate.
+measurements (Schmidt 1966). docs/model.md (Sizes of errors) gives the reasons.
 """
 
 from __future__ import annotations
@@ -35,13 +29,13 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 CONSIDERED = ('eccentricity', 'gravity')
-"""Effects that any arm may have, fitted or not; couplings hardly show in moves of one joint."""
+"""Effects that any arm may have, fitted or not; moves of one joint hardly excite couplings."""
 
 
 def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the effects that an arm may have besides those among the names.
+    """Return the effects that an arm may have besides the named ones.
 
-    So are DH parameters of these patterns: what is held at its nominal value may be off as well.
+    DH parameters held at nominal by a `fixed` pattern may be off as well.
     """
     every = [name for group in CONSIDERED for name in effects.members(chain, group)]
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
@@ -50,7 +44,7 @@ def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) ->
     return tuple(name for name in every if name not in names)
 
 
-def told_of(
+def products_with_doubts(
     chain: Chain,
     names: Sequence[str],
     system: System,
@@ -61,13 +55,14 @@ def told_of(
     known: Normal | None,
     most: int = 10 * SOME_POSES,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the products (P + 1, P + 1) of columns and residual, and those with what is in doubt.
+    """Return products of columns and residual, and their products with doubtful columns.
 
-    The latter are A^T N (P + 1, K) and N^T N + 1 (K, K), N times its standard deviations. All are
-    in units of the `noise` [sigma given], without priors. The column of the scale follows those of
-    the names if there are `lengths` that grow. `doubts` are standard deviations of what else moves
-    a parameter, and `by_device` tells whether devices may bend space. Of more than `most` samples
-    every so many are taken; `known` holds the products of all of them for the names alone.
+    The first (P + 1, P + 1) are those of the names, of the device's scale if there are `lengths`,
+    and of the residual. A^T N (P + 1, K) and N^T N + 1 (K, K) follow, with N scaled by its
+    standard deviations. All are in units of `noise` [sigma given], without priors. `doubts` are
+    standard deviations of parameters that something else moves too; `by_device` includes smooth
+    device errors. Larger systems are thinned to `most` samples; `known` holds the products of all
+    samples for the names alone.
     """
     columns = list(dict.fromkeys([*names, *lengths]))
     share = -(-system.count // most)
@@ -94,10 +89,10 @@ def told_of(
 
 
 def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
-    """Return all lengths [m] that positions are made of, and how well their scale is known.
+    """Return all lengths [m] that positions depend on, and the standard deviation of their scale.
 
-    There are none by sockets and planes, which are where they are. The travel of a prismatic joint
-    grows by its ratio, which the chain returned has.
+    There are none for sockets and planes, whose places are fixed. The travel of a prismatic joint
+    is scaled by its ratio, which is added to the returned chain.
     """
     sets = [samples.observations for samples in system.sets]
     if any(each.socket or each.plane for each in sets):
@@ -111,7 +106,6 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
 
 
 def _products(chain: Chain, columns: Sequence[str], system: System, by_device: bool) -> FloatArray:
-    """Return the products of columns, those of the device if asked, and the residual."""
     fields = bends(system.sets) if by_device else []
     if not any(map(len, fields)):
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
@@ -124,18 +118,18 @@ def _products(chain: Chain, columns: Sequence[str], system: System, by_device: b
             last = first + placed.shape[2]
             wide = np.concatenate([placed[:-1], field[:, :, first:last], placed[-1:]])
             found += gram(wide)
-            for rows in turned:  # what bends space turns nothing
+            for rows in turned:  # distortion does not turn
                 found[np.ix_(own, own)] += gram(rows)
             first = last
     return found
 
 
 def bends(sets: Sequence[Samples]) -> list[FloatArray]:
-    """Return for each set (K, c, N) what its device may do, weighted as the rows of positions.
+    """Return the possible device distortions of each set (K, c, N), weighted as position rows.
 
-    Each of the K coefficients has the standard deviation 1, and together they have the sigma of
-    the device in each coordinate (RMS over the samples). Devices have their own; what is measured
-    in sockets, on planes, as distances or pixels has none.
+    Each of the K coefficients has standard deviation 1; together they have the device's sigma in
+    each coordinate (RMS over samples). Each device has its own; sockets, planes, distances and
+    pixels have none.
     """
     by_device: dict[str, list[int]] = {}
     for number, samples in enumerate(sets):
@@ -159,7 +153,7 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
 
 
 def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return (M, N) weighted polynomials of mean square 1 together, orthogonal, of no mean."""
+    """Return weighted polynomials (M, N), orthogonal, without mean, of total mean square 1."""
     total = max(float(weights @ weights), 1.0)
     centred = places - (weights**2 @ places) / total
     centred /= max(float(np.sqrt((weights**2 @ centred**2).sum() / total)), DEGENERATE)
@@ -173,7 +167,7 @@ def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def _rows(samples: Samples, waves: FloatArray) -> FloatArray:
-    """Return (3 M, c, N) rows of weighted polynomials (M, N) along each axis of the device."""
+    """Return rows (3 M, c, N) of weighted polynomials (M, N) along each axis of the device."""
     seen = samples.observations
     axes = seen.rotations if seen.inverse else np.eye(3)[np.newaxis]
     bent = np.einsum('mn,nia->main', waves, np.broadcast_to(axes, (samples.count, 3, 3)))

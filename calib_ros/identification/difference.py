@@ -2,17 +2,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The difference between two calibrations of one robot, tested with both covariances.
 
-Frames are free: the device may have been moved, the target changed. The second arm is expressed in
-the parameters of the first by a fit to its poses all over the joint range, which removes gauge
-freedoms. The difference d of the parameters is tested by d^T C^-1 d with C = C_1 + C_2; then the
-few parameters that may have changed are searched for (`changes.py`). The difference of predicted
-positions, in the best frames, is a quadratic form of d; its limit is the quantile for d ~ N(d, C).
+Frames are free: device and target may have been moved. The second arm is expressed in the
+parameters of the first by a fit to its poses over the joint range, which removes gauge freedoms.
+The parameter difference d is tested by d^T C^-1 d with C = C_1 + C_2; then the changed parameters
+are searched for (`changes.py`). The difference of predicted positions, in the best frames, is a
+quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
-What the models lack, and smooth errors of a device that was moved (`considered.py`), differ if
+Unmodelled effects, and smooth errors of a moved device (`considered.py`), give differences if
 other poses were measured. Only expected squares of errors include them (`region.py`): a difference
-that is significant only by the covariances of the noise is reported as such. If a calibration held
-DH parameters at nominal, its fitted ones contain part of their errors, so its expected squares
-replace its covariance.
+that is significant only by the noise covariances is reported as such. If a calibration held DH
+parameters at nominal, its fitted ones absorb part of their errors, so its expected squares replace
+its covariance.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scipy import linalg
 from calib_ros.errors import InputError
 from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import Columns, Explanation, Told
+from calib_ros.identification.changes import Columns, Explanation, Information
 from calib_ros.identification.evidence import group_of
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.levels import CONFIDENT, SEVERAL, chance_of
@@ -44,12 +44,12 @@ from calib_ros.shown import Shown
 class Difference(Shown):
     """The second of two calibrations minus the first.
 
-    P parameters of the arm, `names`, differ by `change` (P,) with standard deviations `sigma` (P,)
-    [m, rad]. `chance` is the probability of such a difference from the noise of both, `beyond`
-    also from device errors and unmodelled effects. Predicted positions differ by `rms` [m] over
-    the joint range in the best frames, by `limit` [m] at most (95 %); no parameters of the first
-    model can follow `left` [m] of it. `changed` lists the changes, each with those
-    indistinguishable from it; `unexplained` is the probability of the remaining difference.
+    P parameters `names` differ by `change` (P,) with standard deviations `sigma` (P,) [m, rad].
+    `chance` is the probability of such a difference by the noise of both, `beyond` by device
+    errors and unmodelled effects too. Predicted positions differ by `rms` [m] over the joint range
+    in the best frames, by `limit` [m] at most (95 %); the first model cannot follow `left` [m] of
+    it. `changed` lists the changes, each with those indistinguishable from it; `unexplained` is
+    the probability of the remaining difference.
     """
 
     names: tuple[Parameter, ...]
@@ -85,7 +85,7 @@ class Difference(Shown):
         return f'many parameters differ, by {size}: identify again, and inspect the robot'
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain values; lengths of predictions in mm."""
+        """Return the difference as plain values; distances in mm."""
         rows = zip(self.names, self.change.tolist(), self.sigma.tolist(), strict=True)
         return {
             'same': self.same,
@@ -101,7 +101,7 @@ class Difference(Shown):
         }
 
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """Return the six parameters that differ by the most sigmas, in words."""
+        """Return the six parameters with the largest change in sigmas, and their changes."""
         change, sigma = 1e3 * self.change, 1e3 * self.sigma
         order = np.argsort(-np.abs(change) / sigma)[:6].tolist()
         names = [self.names[k] for k in order]
@@ -110,7 +110,6 @@ class Difference(Shown):
 
 
 def _rows_in_words(chain: Chain) -> str:
-    """Return what calibrations of one robot have in common."""
     rows = (f'{j.name} ({j.type}{", turned" * (j.sign < 0)})' for j in chain.joints)
     return f'{", ".join(rows)} ({chain.convention})'
 
@@ -149,12 +148,17 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         lacking += whole
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
-    told = _told(names, change, square)
-    chance, beyond = _chance(told, freedom), _chance(_told(names, change, lacking), freedom)
+    information = _information(names, change, square)
+    chance, beyond = (
+        _chance(information, freedom),
+        _chance(_information(names, change, lacking), freedom),
+    )
     changed: list[tuple[Explanation, ...]] = []
-    while len(changed) < SEVERAL and (reasons := changes.reasons_of(told, columns, freedom)):
+    while len(changed) < SEVERAL and (
+        reasons := changes.reasons_of(information, columns, freedom)
+    ):
         changed.append(reasons)
-        told = told.beside(columns.spread(reasons))
+        information = information.marginalised(columns.spread(reasons))
     predicted = changes.predicted(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
@@ -169,15 +173,17 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         float(np.sqrt(np.quantile(squares, CONFIDENT))),
         left,
         tuple(changed),
-        _chance(told, freedom, sum(len(each[0].names) for each in changed)),
+        _chance(information, freedom, sum(len(each[0].names) for each in changed)),
     )
 
 
 def _in_parameters_of(
     first: Calibration, second: Calibration
 ) -> tuple[tuple[Parameter, ...], Chain, FloatArray, float]:
-    """Return the parameters of the arm, the first arm with all of them, by how much the second
-    differs in them, and the RMS distance [m] that is left.
+    """Express the second arm in the parameters of the first.
+
+    Returns these parameters, the first chain with all of them, their differences (P,), and the RMS
+    distance [m] left.
     """
     effects = [name for each in (first, second) for name, _ in each.chain.effects]
     chain = first.chain.with_effects(effects)
@@ -197,7 +203,7 @@ def _in_parameters_of(
 def _in_names(
     chain: Chain, names: Sequence[Parameter], own: Sequence[str], square: FloatArray
 ) -> FloatArray:
-    """Return a covariance of the names; those that were not fitted vary as those of arms do."""
+    """Return the covariance of the names; parameters that were not fitted have typical sizes."""
     chain = chain.with_effects([n for n in names if not (n.of_dh or chain.owns_frame(n))])
     mine = [Parameter(name) for name in own]
     change = np.array([[float(name == other) for other in mine] for name in names])
@@ -210,13 +216,15 @@ def _in_names(
     return np.asarray(whole + np.diag(unknown * np.square(sizes)))
 
 
-def _told(names: tuple[Parameter, ...], change: FloatArray, square: FloatArray) -> Told:
+def _information(
+    names: tuple[Parameter, ...], change: FloatArray, square: FloatArray
+) -> Information:
     scale = np.sqrt(np.diag(square))
     inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=ROUNDING) / np.outer(scale, scale)
-    return Told(names, inverse, inverse @ change)
+    return Information(names, inverse, inverse @ change)
 
 
-def _chance(told: Told, freedom: float, explained: int = 0) -> float:
-    """Return the probability of so large a change of all parameters but some by noise."""
-    rank = max(1, len(told.names) - explained)
-    return chance_of(told.explained(np.eye(len(told.names)))[0], rank, freedom)
+def _chance(information: Information, freedom: float, explained: int = 0) -> float:
+    """Return the probability that noise alone changes the remaining parameters as much."""
+    rank = max(1, len(information.names) - explained)
+    return chance_of(information.explained(np.eye(len(information.names)))[0], rank, freedom)

@@ -1,23 +1,16 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Can drift of the device explain a gain?
+"""Can drift of the device explain a gain? A randomisation test by shifts in time.
 
-A tracker drifts, so successive errors are similar. Poses along a path change as slowly, and a
-model can follow the drift: it then gains even on poses left out between fitted ones. But drift
-does not depend on joint values: shifted in time against them, it would be explained equally well.
-So the residuals are shifted in time by every possible amount, and the model is fitted to each.
-Whatever the autocorrelation of stationary errors, the unshifted gain has any rank among the
-shifted ones with equal probability (a randomisation test); a true model explains most unshifted.
-
-Of residuals r, columns A beside the columns F of the model before them explain the share
+Of residuals r, columns A added to the columns F of the previous model explain the share
 
     (e(F, A) - e(F)) / (|r|^2 - e(F))        e(X) = r^T X (X^T X + L)^-1 X^T r
 
-where L holds the inverse variances of priors. A series is closed to a circle by its mirror image.
-Its slowest part, which is not stationary, is removed from residuals and columns: a few cosines
-over the session. Samples of one stop move together, as their sum; those of pixels also with their
-first moments. All shifts of X^T r are one circular correlation, computed by fast Fourier
-transforms.
+where L holds the inverse variances of priors. It is compared with the share of residuals shifted
+in time (docs/model.md, Judgement). Each series is closed to a circle by its mirror image, and its
+slowest, non-stationary part is removed: a few cosines over the session. Samples of one stop move
+together, as their sum; pixels also with their first moments. All shifts of X^T r are one circular
+correlation, computed by fast Fourier transforms.
 """
 
 from __future__ import annotations
@@ -36,20 +29,18 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 
 SLOW = SEVERAL
-"""Cosines that are taken out of a series at most; no more than one for ten stops
-(benchmarks/drift.py)."""
+"""Cosines removed from a series at most, one per ten stops (benchmarks/drift.py)."""
 SHIFTS = 2 * SOME_POSES
-"""Shifts that are tried at most, forwards and backwards; the first of them is none
-(benchmarks/drift.py)."""
+"""Shifts tried at most, forwards and backwards; the first is zero (benchmarks/drift.py)."""
 
 
 Columns: TypeAlias = tuple[FloatArray, FloatArray]
-"""X^T X (P, P) of columns X without their slowest part, with the normal matrix of the priors, and
-X^T r (P, S) by shift."""
+"""X^T X (P, P) of detrended columns X plus the normal matrix of priors, and X^T r (P, S) by
+shift."""
 
 
 class Shifts:
-    """Residuals moved in time, those of every set by the same share of its length.
+    """Residuals shifted in time, every set by the same share of its length.
 
     Parameters
     ----------
@@ -57,7 +48,6 @@ class Shifts:
         Samples in the order in which they were taken; those of one stop move together.
     residuals : sequence of (c, N)
         Weighted residuals of each set, sample by sample.
-
     """
 
     def __init__(self, system: System, residuals: Sequence[FloatArray]) -> None:
@@ -75,7 +65,7 @@ class Shifts:
             series = _by_stop(residual, begins, weights)
             circle = np.concatenate([series, series[:, ::-1]], axis=1)
             length = len(begins)
-            again = np.concatenate([circle, series], axis=1)  # as far as a moved series reaches
+            again = np.concatenate([circle, series], axis=1)  # the reach of a shifted series
             self._circles.append(fft.rfft(again, _period(length)))
             squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
             slow = _correlated(slow_cosines(length)[:, np.newaxis], self._circles[-1], each=True)
@@ -83,10 +73,9 @@ class Shifts:
             self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
 
     def columns(self, columns: Iterable[Sequence[FloatArray]], inverse: FloatArray) -> Columns:
-        """Return the products of weighted columns, (P, c, N) for each set.
+        """Return the products of weighted columns, (P, c, N) for each set, in one or more lots.
 
-        They may come in several lots; `inverse` (P,) is 1 / sigma of the priors of all of them,
-        zero without one.
+        `inverse` (P,) is 1 / sigma of the priors of all columns, zero without a prior.
         """
         rows, products = [], []
         for lot in columns:
@@ -110,31 +99,31 @@ class Shifts:
     def shares(
         self, columns: Columns, known: Sequence[int], groups: Sequence[Sequence[int]]
     ) -> FloatArray:
-        """Return the share (G, S) that each group (G, K) of columns explains beside those known.
+        """Return the share (G, S), by shift, that each group (G, K) explains beside known columns.
 
-        By shift; each group is taken by itself.
+        Each group is taken alone.
         """
         every, moved = columns
         matrix = every[np.ix_(known, known)]
         root = inverse_root(matrix, np.diag(matrix))
-        gone = root.T @ moved[known]
+        removed = root.T @ moved[known]
         which = np.array(groups)
         cross = every[which][:, :, known] @ root  # (G, K, P)
-        products = moved[which] - cross @ gone
+        products = moved[which] - cross @ removed
         own = every[which[:, :, np.newaxis], which[:, np.newaxis]]
         size = np.einsum('gkk->gk', own)
-        mine = inverse_root(own - cross @ np.swapaxes(cross, 1, 2), size)
-        found = ((np.swapaxes(mine, 1, 2) @ products) ** 2).sum(axis=1)
-        left = np.maximum(self._energy - (gone**2).sum(axis=0), 1e-300)
-        return np.asarray(found / left)
+        roots = inverse_root(own - cross @ np.swapaxes(cross, 1, 2), size)
+        explained = ((np.swapaxes(roots, 1, 2) @ products) ** 2).sum(axis=1)
+        left = np.maximum(self._energy - (removed**2).sum(axis=0), 1e-300)
+        return np.asarray(explained / left)
 
     def _sampled(self, shifted: FloatArray) -> FloatArray:
-        """Return (..., S) of all shifts (..., 2 n) of a set."""
+        """Return the shifts to try (..., S) of all shifts (..., 2 n) of a set."""
         return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
 
 
 def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) -> FloatArray:
-    """Return (..., m c, n) the sums over each stop of (..., c, N) with weights (m, N)."""
+    """Return sums over each stop (..., m c, n) of values (..., c, N) with weights (m, N)."""
     parts = [each * values for each in weights]
     if len(begins) < values.shape[-1]:
         parts = [np.add.reduceat(part, begins, axis=-1) for part in parts]
@@ -142,10 +131,10 @@ def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) 
 
 
 def _weights(observations: Observations, begins: NDArray[np.intp]) -> FloatArray:
-    """Return the weights (m, N) of the rows of each stop: one by the root of their number.
+    """Return the weights (m, N) of the rows of each stop: the inverse root of their number.
 
-    Of pixels also where they are, of mean square 1 in each stop: their sum tells of a shift alone,
-    with the first moments of the whole pose of the camera.
+    Pixels also get their image coordinates as weights, with mean square 1 in each stop: sums
+    detect only shifts of the camera, first moments its whole pose.
     """
     count = np.diff(begins, append=len(observations))
     number = np.repeat(np.arange(len(begins)), count)
@@ -162,14 +151,14 @@ def _weights(observations: Observations, begins: NDArray[np.intp]) -> FloatArray
 
 
 def slow_cosines(length: int) -> FloatArray:
-    """Return (K, length) orthonormal: the constant and the slowest cosines of a series."""
+    """Return the constant and slowest cosines (K, length) of a series, orthonormal."""
     order = np.arange(1 + min(SLOW, length // 10))
     waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 
 
 def _period(length: int) -> int:
-    """Return the period of the transforms of a series: that of its circle where that is fast."""
+    """Return the period of the transforms: the circle of a series if that length is fast."""
     circle = 2 * length
     if fft.next_fast_len(circle, real=True) == circle:
         return circle
@@ -179,9 +168,9 @@ def _period(length: int) -> int:
 def _correlated(
     series: FloatArray, circle: NDArray[np.complex128], each: bool = False
 ) -> FloatArray:
-    """Return (P, 2 n) the products of series (P, c, n) with the circle (c, K) moved by each shift.
+    """Return products (P, 2 n) of series (P, c, n) with the circle (c, K) at each shift.
 
-    Summed over the components c; (P, c, 2 n) of `each` if asked.
+    Summed over the components c; (P, c, 2 n) if `each`.
     """
     length = _period(series.shape[-1])
     spectrum = fft.rfft(series, length)
@@ -191,9 +180,9 @@ def _correlated(
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
-    """Return T (..., P, P), T T^T being the inverse of (..., P, P) in the directions that count.
+    """Return T (..., P, P) with T T^T the pseudo-inverse of (..., P, P).
 
-    Those are seen with columns scaled to squared lengths `size` (..., P); others are zero.
+    Columns are scaled to squared lengths `size` (..., P); directions lost to rounding are zero.
     """
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-300))
     sizes, vectors = np.linalg.eigh(matrix * (scale[..., np.newaxis] * scale[..., np.newaxis, :]))
@@ -203,9 +192,8 @@ def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
 
 
 def chance(shares: FloatArray) -> float:
-    """Return how often moved residuals are as well explained as those in place, by shares (S,).
-
-    The first is that of those in place.
+    """Return the share of shifted residuals explained as well as those in place, the first of
+    (S,).
     """
     return float(np.mean(shares[1:] >= shares[0]))
 
@@ -213,9 +201,9 @@ def chance(shares: FloatArray) -> float:
 def chance_of_gain(
     chain: Chain, before: Sequence[str], added: Sequence[str], system: System
 ) -> float:
-    """Return how probable it is that what parameters explain beside those before is chance.
+    """Return the probability that the gain by added parameters is chance.
 
-    The system is linearised at a chain that is fitted by those before.
+    The system is linearised at a chain fitted with the parameters before.
     """
     if not added:
         return 1.0

@@ -2,31 +2,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The typical size of this arm's errors, estimated from its own data (empirical Bayes).
 
-Poses that hardly move a joint hardly determine its parameters. Least squares fits noise there, and
-the arm gets worse wherever that joint is elsewhere. So offsets from the nominal arm have normal
-priors about zero, with one size for each group of parameters: lengths, angles, errors of drives
-(`ratio`, `sin_1`, ...), couplings, and bending or play. The sizes s maximise the probability of
-the data with the parameters integrated out (evidence; MacKay 1992):
+Offsets from the nominal arm have normal priors about zero, with one size s for each group of
+parameters. The sizes maximise the probability of the data with the parameters integrated out
+(evidence; MacKay 1992):
 
     s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
 
-with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1. L is the normal matrix with
-the given sigmas, t the ratio of actual to given noise, shared errors included. gamma counts the
-parameters that the data determine. If it is small, a hyperprior dominates: a size is about
-TYPICAL, within a factor of SPREAD; and sizes above and below are included in the decision where a
-calibration may be used, because a size estimated from few parameters may be far off. Parameters
-that the data determine keep their values; the others shrink to nominal. One error may be far
-larger than the others, as of a wrongly mounted motor: the prior has the tails of Student's t with
-TAILS degrees of freedom, as a normal prior with the variance s^2 / w, w = (TAILS + 1) / (TAILS +
-(x^2 + V_ii) / s^2).
+with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1; docs/model.md (Sizes of
+errors) explains them, the hyperprior and the considered effects (Schmidt 1966).
 
-To judge an arm, variances are averaged over w, whose inverse has the mean (TAILS + (x^2 + V_ii) /
-s^2) / (TAILS - 1), so that a parameter that the data do not determine has the variance of
-Student's t, TAILS / (TAILS - 2) s^2; and over the sizes.
-
-Effects missing from the model are *considered* (Schmidt 1966): they are columns of the same
-posterior with their own sizes, so that the real arm with its possible effects can be compared with
-the fitted one (`region.py`). So are errors of the device (`considered.py`).
+The tails of Student's t with TAILS degrees of freedom are a normal prior with the variance s^2 /
+w, w = (TAILS + 1) / (TAILS + (x^2 + V_ii) / s^2). To judge an arm, variances are averaged over w,
+whose inverse has the mean (TAILS + (x^2 + V_ii) / s^2) / (TAILS - 1).
 """
 
 from __future__ import annotations
@@ -39,7 +26,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import linalg
 
-from calib_ros.identification.considered import lengths_of, told_of
+from calib_ros.identification.considered import lengths_of, products_with_doubts
 from calib_ros.identification.leastsquares import Normal, System
 from calib_ros.identification.levels import OUT_OF_SCALE, SCALE
 from calib_ros.identification.sizes import TYPICAL, Evidence, mixed, solved
@@ -55,7 +42,7 @@ Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
 
 
 def group_of(chain: Chain, name: str) -> str | None:
-    """Return the group of parameters whose errors are of one size; None for frames."""
+    """Return the group of parameters with errors of one size; None for frames."""
     return None if chain.owns_frame(name) else _group(name)
 
 
@@ -69,34 +56,31 @@ def _group(name: str) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Posterior(Shown):
-    """What the data and the sizes of the errors tell about an arm that was fitted.
+    """Posterior of a fitted arm, given the data and the sizes of its errors.
 
     Attributes
     ----------
     chain : Chain
-        The fitted arm, with effects of no size where they were not fitted.
+        The fitted arm, with considered effects of size zero.
     names : tuple of str
         Fitted parameters and considered effects, (P,) in all.
     offsets : (P,)
-        The fitted parameters less their nominal values; zero for frames.
+        Fitted minus nominal values; zero for frames.
     shift : (P,)
-        The posterior mean less the fitted parameters.
+        Posterior mean minus fitted values.
     covariance : (P, P)
-        Of the posterior, for the device that measured; where it is judged, over all sizes that may
-        as well be.
+        For the measuring device; averaged over plausible sizes if used to judge.
     device : (P, K)
-        Its product with itself is what the smooth errors of that device add to the covariance.
+        Square root of the covariance that smooth errors of that device add.
     priors : mapping of str to float
-        Standard deviation [m or rad] of every parameter that has a prior.
+        Standard deviation [m or rad] of parameters with a prior.
     sizes : mapping of str to float
         Size of the errors by group.
     doubted : tuple of Mixed
-        Mean and covariance of the offsets if the device may have a scale of its own, and if joint
-        values that were rounded are off; for sizes that may as well be, each with its weight.
+        The posterior of the offsets for each plausible set of sizes, if the device may have a
+        scale error and rounded joint values may be off.
     rival : (float, float, (P,), (P, P)), optional
-        The same if the device is out of scale: the logarithm of how much more probable the data
-        are then, its scale less one, mean and covariance.
-
+        The same for a device out of scale: log odds, scale minus one, mean and covariance.
     """
 
     chain: Chain
@@ -112,21 +96,21 @@ class Posterior(Shown):
 
     @cached_property
     def square(self) -> FloatArray:
-        """Return the expected squares (P, P) of the fitted parameters' errors."""
+        """Return the expected squares (P, P) of the parameter errors."""
         return np.asarray(self.covariance + np.outer(self.shift, self.shift))
 
     def expected(self, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> FloatArray:
-        """Return the expected squares (N, 6, 6) of errors of predicted poses [m, rad].
+        """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
 
-        At joint values (N, n); position and rotation in world axes. What is not modelled counts.
+        In world axes, unmodelled effects included.
         """
         rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
         return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
 
     def held_at(self, name: str, slope: FloatArray) -> Posterior:
-        """Return it with a length kept nominal as uncertain as lengths are.
+        """Return the posterior with a length held at nominal, as uncertain as lengths are.
 
-        The fitted parameters (F,), which come first, grow by `slope` as that does.
+        The first F fitted parameters grow with it by `slope` (F,).
         """
         along = np.concatenate([slope, np.zeros(len(self.names) - len(slope)), [1.0]])
         more = self.sizes['length'] ** 2 * np.outer(along, along)
@@ -137,14 +121,16 @@ class Posterior(Shown):
             shift=np.append(self.shift, 0.0),
             covariance=np.pad(self.covariance, (0, 1)) + more,
             device=np.pad(self.device, ((0, 1), (0, 0))),
-            rival=None,  # nothing has told a scale
+            rival=None,  # nothing measures the scale
             doubted=tuple(
                 (w, np.append(m, 0.0), np.pad(c, (0, 1)) + more) for w, m, c in self.doubted
             ),
         )
 
     def held(self, name: str) -> float:
-        """Return which share of a parameter's variance is that of its prior: 1 if untold."""
+        """Return the share of a parameter's variance that its prior accounts for, 1 if
+        undetermined.
+        """
         variance = float(self.covariance[self.names.index(name), self.names.index(name)])
         return variance / self.priors[name] ** 2 if name in self.priors else 0.0
 
@@ -165,11 +151,11 @@ def posterior_of(
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
     Offsets of the fitted `chain` from the `nominal` one are normal about zero. `names` were fitted
-    to the `system` with its weights, and `more` effects are considered. `noise` is its size [sigma
-    given], `known` are priors [m or rad] that were given. `doubts` are parameters that something
-    else than the arm moves as well, with its standard deviation; `at_the_fit` are the last normal
-    equations, if they are known. Nothing is `doubted` unless `judging` where it may be used.
-    `sigma_scale` is the standard deviation of the device's scale, 0 if it is not known.
+    to the `system` with its weights and noise of size `noise` [sigma given]; `more` effects are
+    considered. `known` are given priors [m or rad], `doubts` standard deviations of parameters
+    that something else moves too, `at_the_fit` the last normal equations if known, `sigma_scale`
+    the standard deviation of the device's scale, 0 if unknown. Doubts are only evaluated if
+    `judging`.
     """
     chain = chain.with_effects([name for name in more if not Parameter(name).of_dh])
     every = (*names, *more)
@@ -177,19 +163,19 @@ def posterior_of(
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
     unsure = bool(lengths) and scale == SCALE and not sigma_scale
     what = beside, lengths, bool(more), at_the_fit
-    plain, cross, doubtful = told_of(whole, every, system, noise, *what)
+    plain, cross, doubtful = products_with_doubts(whole, every, system, noise, *what)
     offsets = np.zeros(len(plain) - 1)
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
-    told = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
-    alone, matrix = plain[:-1, :-1], told[:-1, :-1]
-    vector = matrix @ offsets + told[:-1, -1]
+    reduced = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
+    alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
+    vector = matrix @ offsets + reduced[:-1, -1]
     also = ['scale'] if lengths else []
     groups = [*(None if n in known else group_of(chain, n) for n in every), *also]
     given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': sigma_scale or scale})
     beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
-    size, slope = evidence.told(beside_it)
+    size, slope = evidence.most_probable(beside_it)
     sought = evidence, matrix, vector, len(every), size, beside_it
     rival = _rival(*sought) if judging and unsure else None
     near = evidence.near(size, slope) if judging else ()
@@ -207,8 +193,9 @@ def posterior_of(
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
-    told_so = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
-    return Posterior(chain, every, *told_so, doubted, rival)
+    moments = offsets[arm], mean - offsets[arm], covariance
+    sizes = evidence.named(size)
+    return Posterior(chain, every, *moments, device, priors, sizes, doubted, rival)
 
 
 def _rival(
@@ -219,7 +206,7 @@ def _rival(
     size: FloatArray,
     considered: set[str | None],
 ) -> tuple[float, float, FloatArray, FloatArray]:
-    """Return what would hold of the first `count` columns (P) by a device out of scale."""
+    """Return log odds, scale, mean and covariance of `count` columns for a device out of scale."""
     odds, precision = evidence.rival('scale', OUT_OF_SCALE, size, considered)
     mean, root = solved(matrix, vector, precision)
     arm = np.s_[:count]
@@ -229,9 +216,9 @@ def _rival(
 def _device(
     matrix: FloatArray, cross: FloatArray, doubtful: FloatArray, precision: FloatArray, count: int
 ) -> FloatArray:
-    """Return (P, K) what another device adds to the covariance of the first `count` columns (P).
+    """Return (P, K), the root of what another device adds to the covariance of `count` columns.
 
-    By the products of columns (P, P), the scale's after those, with what it may do (Woodbury).
+    From the products of columns, the scale last, with those of device errors (Woodbury).
     """
     arm, scale = np.s_[:count], np.s_[count:]
     std = precision[scale, np.newaxis] ** -0.5
@@ -245,4 +232,4 @@ def _device(
     root = solved(matrix[arm, arm], np.zeros(count), precision[arm])[1]
     along = root @ (root.T @ beside)
     left, axes = np.linalg.eigh(own - beside.T @ along)
-    return np.asarray(along @ axes / np.sqrt(np.maximum(left, 1.0)))  # 1 but for rounding
+    return np.asarray(along @ axes / np.sqrt(np.maximum(left, 1.0)))  # >= 1 but for rounding

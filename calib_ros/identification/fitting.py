@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The fit itself: its parameters, start, priors and noise.
 
-A first fit to some samples comes close; common-sense priors keep it from going astray where these
-samples carry little information. The robust fit to all samples follows. If its data yield priors
-that would change it (`evidence.py`), it is repeated with them.
+A first fit to some samples, guarded by common-sense priors, comes close. The robust fit to all
+samples follows. If its data yield priors that would change it (`evidence.py`), it is repeated with
+them.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
 
 SOME = 2 * SOME_POSES
-"""Pairs that are enough for a first fit, or for a linear model of them."""
+"""Samples for a first fit or a linear model."""
 FOLLOWED = 2.0
-"""Part of what it lacks that the geometric model does not follow: one over this
+"""Inverse share of the unmodelled error that the geometric model does not follow
 (benchmarks/real_robots.py)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Simpler:
-    """What the fit of a simpler model, without effects, has told."""
+    """Results of the fit of a simpler model, without effects."""
 
     chain: Chain
     distances: tuple[FloatArray, ...]
@@ -55,9 +55,9 @@ class Simpler:
 class Fitted:
     """A robust fit with what follows from its residuals.
 
-    `problem` has the last priors; `size` [sigma given] is that of the noise before the data told
-    any. Where nothing tells the size of the arm, `held` is the length kept nominal for that, and
-    the growth (P,) of the fitted parameters with it.
+    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors. If
+    nothing measures the size of the arm, `held` is the length held at nominal and the growth (P,)
+    of the fitted parameters with it.
     """
 
     problem: Problem
@@ -86,7 +86,7 @@ class Fitted:
         doubts: Mapping[str, float] | None = None,
         judging: bool = True,
     ) -> Posterior:
-        """Return what the data of the fit tell, with `more` effects considered."""
+        """Return the posterior of the fit with `more` effects considered."""
         model, given, names = self.problem.model, self.problem.given, self.names
         known = None if more else self.robust.fit.normal
         how = doubts, known, judging, self.problem.sigma_scale
@@ -95,7 +95,9 @@ class Fitted:
 
 
 def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
-    """Return what arbitrary poses would determine, the nominal chain in its frames, the fit."""
+    """Return the structurally identifiable names, the nominal chain with start frames, and the
+    fit.
+    """
     model, separations = problem.model, problem.system(problem.sets).separation_rows
     structural = identifiability.structurally_independent(
         model, problem.free, problem.kinds, separations
@@ -114,7 +116,7 @@ def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ..
 
 
 def _sized(fitted: Fitted, held: str) -> Fitted:
-    """Return a fit with the size of the arm as uncertain as the length that was held nominal."""
+    """Return a fit with the size of the arm as uncertain as the length held at nominal."""
     first, chain = fitted.problem.sets[0], fitted.chain
     every = [n for joint in chain.joints for n in joint.parameters if n.is_length]
     size = chain.value(held)
@@ -154,7 +156,7 @@ def _fit_all(
     factor: FloatArray,
     simpler: Simpler | None,
 ) -> Fitted:
-    """Fit the named parameters from start frames, with priors where they are needed.
+    """Fit the named parameters from start frames, with priors where needed.
 
     `factor` (P, P) is that of some samples at the start.
     """
@@ -167,15 +169,15 @@ def _fit_all(
         rough = minimise(rough, names, few, tolerance=1e-2).chain
     fitted = _fit(*_some(problem, simpler), rough, names)
     guarded = _guarded(problem, names, fitted.factor, simpler)
-    if guarded is not problem:  # without its outliers a session tells less
+    if guarded is not problem:  # outliers carried the information
         problem = guarded
         fitted = _fit(*_some(problem, simpler), rough, names)
-    size = _told_by(fitted.noise, simpler)
-    told = fitted.posterior(size, judging=False)
-    if not _matter(problem, names, told):
+    size = _noise_for_priors(fitted.noise, simpler)
+    posterior = fitted.posterior(size, judging=False)
+    if not _priors_matter(problem, names, posterior):
         return fitted
     priors = {
-        name: min(told.priors[name], problem.common_sense(name))
+        name: min(posterior.priors[name], problem.common_sense(name))
         for name in names
         if not problem.model.owns_frame(name)
     }
@@ -185,7 +187,7 @@ def _fit_all(
 
 
 def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
-    """Return what tells the priors of a richer model, which is fitted again with them."""
+    """Thin a problem to the samples that determine the priors of a richer model."""
     share = -(-sum(map(len, problem.sets)) // (2 * SOME))
     if simpler is None or share < 2:
         return problem, simpler
@@ -201,7 +203,7 @@ def _fit(
     names: tuple[str, ...],
     again: bool = False,
 ) -> Fitted:
-    """Fit the named parameters from a chain that is near, or `again` from one that was fitted."""
+    """Fit the named parameters from a near chain, or `again` from a fitted one."""
     system = problem.system(problem.sets)
     if simpler is None and not again:
         robust = thorough_fit(chain, names, system, problem.loss)
@@ -215,13 +217,13 @@ def _fit(
     return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
 
 
-def _told_by(noise: Noise, simpler: Simpler | None) -> float:
-    """Return the size of the noise [sigma given] against which a prior is weighed.
+def _noise_for_priors(noise: Noise, simpler: Simpler | None) -> float:
+    """Return the size of the noise [sigma given] that priors are weighed against.
 
     What the geometric model lacks is no noise to it: it can follow a part of it. On measured
-    robots errors in regions left out were least with more weight on the prior, those on held-out
-    rows of the same session with less; with what is not shared by neighbours, over FOLLOWED, they
-    are those of least squares (`benchmarks/real_robots.py`).
+    robots errors in held-out regions were least with more weight on the prior, those on held-out
+    rows of the same session with less. With the noise that neighbours do not share, over FOLLOWED,
+    they are those of least squares (`benchmarks/real_robots.py`).
     """
     if simpler is not None or noise.consistent:
         return noise.size
@@ -231,11 +233,11 @@ def _told_by(noise: Noise, simpler: Simpler | None) -> float:
 def _guarded(
     problem: Problem, names: Sequence[str], factor: FloatArray, simpler: Simpler | None
 ) -> Problem:
-    """Return the problem with priors that keep a first fit from going astray.
+    """Return the problem with priors that keep a first fit from diverging.
 
-    `factor` (P, P) is that of some samples at the start, or of what a robust fit has left. DH
-    parameters that they tell no better than common sense does get a third of what no faulty robot
-    exceeds as a prior.
+    `factor` (P, P) is that of some samples at the start, or of a robust fit. DH parameters that it
+    determines no better than common sense get a third of the largest error of a faulty robot as a
+    prior.
     """
     known = problem.prior_sigmas
     stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
@@ -249,12 +251,12 @@ def _guarded(
     if problem.learned is not None:
         more = replace(problem.learned, priors={**problem.learned.priors, **guards})
         return replace(problem, learned=more) if guards else problem
-    noise = 1.0 if simpler is None else _told_by(simpler.noise, None)
+    noise = 1.0 if simpler is None else _noise_for_priors(simpler.noise, None)
     return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
 
 
-def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
-    """Tell whether priors that the data have told would change a fit without them."""
+def _priors_matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
+    """Tell whether the priors found in the data would change a fit without them."""
     if problem.learned is not None or problem.model.effects:
         return True
     return any(
@@ -263,7 +265,6 @@ def _matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> boo
 
 
 def _require_enough(problem: Problem, names: Sequence[str]) -> None:
-    """Refuse a problem with fewer equations than parameters (P,)."""
     rows = configurations = 0
     for each, kind in zip(problem.sets, problem.kinds, strict=True):
         if not len(each):
@@ -287,7 +288,7 @@ def parameter_rows(
     names: Sequence[str],
     uncertainty: identifiability.Uncertainty,
 ) -> tuple[ParameterRow, ...]:
-    """Return every parameter of a fitted chain, with its deviation where it was fitted."""
+    """Return every parameter of a fitted chain, with its standard deviation if fitted."""
     change = _to_values(chain, names)
     variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
     std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
@@ -308,7 +309,7 @@ def parameter_rows(
 
 
 def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
-    """Return the derivative (P, P) of the values: of rotation vectors, where frames were turned.
+    """Return the derivative (P, P) of the values, which differ for rotation vectors of frames.
 
     A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
     """

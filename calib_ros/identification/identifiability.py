@@ -24,10 +24,9 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 DEGENERATE = TYPICAL['angle']
-"""Share of the largest extent up to which there is none: of points of a board, of the column of a
-base or tool frame that those before it leave. Orientations that vary by a milliradian vary by no
-more than an arm's own errors: a tool that follows from them would be anywhere, kilometres away as
-well."""
+"""Extents below this share of the largest count as zero: of board points, or of the rest of a
+frame's column after those before it. Orientations that vary by less than an arm's own angle
+errors would put a tool anywhere, even kilometres away."""
 
 
 def independent(
@@ -35,21 +34,21 @@ def independent(
 ) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
-    `factor` (P, P) is the upper triangular one of the weighted Jacobian, with columns in the order
-    of the names, the most wanted first: of the parameters that trade against each other, the last
-    ones are left out (and so stay nominal). So much of a frame's column must be left by those
-    before it, HALF_THE_DIGITS of others.
+    `factor` (P, P) is the upper triangular factor of the weighted Jacobian, columns in the order
+    of the names: of parameters that trade against each other, the last are left out and stay
+    nominal. At least this share of a column must be left by those before it: `frame_tolerance` for
+    frames, HALF_THE_DIGITS for others.
     """
     frames = [Parameter(name).kind in FRAME_KINDS for name in names]
     least = np.where(frames, frame_tolerance, HALF_THE_DIGITS) * np.linalg.norm(factor, axis=0)
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
-        return tuple(names)  # the diagonal is what is left of each
+        return tuple(names)  # the diagonal holds the rest of each column
     basis = np.zeros(factor.shape)
     kept: list[str] = []
     for name, column, short in zip(names, factor.T, least.tolist(), strict=True):
         known = basis[:, : len(kept)]
         rest = column - known @ (known.T @ column)
-        rest -= known @ (known.T @ rest)  # once more: Gram-Schmidt loses orthogonality
+        rest -= known @ (known.T @ rest)  # again: Gram-Schmidt loses orthogonality
         size = math.sqrt(rest @ rest)
         if size > short and size > 0.0:
             basis[:, len(kept)] = rest / size
@@ -58,10 +57,7 @@ def independent(
 
 
 def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the parameters that measured poses determine, by their factor R (P, P).
-
-    Frames by more than arms' errors.
-    """
+    """Return the parameters that measured poses determine, by their factor R (P, P)."""
     return independent(factor, names, DEGENERATE)
 
 
@@ -91,13 +87,13 @@ def structurally_independent(
 ) -> tuple[str, ...]:
     """Return the parameters that a large number of arbitrary poses would determine.
 
-    What is left out is a gauge freedom of the chain, not a lack of measurements. Frames that are
-    not fixed are taken anywhere, because a tool of length zero hides rotations. A complete and
-    minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters
-    by full pose (Everett, Driels and Mooring 1987). A target in a socket is where it is in all
-    poses: turning the whole cell about it shows nowhere else than in residuals. So does the size
-    of a cell that touches planes alone. A board tells its pose in a camera, and images of it from
-    anywhere tell the camera's lens (Zhang 2000). `extra` returns further equations at a chain.
+    The others are gauge freedoms of the chain, not a lack of measurements. Frames that are not
+    fixed get arbitrary places, because a tool of length zero hides rotations. A complete and
+    minimal model of an arm with R revolute and P prismatic joints has 4 R + 2 P + 6 parameters by
+    full pose (Everett, Driels and Mooring 1987). A target in a socket is in one place in all
+    poses: turning the whole cell about it only shows in residuals. So does the size of a cell that
+    touches only planes. A board gives its pose in a camera, and images from anywhere give the
+    camera's lens (Zhang 2000). `extra` returns further equations at a chain.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -134,11 +130,11 @@ def structurally_independent(
 def untold_size(
     chain: Chain, names: Sequence[str], kinds: Sequence[Kind], told: Sequence[str]
 ) -> Parameter | None:
-    """Return the longest length of the arm where nothing that is measured tells its size.
+    """Return the longest length of the arm if nothing measures its size, else None.
 
-    Sockets and planes alone would be met as well by a larger arm in a larger cell: a gauge of what
-    is measured, but not of positions elsewhere. Of all lengths the longest, kept nominal, spoils
-    the size least. `told` are the parameters that arbitrary poses would determine.
+    Sockets and planes alone fit a larger arm in a larger cell as well: a gauge of what is
+    measured, but not of positions elsewhere. Holding the longest length at nominal distorts the
+    size least. `told` are the structurally identifiable parameters.
     """
     if not all(kind.socket or kind.plane for kind in kinds):
         return None
@@ -160,9 +156,9 @@ def growth(
     joints: FloatArray,
     oriented: bool,
 ) -> FloatArray:
-    """Return the growth (P,) of named parameters as `lengths` [m] of a chain grow.
+    """Return the growth (P,) of named parameters as other `lengths` [m] of a chain grow.
 
-    What is none of them shows in others, by poses or positions between the ends at (N, n).
+    By positions between the ends at joint values (N, n), and rotations if `oriented`.
     """
     changes, _, _ = followed(chain, names, [*lengths], joints, float(oriented), ends)
     return np.asarray(changes @ [*lengths.values()])
@@ -179,9 +175,9 @@ def followed(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how P named parameters follow a unit of each of K others.
 
-    Their changes (P, K) are those that move the arm most nearly as the others do, at joint values
-    (N, n), to which it came with signs of `approach` (N, n); a radian counts as `lever` [m]. What
-    the others move (6 N, K) [m], and what is left of that, follow.
+    Their changes (P, K) reproduce the arm's motion by the others best, at joint values (N, n)
+    approached with signs `approach` (N, n); a radian counts as `lever` [m]. The motion (6 N, K)
+    [m] by the others and its rest follow.
     """
     every = list(dict.fromkeys([*names, *others]))
     rows = ErrorModel(chain, every, *ends).jacobian(joints, approach)
@@ -189,7 +185,7 @@ def followed(
     flat = rows.reshape(-1, len(every))
     own, wanted = flat[:, : len(names)], flat[:, [every.index(name) for name in others]]
     scale = np.linalg.norm(own, axis=0)
-    scale[scale <= ROUNDING * scale.max(initial=0.0)] = 1.0  # what moves nothing
+    scale[scale <= ROUNDING * scale.max(initial=0.0)] = 1.0  # without effect
     found = np.linalg.lstsq(own / scale, wanted, rcond=1e-9)[0] / scale[:, np.newaxis]
     return found, wanted, wanted - own @ found
 
@@ -197,8 +193,8 @@ def followed(
 def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, FloatArray]:
     """Return joint values (M, n) that bring the target to one place, and that place (3,) [m].
 
-    It is that of the first, of planes the height in the middle. Those that have not arrived in 20
-    steps, stretched, are left out.
+    The place of the first pose, or the median height of a plane. Poses that do not arrive within
+    20 steps, stretched, are left out.
     """
     places = chain.forward(joints, base=kind.base, tool=kind.tool)
     place = places[0, :3, 3].copy()
@@ -213,9 +209,9 @@ def _meeting(chain: Chain, joints: FloatArray, kind: Kind) -> tuple[FloatArray, 
 def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArray:
     """Return the covariance (P, P) of the parameters from R, for weights in units of sigma.
 
-    For Gaussian noise of those sigmas (R^T R)^-1 is the Cramer-Rao bound. With noise of another
-    size it is (R^T R)^-1 M (R^T R)^-1, where `middle` M (P, P) is the normal matrix with every
-    equation weighted by its true variance (in units of the one assumed).
+    For Gaussian noise of those sigmas (R^T R)^-1 is the Cramer-Rao bound. Otherwise it is (R^T
+    R)^-1 M (R^T R)^-1, where `middle` M (P, P) is the normal matrix with every equation weighted
+    by its true variance (in units of the assumed one).
     """
     scale = 1.0 / np.linalg.norm(factor, axis=0)
     inverse, failed = lapack.dtrtri(factor * scale)
@@ -233,8 +229,8 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
 class Uncertainty(Shown):
     """Covariance of the fitted parameters, by source of error.
 
-    `parts` (K, P, P) are the shares of position, orientation, and what was known before; `freedom`
-    (K,) the degrees of freedom from which the size of each was estimated, infinite where known.
+    `parts` (K, P, P) belong to position, orientation, and priors; `freedom` (K,) are the degrees
+    of freedom of each noise estimate, infinite if known.
     """
 
     parts: FloatArray
@@ -252,9 +248,9 @@ class Uncertainty(Shown):
         return float(self.freedom_of(variances))
 
     def freedom_of(self, variances: FloatArray) -> FloatArray:
-        """Return the degrees of freedom (...) of a sum of variances (K, ...) from the sources.
+        """Return the degrees of freedom (...) of sums of variances (K, ...) from the sources.
 
-        That of Satterthwaite (1946): the spread of the sum is that of a single estimate.
+        After Satterthwaite (1946).
         """
         shares = variances / np.maximum(variances.sum(axis=0), 1e-300)
         with np.errstate(divide='ignore'):
@@ -262,10 +258,10 @@ class Uncertainty(Shown):
 
 
 def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dict[str, list[str]]:
-    """Return, for each parameter that was left out, the fitted ones that it trades against.
+    """Return the fitted parameters that each left-out one trades against.
 
-    Moving the one, and the others by the right amounts, leaves every measured pose as it is.
-    `matrix` (P, P) is the normal matrix of all of them.
+    Moving both by the right amounts leaves every measured pose unchanged. `matrix` (P, P) is the
+    normal matrix of all.
     """
     sizes = np.sqrt(np.diag(matrix))
     seen = sizes > ROUNDING * sizes.max(initial=0.0)
@@ -316,10 +312,7 @@ def indices_of(singular: FloatArray) -> dict[str, FloatArray]:
 def correlated(
     matrix: FloatArray, names: Sequence[str], threshold: float
 ) -> tuple[tuple[str, str, float], ...]:
-    """Return pairs of parameters whose correlation exceeds a threshold, strongest first.
-
-    By their covariance (P, P).
-    """
+    """Return pairs correlated beyond a threshold by their covariance (P, P), strongest first."""
     std = np.sqrt(np.diag(matrix))
     correlation = matrix / np.outer(std, std)
     strong = np.argwhere(np.triu(np.abs(correlation) > threshold, 1)).tolist()

@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """From matched pairs to the errors of the chain's parameters: Problem -> Identification.
 
-The steps of `identify` are those of Vacarescu et al., section 3: measure, write the pose errors as
-a linear model of the parameter errors, solve by least squares, correct the parameters, and repeat
-until the step vanishes. The rest makes the result trustworthy: frames without an initial guess,
-gauge freedoms found and named, and a judgement on poses that were not fitted.
+The steps of `identify` are those of Vacarescu et al., section 3: measure, linearise the pose
+errors in the parameter errors, solve by least squares, correct the parameters, and repeat until
+the step vanishes. The rest makes the result trustworthy: frames without an initial guess, gauge
+freedoms found and named, and a test on held-out poses.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from calib_ros.progress import Told, nobody
 from calib_ros.settings import EXCEPTION
 
 
-@np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a fit that runs away
+@np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a diverging fit
 def identify(
     problem: Problem, simpler: Identification | None = None, progress: Told = nobody
 ) -> Identification:
     """Identify the parameters of a chain from matched pairs.
 
-    Given the result of a `simpler` model, without effects, no sample that it explains is set aside
-    as a gross error: otherwise a rich model could leave out what contradicts it.
+    With the result of a `simpler` model, without effects, samples that it explains are no gross
+    errors: otherwise a rich model could leave out what contradicts it.
 
     Raises
     ------
@@ -51,7 +51,6 @@ def identify(
         With fewer equations than parameters.
     InputError
         If the fit diverges; the message names the mistake that explains it, if any.
-
     """
     try:
         return _identified(problem, simpler, progress)
@@ -70,7 +69,7 @@ def _identified(
     known = Simpler(simpler.chain, simpler.distances, simpler.noise) if simpler else None
     structural, start, fitted = fit(problem, known)
     problem, names, robust, chain = fitted.problem, fitted.names, fitted.robust, fitted.chain
-    progress(1 / 2)  # of many poses (benchmarks/end_to_end.py)
+    progress(1 / 2)  # with many poses (benchmarks/end_to_end.py)
     frames = [name for name in names if start.owns_frame(name)]
     if robust.system.count > 4 * SOME:
         most = max(SOME, int(EXCEPTION * robust.system.count))
@@ -122,9 +121,9 @@ def _identified(
 
 
 def _size(fitted: Fitted, explained: float) -> float:
-    """Return the size of the noise [sigma given] without the share that is explained.
+    """Return the size of the noise [sigma given] without the explained share.
 
-    No explanation makes it smaller than that given. Targets of one stop share what a model lacks.
+    At least the given sigma counts. Targets of one stop share unmodelled errors.
     """
     size = max(float(np.sqrt(1.0 - explained)) * fitted.size, min(fitted.size, 1.0))
     if fitted.noise.consistent:
@@ -135,15 +134,15 @@ def _size(fitted: Fitted, explained: float) -> float:
 
 
 def _priors(problem: Problem) -> dict[str, float]:
-    """Return the priors that were known before: those of effects, and those given."""
+    """Return the priors of effects and the given ones."""
     known = {name: problem.prior_sigmas[name] for name, _ in problem.model.effects}
     return {**known, **problem.given}
 
 
 def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
-    """Return how probable it is that what the arm's parameters explain is chance (`drift.py`).
+    """Return the probability that the arm's parameters explain only drift (`drift.py`).
 
-    None for a target in sockets: nothing measures there that could drift.
+    None for sockets: no device could drift.
     """
     if any(each.socket for each in problem.sets):
         return None
@@ -157,7 +156,7 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
 
 
 def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
-    """Return the DH parameters that the poses tell less of than what is known of other arms."""
+    """Return the DH parameters that the poses determine less than the learned priors."""
     if problem.learned is None:
         return ()
     learned = {n: x for n, x in problem.learned.priors.items() if n not in _priors(problem)}
@@ -166,7 +165,7 @@ def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ..
 
 
 def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, list[str]]:
-    """Return what each parameter that was left out trades against, seen on a part of the pairs."""
+    """Return what each left-out parameter trades against, by a part of the pairs."""
     free = problem.free
     if len(names) == len(free):
         return {}

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Weighted nonlinear least squares on the vector residual of poses.
+"""Weighted nonlinear least squares on the pose residuals.
 
-Samples are visited in blocks that fit the cache. A block adds to the normal matrix, which has
-the residual as its last row and column, so memory does not grow with the number of samples.
-The rank comes from a triangular factor of the Jacobian itself (a QR decomposition, block by
-block), because the normal matrix squares its condition number; so does the covariance, unless
-that matrix is well conditioned.
+Samples are visited in blocks that fit the cache. A block adds to the normal matrix, which has the
+residual as its last row and column, so memory does not grow with the number of samples. The rank
+is found from a triangular factor of the Jacobian (QR, block by block), because the normal matrix
+squares its condition number; so is the covariance, unless that matrix is well conditioned.
 """
 
 from __future__ import annotations
@@ -29,25 +28,24 @@ from calib_ros.settings import EXACT, EXCEPTION, Settings
 from calib_ros.shown import Shown
 
 Folds: TypeAlias = Sequence[NDArray[np.intp]]
-"""The number (N,) of the fold of every sample, set by set."""
+"""Fold number (N,) of every sample, set by set."""
 STEP_TOLERANCE = 1e-6
-"""The fit has converged when a step moves the predictions by less (RMS; in sigma or, where it is
-larger, in RMS residuals): a thousandth of what a million rows tell."""
+"""Convergence: the RMS step of the predictions in sigma or, if larger, in RMS residuals. A
+thousandth of the uncertainty with a million rows."""
 PATIENCE = SEVERAL
-"""Steps in succession that may raise the cost before they are damped."""
+"""Successive steps that may raise the cost before steps are damped."""
 SEPARATION_SIGMA = EXCEPTION * Settings.sigma_position
-"""Standard deviation [m] of a known distance between sockets, assumed: nearly exact beside what a
-device measures."""
+"""Assumed standard deviation [m] of known socket distances: nearly exact compared with a
+device."""
 SMALL_STEP = math.sqrt(EXACT)
-"""Step [m or rad] whose second order, half its square, is an error that may remain."""
+"""Step [m or rad] whose second-order error, half its square, is negligible."""
 
 
 @dataclass(frozen=True)
 class Prior:
     """Gaussian priors: standard deviations [m or rad] of parameters about the nominal chain.
 
-    `noise` is the size of the noise in the sigmas that weigh the data: where these are too small,
-    priors count for more.
+    `noise` scales the sigmas of the data: if these are too small, priors count for more.
     """
 
     nominal: Chain
@@ -67,7 +65,7 @@ class Prior:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class System(Shown):
-    """What is fitted: sets of samples, and priors if there are any."""
+    """Sets of samples to fit, with priors and known socket separations."""
 
     sets: tuple[Samples, ...]
     prior: Prior | None = None
@@ -97,22 +95,24 @@ class System(Shown):
         return rows / SEPARATION_SIGMA, residual
 
     def select(self, chosen: Sequence[NDArray[np.generic]]) -> System:
-        """Return the samples chosen by masks (N,) or indices (K,) by set, with their weights."""
+        """Return the samples chosen by masks (N,) or indices (K,) for each set, with their
+        weights.
+        """
         pairs = zip(self.sets, chosen, strict=True)
         return replace(self, sets=tuple(samples.select(index) for samples, index in pairs))
 
     def spread(self, most: int) -> System:
-        """Return every so many samples of each set, at most so many of all sets or one of each."""
+        """Return every k-th sample of each set: at most `most` in all, or one of each set."""
         share = -(-self.count // most)
         return self.select([np.arange(0, samples.count, share) for samples in self.sets])
 
     def weighted(self, weights: Sequence[FloatArray | None]) -> System:
-        """Return the samples with weights (N,) set by set; None for all ones."""
+        """Return the samples with weights (N,) for each set; None for ones."""
         pairs = zip(self.sets, weights, strict=True)
         return replace(self, sets=tuple(samples.weighted(each) for samples, each in pairs))
 
     def rows_of(self, chain: Chain, names: Sequence[str]) -> list[FloatArray]:
-        """Return (P + 1, c, N) the weighted rows of each set, the residual last."""
+        """Return the weighted rows (P + 1, c, N) of each set, the residual last."""
         return [samples.rows_of(chain, names) for samples in self.sets]
 
     @property
@@ -127,18 +127,18 @@ class System(Shown):
 
 
 def stacked(rows: Sequence[FloatArray]) -> FloatArray:
-    """Return the rows (P, c, N) of all sets as one, (R, P)."""
+    """Return the rows (P, c, N) of all sets as one array (R, P)."""
     return np.concatenate([each.reshape(len(each), -1) for each in rows], axis=1).T
 
 
 def gram(rows: FloatArray) -> FloatArray:
-    """Return the products (P, P) of rows (P, c, N) with each other."""
+    """Return the products (P, P) of rows (P, c, N)."""
     flat = rows.reshape(len(rows), -1)
     return np.asarray(flat @ flat.T)
 
 
 def owners(rows: Sequence[FloatArray]) -> NDArray[np.intp]:
-    """Return (R,) the number of the sample, over all sets, of each row of `stacked`."""
+    """Return the sample number (R,), over all sets, of each row of `stacked`."""
     ends = np.cumsum([each.shape[2] for each in rows]).tolist()
     numbers = [np.arange(end - each.shape[2], end) for end, each in zip(ends, rows, strict=True)]
     return np.concatenate(
@@ -148,10 +148,10 @@ def owners(rows: Sequence[FloatArray]) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations H dx = g at one chain, and the sum of squared weighted residuals there.
+    """Normal equations H dx = g at one chain, with the sum of squared weighted residuals.
 
-    `products` (2, P + 1, P + 1) are those of the measured rows with each other, by position and by
-    orientation, the residual last.
+    `products` (2, P + 1, P + 1) are those of the measured position and orientation rows, the
+    residual last.
     """
 
     matrix: FloatArray
@@ -161,11 +161,11 @@ class Normal:
 
     @property
     def parts(self) -> FloatArray:
-        """Return the shares (2, P, P) of H by position and by orientation."""
+        """Return the shares (2, P, P) of H by position and orientation."""
         return self.products[:, :-1, :-1]
 
     def factor(self) -> FloatArray | None:
-        """Return R (P, P) with R^T R = H; None where H has lost too many digits for it."""
+        """Return R (P, P) with R^T R = H; None if H has lost too many digits."""
         scale = np.sqrt(np.diag(self.matrix))
         if not (scale.all() and np.isfinite(scale).all()):
             return None
@@ -176,12 +176,12 @@ class Normal:
         return np.asarray(np.linalg.cholesky(scaled).T * scale)
 
     def rms(self, system: System) -> float:
-        """Return the RMS of the weighted residuals, in sigma."""
+        """Return the RMS weighted residual in sigma."""
         return float(np.sqrt(self.cost / system.rows))
 
 
 def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Normal:
-    """Return the normal equations (P, P), (P,) and the sum of squared weighted residuals."""
+    """Return the normal equations (P, P), (P,) with priors and separations."""
     products = products_of(chain, names, system)[0]
     total = products.sum(axis=0)
     extra, residual = system.extra_rows(chain, names)
@@ -194,9 +194,9 @@ def normal_equations(chain: Chain, names: Sequence[str], system: System) -> Norm
 def products_of(
     chain: Chain, names: Sequence[str], system: System, folds: Folds | None = None
 ) -> FloatArray:
-    """Return (K, 2, P + 1, P + 1) the products of measured rows by fold; K = 1 without folds.
+    """Return products (K, 2, P + 1, P + 1) of measured rows by fold; K = 1 without folds.
 
-    By position and by orientation, the residual last.
+    By position and orientation, the residual last.
     """
     count = 1 if folds is None else 1 + max(int(each.max(initial=0)) for each in folds)
     found = np.zeros((count, 2, len(names) + 1, len(names) + 1))
@@ -208,16 +208,13 @@ def products_of(
 def factor_of(
     chain: Chain, names: Sequence[str], system: System, normal: Normal | None = None
 ) -> FloatArray:
-    """Return R (P, P), upper triangular, with R^T R the normal matrix, by the shortest way.
-
-    `normal` are the normal equations there, if they are known.
-    """
+    """Return R (P, P), upper triangular, with R^T R the normal matrix; `normal` if known."""
     factor = (normal or normal_equations(chain, names, system)).factor()
     return triangular_factor(chain, names, system) if factor is None else factor
 
 
 def factor_of_some(factor: FloatArray, which: Sequence[int]) -> FloatArray:
-    """Return R (K, K) of some of the columns of a factor R (P, P)."""
+    """Return R (K, K) of some columns of a factor R (P, P)."""
     if len(which) == len(factor):
         return factor
     return np.asarray(np.linalg.qr(factor[:, which], mode='r'))
@@ -239,9 +236,9 @@ def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> Flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Shown):
-    """The chain at the minimum of the weighted squares, and the last normal equations there.
+    """The chain at the minimum, and the last normal equations.
 
-    `left` is how far the last step moved the predictions (RMS, as `STEP_TOLERANCE`).
+    `left` is the last RMS step of the predictions (as `STEP_TOLERANCE`).
     """
 
     chain: Chain
@@ -261,21 +258,20 @@ def minimise(
 ) -> Fit:
     """Fit the named parameters, relinearising until the step vanishes.
 
-    Gauss-Newton with columns scaled to unit length. A step may raise the cost for a moment, as
-    it must to get through a curved valley (watchdog; Chamberlain et al. 1982); when PATIENCE
-    steps have not brought it far enough below the best (Armijo 1966), for they may go to and fro,
-    the fit goes back there and steps are damped (Levenberg 1944, Marquardt 1963), by the ratio of
-    the gain to the one foreseen (Nielsen 1999).
-    It has converged when the step left to go, undamped, vanishes, however far the damped ones go.
-    It ends as well, not converged, where ROUNDS iterations bring no progress (a thousandth of the
-    cost, or half of the step left to go), where numbers end, or after so many `iterations`; curved
-    valleys need 400. `normal` are the equations at the start, if known.
+    Gauss-Newton with columns scaled to unit length. A step may raise the cost for a moment, as it
+    must to get through a curved valley (watchdog; Chamberlain et al. 1982). If PATIENCE steps have
+    not brought it far enough below the best (Armijo 1966), as if they oscillate, the fit returns
+    there and damps its steps (Levenberg 1944, Marquardt 1963) by the ratio of actual to predicted
+    gain (Nielsen 1999). It has converged when the undamped step vanishes. It ends without
+    convergence after ROUNDS iterations without progress (a thousandth of the cost, or half of the
+    remaining step), when numbers overflow, or after `iterations`; curved valleys need 400.
+    `normal` are the equations at the start, if known.
     """
     normal = normal or normal_equations(chain, names, system)
     if not names:
         return Fit(chain, normal, 0, True)
     best, best_chain = normal, chain
-    damping, growth, patience, promised = 0.0, 2.0, PATIENCE, 0.0
+    damping, growth, patience, expected = 0.0, 2.0, PATIENCE, 0.0
     iteration, stalled, least_cost, least_left = 0, 0, np.inf, np.inf
     while iteration < iterations and stalled < ROUNDS:
         iteration += 1
@@ -288,15 +284,15 @@ def minimise(
         stalled += 1
         if best.cost < 0.999 * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
-        foreseen = float(step @ (2.0 * normal.gradient - normal.matrix @ step))
-        promised = foreseen if normal is best else promised
+        predicted = float(step @ (2.0 * normal.gradient - normal.matrix @ step))
+        expected = predicted if normal is best else expected
         normal = normal_equations(chain, names, system)
         gain = best.cost - normal.cost
         if gain >= -ROUNDING * best.cost:
             best, best_chain, growth = normal, chain, 2.0
             if damping > ROUNDING:
-                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / foreseen - 1.0) ** 3)
-            elif gain > 1e-4 * promised:
+                damping *= max(1.0 / 3.0, 1.0 - (2.0 * gain / predicted - 1.0) ** 3)
+            elif gain > 1e-4 * expected:
                 damping, patience = 0.0, PATIENCE
             elif patience > 0:
                 patience -= 1
@@ -316,7 +312,7 @@ def minimise(
 def _next(
     normal: Normal, system: System, tolerance: float, damping: float
 ) -> tuple[FloatArray, float, bool]:
-    """Return the next step, how far the undamped one moves the predictions, and if they rest."""
+    """Return the next step, the RMS move of predictions by the undamped step, and convergence."""
     step = _solve(normal.matrix, normal.gradient)
     left = float(np.sqrt(max(float(step @ normal.matrix @ step), 0.0) / system.rows))
     settled = left < tolerance * max(1.0, normal.rms(system))
@@ -328,11 +324,11 @@ def _next(
 def without_each(
     chain: Chain, names: Sequence[str], system: System, folds: Folds
 ) -> Iterator[Chain]:
-    """Yield the chain fitted to all samples but those of one fold, for each one in turn.
+    """Yield, for each fold in turn, the chain fitted to all other samples.
 
     `chain` is the fit to all of them. One Gauss-Newton step from there, with the normal equations
-    of all less those of the fold, visits every sample only once. Where that step is too long to be
-    trusted, the fit is done on the samples.
+    of all samples minus those of the fold, visits every sample only once. If that step is too long
+    to be accurate, the samples are fitted.
     """
     curved = [k for k, name in enumerate(names) if not Parameter(name).of_lens]  # pixels are not
     parts = products_of(chain, names, system, folds).sum(axis=1)
@@ -350,9 +346,9 @@ def without_each(
 
 
 def _solve(matrix: FloatArray, gradient: FloatArray, damping: float = 0.0) -> FloatArray:
-    """Return the damped step; a matrix that rounding made singular is damped a little more.
+    """Return the damped step; more damping is added if rounding made the matrix singular.
 
-    NaN where the numbers of the matrix end.
+    NaN if the matrix overflows.
     """
     size = np.arange(len(matrix))
     if not len(size):

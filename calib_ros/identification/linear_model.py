@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The linear model about a geometric fit: what further effects would predict, without refitting.
+"""The linear model about a geometric fit: predictions with further effects, without refitting.
 
-Every effect adds a column at that fit. The residual of a left-out part is r - J_S beta, with beta
-from the other parts. Parts are formed in two ways, sample by sample and in blocks of successive
-samples, and both must agree, because neighbours share errors.
+Every effect adds a column at that fit. The residual of a held-out fold is r - J_S beta, with beta
+from the other folds. Folds are dealt in two ways, sample by sample and in blocks of successive
+samples; both must agree, because neighbours share errors.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.progress import Told, nobody
 
 HARMONICS = range(3, 41)
-"""Harmonics per turn of a joint that are looked for; 1 and 2 are the group of eccentricities."""
+"""Harmonics per turn of a joint to search; 1 and 2 belong to the eccentricities."""
 HARMONIC_SIZES = (TYPICAL['drive'], TYPICAL['drive'] / CLEARLY)
-"""Sizes [rad] of which all harmonics together may be: the usual, and a smaller one that decides
-nothing in benchmarks/real_robots.py."""
+"""Sizes [rad] of all harmonics together: the usual, and a smaller one that decides nothing in
+benchmarks/real_robots.py."""
 COMPARED = 15 * SOME_POSES
-"""Samples by which effects are compared; of more, every so many are taken, to save time.
-By 2,000 errors are the same within 1e-4 (benchmarks/real_robots.py)."""
+"""Samples that effects are compared on; larger sets are thinned to save time. By 2,000 errors
+are the same within 1e-4 (benchmarks/real_robots.py)."""
 
 
 class LinearModel:
-    """The linear model about a geometric fit, with columns of effects made when asked for.
+    """The linear model about a geometric fit; columns of effects are computed on demand.
 
-    Rows are sample by sample. Nothing measures at sockets that could drift, so nothing is moved
-    in time there, and no spectrum is searched.
+    Rows are ordered sample by sample. At sockets no device could drift, so residuals are not
+    shifted in time and no spectrum is searched.
     """
 
     def __init__(self, problem: Problem, geometric: Identification) -> None:
@@ -54,7 +54,7 @@ class LinearModel:
         posterior = geometric.posterior
         priors = {n: s for n, s in posterior.priors.items() if n in self._names}
         self._noise, self._sizes = geometric.noise.size, dict(posterior.sizes)
-        # what is considered as couplings may be what a drive does to its own joint
+        # couplings may be confused with errors of a joint's own drive
         self._sizes['drive'] = max(self._sizes.get(k, 0.0) for k in ('drive', 'coupling'))
         problem = replace(problem, learned=Learned(priors, self._noise))
         self._problem = problem
@@ -70,7 +70,7 @@ class LinearModel:
         numbers = numbered(sets)
         self._groups = np.concatenate(numbers)
         blocks = np.full(int(self._groups.max(initial=-1)) + 1, -1)
-        for each in numbers:  # every fold has some of each set
+        for each in numbers:  # every fold gets some of each set
             new = np.unique(each[blocks[each] < 0])
             blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
         dealings = (self._groups % problem.folds, blocks[self._groups])
@@ -99,13 +99,13 @@ class LinearModel:
         self._seen: Columns | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-        """Return the effects of each group whose columns are independent of the geometric model.
+        """Return the effects of each group that are independent of the geometric model.
 
-        What that model leaves of a column stands in the lower rows of a triangular factor.
+        The part of a column that this model does not explain is in the lower rows of the factor.
         """
         every = list(dict.fromkeys(name for names in groups.values() for name in names))
         count = len(self._names)
-        which = self._of([*self._names, *every])
+        which = self._columns_of([*self._names, *every])
         factor = np.asarray(np.linalg.qr(self._columns[which].T, mode='r'))
         number = {name: k for k, name in enumerate(every, count)}
         found: dict[str, list[str]] = {}
@@ -125,10 +125,7 @@ class LinearModel:
     def judge(
         self, chosen: Sequence[str], added: Sequence[str], what: str, size: float = 0.0
     ) -> Verdict:
-        """Compare the errors on configurations left out, with and without some effects.
-
-        These may be as large as `size`, or as usual without one.
-        """
+        """Compare held-out errors with and without `added` effects, of given or usual `size`."""
         new = [name for name in added if name not in chosen]
         found, pays = [], True
         for dealing in range(len(self._folds)):
@@ -142,7 +139,7 @@ class LinearModel:
         return Verdict(what, found[0], found[1], bool(pays))
 
     def judge_all_harmonics(self, chosen: Sequence[str]) -> Verdict:
-        """Judge all harmonics together, of the usual size and else of a smaller one."""
+        """Judge all harmonics together, of the usual size, then of a smaller one."""
         new = [name for name in self.harmonics if name not in chosen]
         for size in HARMONIC_SIZES:
             verdict = self.judge(
@@ -155,10 +152,11 @@ class LinearModel:
     def strongest_harmonic(
         self, chosen: Sequence[str], progress: Told
     ) -> tuple[Sequence[Parameter], bool]:
-        """Return sine and cosine of the harmonic that explains most of what is left.
+        """Return sine and cosine of the harmonic that explains most, and if many explain
+        something.
 
-        None where the strongest one of residuals moved in time often explains as much. And whether
-        all harmonics, each by itself, explain more than of those.
+        None if the strongest one explains time-shifted residuals as well. Many do if the sum of
+        their shares is larger than for shifted residuals.
         """
         pairs = [pair for pair in self._pairs if pair[0] not in chosen]
         if self._shifts is None or not pairs:
@@ -176,9 +174,9 @@ class LinearModel:
         groups: Sequence[Sequence[str]],
         progress: Told = nobody,
     ) -> FloatArray:
-        """Return the shares (G, S) of the moved residuals that groups of effects explain.
+        """Return the shares (G, S) of shifted residuals explained by groups of effects.
 
-        Columns are made once: those of effects, and with them all harmonics when one is asked for.
+        Columns are computed once, those of all harmonics when one is asked for.
         """
         assert self._shifts is not None
         wanted = {name for group in groups for name in group}
@@ -200,15 +198,14 @@ class LinearModel:
         )
 
     def _lots(self, lots: Sequence[Sequence[str]], progress: Told) -> Iterator[list[FloatArray]]:
-        """Yield the weighted columns (P, c, N) of each set, lot by lot."""
         for number, names in enumerate(lots):
             if number:
                 progress(f'harmonics of {Parameter(names[0]).owner}')
                 progress(number / len(lots))
             yield [each[:-1] for each in self._rows(names)]
 
-    def _of(self, names: Sequence[str]) -> list[int]:
-        """Return the numbers of the columns of effects, each made once."""
+    def _columns_of(self, names: Sequence[str]) -> list[int]:
+        """Return the column numbers of effects, adding missing columns."""
         missing = [name for name in names if name not in self._number]
         if missing:
             added = stacked(self._rows(missing)).T[:-1]
@@ -223,18 +220,17 @@ class LinearModel:
         return [self._number[name] for name in names]
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
-        """Return weighted Jacobian and residual (P + 1, c, N) of each set."""
         chain = self._chain.with_effects([name for name in names if name not in self._names])
         return self._system.rows_of(chain, names)
 
     def _left_out(
         self, dealing: int, chosen: Sequence[str], new: Sequence[str] = (), size: float = 0.0
     ) -> FloatArray:
-        """Return position errors (N, 3) [m] of every sample, predicted from the other folds.
+        """Return held-out position errors (N, 3) [m] of every sample, by the other folds.
 
-        The effects are the chosen ones and new ones, these as large as `size` or as usual.
+        With the chosen and new effects, the latter of `size` or usual.
         """
-        which = [*range(len(self._names)), *self._of([*chosen, *new])]
+        which = [*range(len(self._names)), *self._columns_of([*chosen, *new])]
         key = (dealing, size, *which)
         if key in self._errors:
             return self._errors[key]
@@ -246,7 +242,9 @@ class LinearModel:
         folds = self._problem.folds
         parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
         rest = parts.sum(axis=0) + _square(extra)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))  # a fold may hold all of it
+        scale = 1.0 / np.sqrt(
+            np.maximum(np.diag(rest)[:-1], 1e-300)
+        )  # a fold may hold all of a column
         weights = np.zeros((len(parts), len(self._columns)))
         for fold, part in enumerate(parts):
             left = (rest - part)[:-1]
@@ -261,10 +259,10 @@ class LinearModel:
         self._errors[key] = np.concatenate(errors)
         return self._errors[key]
 
-    def _priors(self, names: Sequence[str], told: float = 0.0) -> FloatArray:
-        """Return noise / sigma (P,) of the priors; zero without one.
+    def _priors(self, names: Sequence[str], given: float = 0.0) -> FloatArray:
+        """Return noise / sigma (P,) of the priors, zero without one.
 
-        Effects may be as large as is told, else as usual or as large as the data show.
+        Effects have the `given` size, else the usual one or that found in the data if larger.
         """
         sigmas = self._problem.prior_sigmas
         found = np.zeros(len(names))
@@ -273,11 +271,10 @@ class LinearModel:
             if name not in self._names:
                 group = str(group_of(self._chain, name))
                 usual = max(effects.expected(name), self._sizes.get(group, 0.0))
-                size = told or usual
+                size = given or usual
             found[k] = self._noise / size if size else 0.0
         return found
 
 
 def _square(rows: FloatArray) -> FloatArray:
-    """Return the products (P, P) of the columns of rows (R, P)."""
     return np.asarray(rows.T @ rows)

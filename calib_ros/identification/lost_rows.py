@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A row missing from one of two tables put side by side: later rows are mismatched.
+"""A missing row in one of two tables put side by side: later rows are mismatched.
 
-Base and tool are known from the pairs of a third of the session, the first or the last. By these
-each measurement i is held against the joint values i + s, for small shifts s: before a row k the
-one shift fits, from there on another, and one of them is zero.
+Base and tool are found from the first or last third of the session. Then each measurement i is
+compared with the joint values i + s for small shifts s: one shift fits before a row k, another
+from there on, and one of them is zero.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXCEPTION
 
 SLIPS = (0, 1, -1, 2, -2)
-"""Rows that may be missing; more at once are no slip (benchmarks/mistakes.py loses one)."""
+"""Rows that may be missing (benchmarks/mistakes.py loses one)."""
 FEWEST_ROWS = 3 * IN_A_FRAME
-"""Rows of a table: base and tool alone explain nearly all of fewer in a third of it."""
+"""Rows of a table: with fewer, base and tool alone explain nearly all of a third."""
 MOST_SEARCHED = 10 * SOME_POSES
-"""Rows that are looked at."""
+"""Rows of a table; longer ones are not searched."""
 EXPLAINED_ROWS = 1.0 - EXCEPTION
 """Share of the rows that a loss must explain."""
 
@@ -38,9 +38,9 @@ Framed = Callable[[Observations], Chain | None]
 
 @dataclass(frozen=True)
 class Loss:
-    """From `row` on (counted from 0) joint values stand `after` rows below their measurement.
+    """Joint values that are `after` rows below their measurement from `row` (from 0) on.
 
-    Before it they stand `before` rows below. `error` [m] is the typical one so.
+    Before it, they are `before` rows below. `error` [m] is the typical one once corrected.
     """
 
     row: int
@@ -61,10 +61,10 @@ class Loss:
 
 
 def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> Loss | None:
-    """Return the loss that explains nearly all pairs (N) in their order, if one does.
+    """Return the loss that explains nearly all pairs (N), if one does.
 
-    `framed` returns the chain in the frames that suit some pairs, `errors` (N,) [m] those of
-    pairs; up to `largest` they are those of a faulty arm.
+    `framed` returns the chain with frames fitted to some pairs, `errors` (N,) [m] those of pairs;
+    a faulty arm has errors of up to `largest`.
     """
     count = len(seen)
     if not FEWEST_ROWS <= count <= MOST_SEARCHED:
@@ -86,7 +86,6 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
 
 
 def _frames(seen: Observations, framed: Framed) -> Iterator[Chain]:
-    """Yield the chain in the frames by the first and the last third, for each shift."""
     third = len(seen) // 3
     for part, shift in product((slice(third), slice(-third, None)), SLIPS):
         rows = np.arange(len(seen))[part]
@@ -102,7 +101,7 @@ def _paired(seen: Observations, rows: NDArray[np.intp], shift: int) -> Observati
 
 
 def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> FloatArray:
-    """Return (N,) the errors [m] of each measurement at joint values some rows below."""
+    """Return the errors (N,) [m] of measurements at joint values `shift` rows below."""
     rows = np.arange(len(seen))
     inside = (rows + shift >= 0) & (rows + shift < len(seen))
     found = np.full(len(seen), np.inf)
@@ -111,13 +110,12 @@ def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> Fl
 
 
 def _where(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> int:
-    """Return the row at which most fit before and from there on."""
     gain = before.astype(int) - after.astype(int)
     return int(np.argmax(np.concatenate([[0], np.cumsum(gain)])))
 
 
 def _apart(before: FloatArray, after: FloatArray, row: int, largest: float) -> bool:
-    """Tell whether either side fits by its own shift and not by that of the other."""
+    """Tell whether each side fits by its own shift and not by the other's."""
     sides = (before[:row], after[:row]), (after[row:], before[row:])
     return all(
         len(own) >= LEAST_ASIDE

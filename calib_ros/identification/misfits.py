@@ -1,12 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Are the outliers of a robust fit gross errors, or the arm's own behaviour?
-
-Errors of a device occur anywhere, errors of an arm follow its joint values. So outliers are the
-arm's own behaviour if a joint hardly moves except in them; if all targets seen at a stop are off
-there, more often than by chance; or if they follow the values of a joint. Outliers of a device do
-so as well when they are shifted in time against these, as in `drift.py`, even if in a row.
-"""
+"""Are the outliers of a robust fit gross errors, or the arm's own behaviour (docs/model.md)?"""
 
 from __future__ import annotations
 
@@ -26,8 +20,8 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXCEPTION
 
 LEAST_STOPS = SOME_POSES // 4
-"""Stops from which on outliers are compared with the values of joints: along a path
-half as many make a false alarm twice as likely, 1.5 instead of 0.7 %."""
+"""Stops needed to compare outliers with joint values: along a path half as many double the false
+alarms, from 0.7 to 1.5 %."""
 ADVICE = (
     'device errors do not depend on joint values, so the arm has an effect that the model lacks. '
     'Look for effects (model auto), or fit these poses too (loss none)'
@@ -36,7 +30,7 @@ ADVICE = (
 
 @dataclass(frozen=True)
 class Outlier:
-    """A sample of gross error: where it is found, and its size in units of the usual error."""
+    """A sample with a gross error: its place, and its size in units of the usual error."""
 
     set: int
     sample: int
@@ -45,7 +39,7 @@ class Outlier:
 
 
 def outliers_of(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
-    """Return the samples that a robust fit has given up."""
+    """Return the samples that a robust fit excludes."""
     if problem.loss == 'none':
         return ()
     return tuple(
@@ -58,7 +52,7 @@ def outliers_of(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
 
 
 def arms_own(problem: Problem, robust: Robust) -> str | None:
-    """Return in words why outliers look like the arm's own behaviour, None where they do not."""
+    """Return why outliers look like the arm's own behaviour, or None."""
     if not robust.outliers.any() or any(each.socket for each in problem.sets):
         return None
     joints, kept = np.concatenate([each.joints for each in problem.sets]), ~robust.outliers
@@ -78,7 +72,7 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
 
 
 def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
-    """Return at how many configurations all of several targets are off, and how probable it is."""
+    """Return at how many configurations all of several targets are off, and its probability."""
     count = 1 + max(int(each.max()) for each in problem.configurations)
     targets = dict.fromkeys(each.tool for each in problem.sets)
     seen, off = np.zeros((2, len(targets), count))
@@ -99,7 +93,7 @@ def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
 def _with_a_joint(
     problem: Problem, joints: FloatArray, outliers: NDArray[np.bool_]
 ) -> tuple[str, float]:
-    """Return the joint whose values (N, n) go with outliers (N,) most, and by what chance."""
+    """Return the joint whose values (N, n) best explain outliers (N,), and the chance of that."""
     number = stops(joints)
     begins = np.flatnonzero(np.diff(number, prepend=-1))
     off = np.bincount(number, outliers) > 0.5 * np.bincount(number)
@@ -115,6 +109,6 @@ def _with_a_joint(
     spectrum = np.conj(np.fft.rfft(waves, axis=1)) * np.fft.rfft(off)[:, np.newaxis]
     shifted = (np.fft.irfft(spectrum, len(off), axis=1) ** 2).sum(axis=0).T  # joint, shift
     most = int(np.argmax(shifted[:, 0]))
-    variance = off.sum() * (1.0 - off.mean())  # of each wave, were they anywhere
+    variance = off.sum() * (1.0 - off.mean())  # of each wave for random outliers
     anywhere = len(names) * float(np.exp(-0.5 * shifted[most, 0] / variance))
     return names[most], max(anywhere, chance(shifted.max(axis=0)))

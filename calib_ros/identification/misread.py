@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rotations read in another convention than they were written in.
 
-A rotation matrix gives back the angles that it was made of, in each order of axes that may have
-been read; from these follows the rotation that was meant. Two triples of angles make the same
-rotation; where one of them is never written as what was meant, it was the other. XYZ stands for
-R = Rx Ry Rz, turns about rotated axes; zyx about fixed ones is the same.
+A rotation matrix gives back the angles it was made of, in each order of axes in which they may
+have been read; these give the intended rotation. Two triples of angles make the same rotation; if
+the intended convention never writes one of them, it was the other. XYZ stands for R = Rx Ry Rz,
+turns about rotated axes; zyx about fixed ones is the same.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from calib_ros.kinematics.se3 import FloatArray
 Turn: TypeAlias = Callable[[FloatArray], FloatArray]
 ORDERS = tuple(map(''.join, permutations('XYZ')))
 VECTOR = ''
-"""Of no order: three numbers that are a rotation vector."""
+""""Order" of a rotation vector."""
 
 
 def misread() -> Iterator[tuple[str, str, Turn]]:
-    """Yield mistakes, what to do, and the rotations (N, 3, 3) that were meant by those read."""
+    """Yield mistakes, remedies, and functions from the rotations (N, 3, 3) read to the intended
+    ones.
+    """
     in_radians = '--angle rad, with --joint-angle for the joints'
     for read in ORDERS:
         now = ', '.join(f'r{axis.lower()}' for axis in read)
@@ -68,11 +70,10 @@ def _order(letters: str) -> str:
 
 
 def _meant(read: str, meant: str, axes: str, size: float = 1.0, longer: bool = False) -> Turn:
-    """Return what makes other rotations of the same numbers.
+    """Return a function from the rotations read to those meant.
 
-    Those about `axes`, as they were read, become turns in the order that was meant, or a rotation
-    vector. Of rotation vectors the `longer` ones are taken first if asked: Euler angles may well
-    be longer than half a turn.
+    Angles about `axes`, as read, become turns in the intended order or a rotation vector. With
+    `longer`, the longer rotation vectors come first: Euler angles may exceed half a turn.
     """
     columns = ['XYZ'.index(axis) for axis in axes]
 
@@ -89,7 +90,7 @@ def _meant(read: str, meant: str, axes: str, size: float = 1.0, longer: bool = F
 
 
 def _beyond(angles: FloatArray, order: str) -> FloatArray:
-    """Return by how much angles (N, 3) exceed [rad] what is written: (N,)."""
+    """Return by how much [rad] angles (N, 3) exceed the usual range: (N,)."""
     if order == VECTOR:
         sizes = np.linalg.norm(angles, axis=1) - np.pi
     else:
@@ -100,7 +101,7 @@ def _beyond(angles: FloatArray, order: str) -> FloatArray:
 def _angles(rotations: FloatArray, order: str) -> tuple[FloatArray, FloatArray]:
     """Return both triples of angles (N, 3) about x, y and z [rad] in an order."""
     with warnings.catch_warnings():
-        warnings.simplefilter('ignore')  # where two axes are parallel any split will do
+        warnings.simplefilter('ignore')  # any split will do in gimbal lock
         one = np.asarray(Rotation.from_matrix(rotations).as_euler(order))
     half = np.copysign(np.pi, one)
     other = np.where([True, False, True], one - half, half - one)
@@ -109,7 +110,7 @@ def _angles(rotations: FloatArray, order: str) -> tuple[FloatArray, FloatArray]:
 
 
 def _vectors(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the rotation vectors (N, 3) [rad], the shorter ones and the longer ones."""
+    """Return the shorter and the longer rotation vectors (N, 3) [rad]."""
     one = se3.log_rotation(rotations)
     length = np.maximum(np.linalg.norm(one, axis=1, keepdims=True), 1e-300)
     return one, one * (1.0 - 2.0 * np.pi / length)

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The usual mistakes, tried out: units, conventions, joints, the wrong arm. Never corrected.
+"""Usual mistakes, tried out but never corrected: units, conventions, joints, the wrong arm.
 
 If the nominal arm misses the measurements by more than faulty arms do, each suspected mistake is
 undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`);
 the best few are refined by least squares. A mistake is named if undoing it reduces the typical
-error below NEARER times the original and to a level that faulty arms have; so are those that
-explain nearly as much. If none does, the positions are tried without the orientations, then
-several mistakes at once.
+error below NEARER times the original and to that of a faulty arm; so are those that explain nearly
+as much. If none does, the positions are tried without the orientations, then several mistakes at
+once.
 
-The typical error is the median over the samples of the distance and the angle times LEVER.
+The typical error is the median over the samples of the distance plus the angle times LEVER.
 Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
 that of the last joint one of the tool.
 """
@@ -45,36 +45,35 @@ from calib_ros.settings import LEVER
 
 @dataclass(frozen=True, eq=False)
 class Explained:
-    """What explains the measurements, and their typical errors [m] as given and so.
+    """The mistakes that explain the measurements, and typical errors [m] with and without them.
 
-    The latter is NaN where it is not known.
+    The latter is NaN if unknown.
     """
 
     suspects: tuple[Suspect, ...]
     given: float
-    so: float
+    corrected: float
 
     @property
     def alone(self) -> bool:
-        """Tell whether it is enough to refuse a result that nothing else refuses."""
+        """Tell whether this refuses a result by itself."""
         return not any(each.chain or each.what == ORIENTATIONS.what for each in self.suspects)
 
     def __str__(self) -> str:
-        """Return the mistake and what to do."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
-        if np.isnan(self.so):
+        if np.isnan(self.corrected):
             return whats[0]
         return (
             f'{" -- or ".join(whats)} (so the uncorrected arm is typically '
-            f'{1e3 * self.so:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
+            f'{1e3 * self.corrected:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
 
 
 def remarked(problem: Problem, result: Identification) -> Identification:
-    """Return the result with the mistake that explains its errors, if there is one.
+    """Return the result with the mistake that explains its errors, if any.
 
-    It is the first of the refusals; but another arm, and orientations that do not fit, are only
-    remarked on where nothing else refuses the result.
+    It becomes the first refusal; but another arm, and orientations that do not fit, only give a
+    remark if nothing else refuses the result.
     """
     found = explained(problem) if _suspicious(problem, result) else None
     if found is None:
@@ -87,7 +86,7 @@ def remarked(problem: Problem, result: Identification) -> Identification:
 def _suspicious(problem: Problem, result: Identification) -> bool:
     """Tell whether errors, before or after, are larger than those of faulty arms.
 
-    Couplings may explain most of what is left, however small, and a fit without end anything.
+    Couplings may explain most of any residuals, and a diverging fit everything.
     """
     if not result.converged or (not result.refusals and result.coupled):
         return True
@@ -103,7 +102,7 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
 
 
 def explained(problem: Problem) -> Explained | None:
-    """Return what explains the measurements much better than what was given, if anything does."""
+    """Return what explains the measurements much better than the given input, if anything."""
     sets = tuple(
         _as_poses(problem, each)
         for each in problem.sets
@@ -139,13 +138,12 @@ def _of_images(problem: Problem) -> bool:
 
 
 def _of_a_dead_column(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
-    """Return that a coordinate was not measured: no change of what was gives it back."""
+    """Return a coordinate that was not measured: no change of the input restores it."""
     found = None if _of_images(problem) else dead(chain, given.sets)
     return None if found is None else Explained((found,), given.error, np.nan)
 
 
 def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
-    """Return the mistakes that explain nearly the most, up to three, if they explain enough."""
     rough, tried, bare = [], [], _Bare()
     for each in suspects(chain, given.sets, _of_images(problem)):
         few = given.sets
@@ -155,9 +153,10 @@ def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explain
         if found is not None and found.share < given.share:
             rough.append((found, each))
     for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
-        so = _polished(problem, found)
-        if so.error <= _largest(problem):  # an arm in mm fits places in mm, and is off by metres
-            tried.append((so.share, so, each))
+        polished = _polished(problem, found)
+        # an arm in mm fits places in mm, and is off by metres
+        if polished.error <= _largest(problem):
+            tried.append((polished.share, polished, each))
     if not tried:
         return None
     tried.sort(key=lambda one: one[0])
@@ -172,13 +171,12 @@ def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explain
     return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
 
-def _largest(problem: Problem) -> float:
-    """Return the typical error [m] beyond which an arm is not a faulty one."""
+def _largest(problem: Problem) -> float:  # [m]
     return problem.largest_error + LEVER * problem.largest_angle / 3.0
 
 
 def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
-    """Return that a row is missing in one of two tables side by side, if that explains all."""
+    """Return a row missing in one of two tables side by side, if that explains all."""
     if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
         return None
 
@@ -194,7 +192,7 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) ->
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
-    """Return that the orientations are wrong, if the arm, or a mistake, explains the positions."""
+    """Return that the orientations are wrong, if the positions are explained."""
     whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
     if _of_images(problem) or not whole:
         return None
@@ -202,12 +200,12 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
     start = _tried(chain, tuple(each.spread() for each in alone))
     if start is None:
         return None
-    so = _polished(problem, start)
-    if so.error <= min(problem.largest_error, NEARER * given.error):
-        known = so.error + LEVER * problem.sigma_orientation
+    placed = _polished(problem, start)
+    if placed.error <= min(problem.largest_error, NEARER * given.error):
+        known = placed.error + LEVER * problem.sigma_orientation
         enough = known < NEARER * given.error
-        return Explained((ORIENTATIONS,), given.error, so.error) if enough else None
-    found = _named(problem, chain, alone, so)
+        return Explained((ORIENTATIONS,), given.error, placed.error) if enough else None
+    found = _named(problem, chain, alone, placed)
     if found is None or len(found.suspects) > 1:
         return None
     what = f'{found.suspects[0].what}, and the orientations do not fit either'
@@ -215,10 +213,10 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
 
 
 def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
-    """Return mistakes made at once, each of which explains part of the errors.
+    """Return simultaneous mistakes, each of which explains part of the errors.
 
-    The best few are kept and another one is added to each, until the arm explains the rest, or
-    one more is no better. One alone may be no better: two can hide each other.
+    Beam search: another mistake is added to each of the best few, until the arm explains the rest
+    or another is no better. The first may be no better alone: two mistakes can hide each other.
     """
     if given.error <= problem.largest_error:
         return None
@@ -227,28 +225,27 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
     largest, share = min(_largest(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
     least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
-    for _ in range(SEVERAL + 1):  # of joints, and one of how poses are written
+    for _ in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
         for some in kept:
             for each in options:
                 if each.part not in {one.part for one in some}:
                     more = tuple(sorted((*some, each), key=lambda one: one.part != 'measured'))
                     trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
-                    if trial is not None:  # others may be the same in other words
+                    if trial is not None:  # keeps the first of equivalent ones
                         found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (len(best[0][1]) > 1 and best[0][0].share > CONFIDENT * least):
             return None
         least = best[0][0].share
-        so = _polished(problem, best[0][0])
+        polished = _polished(problem, best[0][0])
         kept = [some for _, some in best]
-        if len(kept[0]) > 1 and so.error <= largest and so.share <= share:
-            return Explained((_together(kept[0]),), given.error, so.error)
+        if len(kept[0]) > 1 and polished.error <= largest and polished.share <= share:
+            return Explained((_together(kept[0]),), given.error, polished.error)
     return None
 
 
 def _together(mistakes: Sequence[Suspect]) -> Suspect:
-    """Return several mistakes as one."""
     published = [f'{each.what} ({each.published})' for each in mistakes]
     of_tables = [
         f'{each.what} ({each.remedy})' if each.part == 'measured' else said
@@ -259,7 +256,7 @@ def _together(mistakes: Sequence[Suspect]) -> Suspect:
 
 
 def _as_poses(problem: Problem, each: Observations) -> Observations:
-    """Return what was measured, boards in images by their poses."""
+    """Return the measurements, boards in images as poses."""
     if each.pixels is None:
         return each
     return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
@@ -267,10 +264,11 @@ def _as_poses(problem: Problem, each: Observations) -> Observations:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A chain with its frames for some samples, and the spread of the positions [m].
+    """A chain with frames fitted to some samples, and the spread of positions [m].
 
-    That of the flange or measured, which is less: with metres taken for millimetres, or radians
-    for degrees, every error is small. `arms` are the poses (N, 4, 4) of the bare arm.
+    The smaller of the spreads of flange and measured positions: if metres are taken for
+    millimetres, or radians for degrees, every error is small. `arms` are the poses (N, 4, 4) of
+    the bare arm.
     """
 
     chain: Chain
@@ -280,7 +278,7 @@ class _Trial:
 
     @cached_property
     def error(self) -> float:
-        """Return the median of the samples' errors [m]."""
+        """Return the median error [m] of the samples."""
         pairs = zip(self.sets, self.arms, strict=True)
         sizes = [_away(self.chain, each, arm) for each, arm in pairs]
         return float(np.median(np.concatenate(sizes)))
@@ -292,9 +290,9 @@ class _Trial:
 
 
 def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None:
-    """Return the chain with its frames for some samples in closed form, set by set.
+    """Return the chain with frames for some samples in closed form, set by set.
 
-    `bare` knows the poses of arms that were tried before.
+    `bare` caches the poses of arms tried before.
     """
     spreads, arms, bare = [], [], bare or _Bare()
     for each in sets:
@@ -306,7 +304,7 @@ def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None
             return None
         best = min(starts, key=lambda start: start.error).chain
         places = arm[:, :3, 3]
-        seen = places if each.socket else each.positions  # in sockets nothing is measured
+        seen = places if each.socket else each.positions  # sockets measure nothing
         spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
         chain = chain.with_frame(each.base, best.frame('base'))
         chain = chain.with_frame(each.tool, best.frame('tool'))
@@ -315,7 +313,7 @@ def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None
 
 
 class _Bare:
-    """Poses of bare arms, which most suspects leave as they are."""
+    """Cache of the poses of bare arms, which most suspects leave unchanged."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
@@ -323,13 +321,13 @@ class _Bare:
     def poses(self, chain: Chain, each: Observations) -> FloatArray:
         """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
         key = id(each.joints), id(chain.joints), chain.convention
-        if key not in self._known:  # what is kept keeps its identity
+        if key not in self._known:  # cached objects keep their ids
             self._known[key] = flange(chain, each), chain, each.joints
         return self._known[key][0]
 
 
 def _polished(problem: Problem, trial: _Trial) -> _Trial:
-    """Return a trial with its frames by least squares."""
+    """Return a trial with frames refined by least squares."""
     chain, sets = trial.chain, trial.sets
     sigmas = problem.sigma_position, problem.sigma_orientation
     system = System(tuple(Samples(each, *sigmas) for each in sets))
@@ -343,12 +341,11 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
 
 
 def _errors(chain: Chain, each: Observations) -> FloatArray:
-    """Return the errors (N,) [m] of samples."""
     return _away(chain, each, flange(chain, each))
 
 
 def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
-    """Return the errors (N,) [m] of samples by the poses (N, 4, 4) of the bare arm."""
+    """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
     found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
     away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
     if each.oriented.any():
@@ -358,7 +355,7 @@ def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
-    """Return each measurement with the joint values some rows below, held-out rows included."""
+    """Return measurements with the joint values `rows` below, held-out rows included."""
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
     parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')

@@ -1,13 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of non-geometric effects by cross-validation (`linear_model.py`).
-
-Groups of effects are added one by one, the best first, as long as the position error on left-out
-configurations falls by more than chance explains, and as long as they explain more of the
-residuals than of time-shifted ones (`drift.py`), which rules out drift. Then the spectrum of the
-remaining residuals is searched, joint by joint, for gear harmonics: the strongest one is added
-while it reduces the error, and all of them if many explain something.
-"""
+"""Choice of non-geometric effects by cross-validation (docs/model.md, Non-geometric errors)."""
 
 from __future__ import annotations
 
@@ -30,14 +23,14 @@ from calib_ros.progress import Told, nobody, share_of
 def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:
     """Identify with the errors named by `model`; `auto` chooses them by cross-validation.
 
-    If the choice cannot be fitted, or is refused although the geometric result is not, the
+    If the chosen model cannot be fitted, or is refused although the geometric one is not, the
     geometric result is returned with the verdicts and a remark. An exception from `progress` ends
     the work.
     """
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
         return identify(problem, progress=progress)
-    poses = max(1, sum(map(len, problem.sets)))  # of none nothing is fitted
+    poses = max(1, sum(map(len, problem.sets)))
     columns = 2 * len(HARMONICS) * len(problem.chain.joints)
     fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
     first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
@@ -63,7 +56,6 @@ def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Ide
 def _chosen(
     problem: Problem, geometric: Identification, progress: Told
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
-    """Return the effects that reduce the held-out error, and the verdicts on all tried."""
     progress('effects')
     model = LinearModel(problem, geometric)
     chosen: list[str] = []
@@ -91,7 +83,7 @@ def _chosen(
 def _with_harmonics(
     model: LinearModel, chosen: list[str], verdicts: list[Verdict], progress: Told
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
-    """Add the strongest harmonics one by one, or all of them where that predicts better."""
+    """Add the strongest harmonics one by one, or all of them if that predicts better."""
 
     def added(verdict: Verdict, names: Sequence[str]) -> bool:
         verdicts.append(verdict)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The size of the noise, which pairs share it, and the effect on the parameters."""
+"""The size of the noise, pairs that share it, and the uncertainty of the parameters."""
 
 from __future__ import annotations
 
@@ -22,18 +22,17 @@ from calib_ros.kinematics.se3 import FloatArray
 
 @dataclass(frozen=True)
 class Noise:
-    """Size of the residuals in units of the sigma given, for position and orientation.
+    """Size of the residuals in units of the given sigma, for position and orientation.
 
-    `consistent` tells whether a chi-squared test lets the sigmas pass. Then standard deviations
-    are those of the larger, the sigmas given or found, for a test of few residuals would let
-    through too small ones, and either of them may be right; else those of the sigmas found.
+    `consistent` tells whether a chi-squared test accepts the sigmas. Then standard deviations
+    follow the larger of given and found sigmas, because a test of few residuals would accept
+    sigmas that are too small; otherwise the found ones.
 
-    `successive` and `near` are the correlations of the residuals of configurations that follow
-    each other and that are near each other in joint space; `shared` names which of them a test
-    finds to share errors (`shared_errors.py`), and `widened` by what factor that makes the
-    standard deviations larger (median). `size` is that by which they are larger than the sigmas
-    given would make them, in all. `given` are these sigmas [m, rad, px] by their names in
-    `Problem`, as far as they are known.
+    `successive` and `near` are the correlations of residuals of configurations that follow each
+    other, and that are near each other in joint space; `shared` names those with shared errors by
+    a test (`shared_errors.py`), which widens the standard deviations by the factor `widened`
+    (median). `size` is their total ratio to those by the given sigmas. `given` are these [m, rad,
+    px] by their names in `Problem`, where known.
     """
 
     position: float
@@ -50,11 +49,11 @@ class Noise:
 def noise_of(
     fit: Fit, names: Sequence[str], system: System, factor: FloatArray
 ) -> tuple[Noise, Uncertainty]:
-    """Return the noise found, and the uncertainty of the parameters that follows from it.
+    """Return the noise and the resulting uncertainty of the parameters.
 
     `factor` R (P, P) is that of the weighted Jacobian, R^T R = H. Each part (position,
-    orientation) has as many degrees of freedom as equations, less its share of the parameters,
-    trace(H^-1 H_part). Pairs of one configuration share what the model lacks, and count for fewer.
+    orientation) has as many degrees of freedom as equations, minus its share of the parameters,
+    trace(H^-1 H_part). Pairs of one configuration share the model error, and count for fewer.
     """
     plain = identifiability.covariance(factor)
     taken = np.array([float(np.sum(plain * part)) for part in fit.normal.parts])
@@ -70,8 +69,10 @@ def noise_of(
     consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
     position, orientation = np.sqrt(variances).tolist()
     orientation = orientation if known[1] else None
-    by = shared_errors(fit, names, system)
-    noise = Noise(position, orientation, consistent, by.successive, by.near, by.found)
+    neighbours = shared_errors(fit, names, system)
+    noise = Noise(
+        position, orientation, consistent, neighbours.successive, neighbours.near, neighbours.found
+    )
     together = joint_sums / np.maximum(sums, 1e-300)
     alone = np.maximum(variances, 1.0) if consistent else variances
     sizes = np.where(together > SUSPICIOUS, together, 1.0) * alone
@@ -79,7 +80,9 @@ def noise_of(
     extra, _ = system.extra_rows(fit.chain, names)
     if system.prior is not None:
         extra[: len(names)] *= system.prior.noise
-    estimated = np.array([not consistent or sizes[k] != 1.0 or k in by.middles for k in (0, 1)])
+    estimated = np.array(
+        [not consistent or sizes[k] != 1.0 or k in neighbours.middles for k in (0, 1)]
+    )
     seen = np.where(together > SUSPICIOUS, joint_counts, counts)
     freedom = np.maximum(seen - taken, 1.0)
     freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
@@ -90,8 +93,10 @@ def noise_of(
         sources = (*by_part, extra.T @ extra)
         return np.array([identifiability.covariance(factor, middle) for middle in sources])
 
-    covariance = covariances([by.middles.get(k, middle) for k, middle in enumerate(middles)])
-    if by.middles:
+    covariance = covariances(
+        [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
+    )
+    if neighbours.middles:
         alone = np.diag(covariances(middles).sum(axis=0))
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
@@ -100,10 +105,9 @@ def noise_of(
 
 
 def _squares(chain: Chain, system: System) -> FloatArray:
-    """Return by part (4, 2) the sums of squared residuals, their numbers, and both of the sums.
+    """Return by part (4, 2) sums and counts of squared residuals, alone and over configurations.
 
-    The latter are over the pairs of each configuration: if its pairs share no error, the squares
-    of the sums add up to as much as the squares.
+    If pairs of a configuration share no error, squares of their sums add up to the same.
     """
     found = np.zeros((4, 2))
     sums, counts, joint_sums, joint_counts = found  # views

@@ -26,12 +26,12 @@ _SHAPES: dict[str, tuple[int | None, ...]] = {
     'covariance': (6, 6),
     'pixels': (2,),
 }
-"""Shapes of a pair's share of each array; None for the number of joints."""
+"""Shapes per pair; None for the number of joints."""
 NO_ROTATION = 0.05
-"""Difference of R^T R from the identity from which R is no rotation: two digits leave 0.02."""
+"""Largest deviation of R^T R from the identity for a rotation: two digits leave 0.02."""
 SOME_POSES = 200
-"""Poses that stand for many: random ones for the joint range, even ones for those measured.
-A convention, of which other counts are multiples."""
+"""Sample size by convention: random poses for the joint range, even ones for the measured poses.
+Other counts are multiples."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,7 +48,7 @@ class Observations(Shown):
         True where the orientation was measured; elsewhere the rotation is the identity.
     covariance : (N, 6, 6), optional
         Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
-        PoseWithCovariance; NaN rows where there is none.
+        PoseWithCovariance; NaN rows where unknown.
     approach : (N, n), optional
         Signs of the velocities with which the joints reached their values, for backlash.
     distances : (N,), optional
@@ -57,16 +57,16 @@ class Observations(Shown):
     plane : bool
         The distances are heights over the plane z = 0 of the world, zero where touched.
     velocity, acceleration : (N, n), optional
-        Of the joints, where the arm was moving when it was measured.
+        Of the joints, if the arm was moving when measured.
     delay : (N,), optional
-        How much earlier than the stamps the joints had these values [s].
+        Time [s] before the stamps at which the joints had these values.
     base, tool : str
         Frames of the chain for these pairs.
     socket : bool
-        The target, a ball, sat in a socket at an unknown place: it stayed at the origin of the
-        world, whose axes are parallel to the arm's base.
+        The target is a ball in a socket at an unknown place: the origin of the world, whose axes
+        are parallel to the arm's base.
     inverse : bool
-        The poses were inverted: they were of a fixed target in a camera on the flange.
+        The poses are inverted: a fixed target was measured by a camera on the flange.
     pixels, points : (N, 2), (N, 3), optional
         Points of a board in images: one row per point, with its place in the image and in the
         board frame [m]. Rows of one image are consecutive and share stamp and joint values.
@@ -74,7 +74,6 @@ class Observations(Shown):
     on_flange : bool
         The camera is on the flange, at `tool`, and the board is the world. Otherwise the camera is
         the world and the board is at `tool`.
-
     """
 
     stamps_ns: NDArray[np.int64]
@@ -98,7 +97,7 @@ class Observations(Shown):
     plane: bool = False
 
     def __post_init__(self) -> None:
-        """Check that the arrays fit together and hold only numbers."""
+        """Check that the arrays match and are finite."""
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):
@@ -115,12 +114,10 @@ class Observations(Shown):
                 raise InputError(f'{name} of the observations hold NaN or infinite values')
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the arrays that there are, a row each pair."""
         arrays = {name: getattr(self, name) for name in _SHAPES}
         return {name: array for name, array in arrays.items() if array is not None}
 
     def __len__(self) -> int:
-        """Return the number of pairs."""
         return len(self.stamps_ns)
 
     @classmethod
@@ -129,14 +126,12 @@ class Observations(Shown):
     ) -> Observations:
         """Make observations of joint values (N, n) [rad or m] and positions (N, 3) [m].
 
-        With `rotations` (N, 3, 3) they are poses, without them positions only.
+        With `rotations` (N, 3, 3) they are poses. Masked values count as missing.
 
         Raises
         ------
         InputError
-            For arrays that are not numeric, have another shape, or are not rotations; masked
-            values count as missing.
-
+            For arrays that are not numeric, have another shape, or are not rotations.
         """
         joints, positions = _numbers('joints', joints), _numbers('positions', positions)
         if joints.ndim != 2:
@@ -161,10 +156,10 @@ class Observations(Shown):
         images: NDArray[np.intp],
         on_flange: bool = False,
     ) -> Observations:
-        """Make observations of a board: `images` (N,) numbers the image of each row.
+        """Make observations of board `points` (N, 3) [m] at `pixels` (N, 2).
 
-        `joints` (N, n) are the joint values at that image; the board's `points` (N, 3) [m] are
-        seen at `pixels` (N, 2).
+        `images` (N,) numbers the image of each row, `joints` (N, n) are the joint values at that
+        image.
         """
         plain = cls.from_arrays(joints, np.broadcast_to(np.zeros(3), (len(joints), 3)))
         stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
@@ -178,37 +173,37 @@ class Observations(Shown):
 
     @classmethod
     def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
-        """Make observations of a point that touched one plane, at joint values (N, n)."""
+        """Make observations of a point touching one plane, at joint values (N, n)."""
         heights = np.zeros(len(joints))
         plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
         return replace(plain, distances=heights, plane=True, base=base, tool=tool)
 
     def select(self, mask: NDArray[np.generic] | slice) -> Observations:
-        """Return the pairs of a mask (N,), of indices (K,) or a slice; they have been checked."""
+        """Return the pairs of a mask (N,), indices (K,) or a slice, unchecked."""
         chosen = object.__new__(Observations)
         vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
         count = len(self.stamps_ns[mask])
         for name, array in self._arrays().items():
-            alike = array.strides[0] == 0  # what all pairs share stays one row
+            alike = array.strides[0] == 0  # keep broadcast arrays so
             few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
             vars(chosen)[name] = few
-        if 'configurations' in vars(self):  # takes longer to find than all the rest
+        if 'configurations' in vars(self):  # slow to compute
             numbers = self.configurations[mask]
             vars(chosen)['configurations'] = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
         return chosen
 
     def spread(self, most: int = SOME_POSES) -> Observations:
-        """Return evenly spread pairs, at most so many."""
+        """Return evenly spread pairs, at most `most`."""
         step = -(-len(self) // most)
         return self if step <= 1 else self.select(np.arange(0, len(self), step))
 
     def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
         """Return the inverted poses, for a camera on the flange that sees a fixed target.
 
-        The measured pose of the target in the camera becomes the pose of the camera in the target
-        frame, which becomes the world. Covariances are transformed too; where there is none,
-        `sigmas` (position [m], orientation [rad]) give one, because the uncertainty of the inverse
-        includes the orientation's sigma times the distance.
+        The pose of the target in the camera becomes the pose of the camera in the target frame,
+        the new world. Covariances are transformed too. `sigmas` (position [m], orientation [rad])
+        replace missing ones, because the uncertainty of the inverse includes the orientation's
+        sigma times the distance.
         """
         if not self.oriented.all():
             raise InputError(
@@ -231,9 +226,9 @@ class Observations(Shown):
         )
 
     def covariances(self, sigmas: tuple[float, float]) -> FloatArray:
-        """Return (N, 6, 6) the covariances, by `sigmas` [m, rad] where a measurement brought none.
+        """Return the covariances (N, 6, 6), from `sigmas` [m, rad] where missing.
 
-        One that is zero in all that concerns the rotation is that of the position alone.
+        A covariance with zeros for the rotation is that of the position alone.
         """
         given = np.diag(np.repeat(np.square(sigmas), 3))
         found = np.tile(given, (len(self), 1, 1))
@@ -249,7 +244,7 @@ class Observations(Shown):
         return replace(self, stamps_ns=stamps_ns)
 
     def earlier(self, delay: float | None) -> Observations:
-        """Return the same measurements with the joint values of a delay [s] before the stamps.
+        """Return the measurements with the joint values a delay [s] before the stamps.
 
         By velocity and acceleration; without them the arm was at rest and nothing changes.
         """
@@ -272,12 +267,12 @@ class Observations(Shown):
 
     @property
     def camera(self) -> str:
-        """Return the frame of the camera that saw the pixels."""
+        """Return the frame of the camera."""
         return self.tool if self.on_flange else self.base
 
     @cached_property
     def images(self) -> NDArray[np.intp]:
-        """Return (N,) the number of the image that each row of pixels is from."""
+        """Return the image number (N,) of each row of pixels."""
         other = np.zeros(len(self), dtype=np.intp)
         other[1:] = np.diff(self.stamps_ns) != 0
         other[1:] |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
@@ -285,17 +280,17 @@ class Observations(Shown):
 
     @cached_property
     def configurations(self) -> NDArray[np.intp]:
-        """Return (N,) the number of the standing configuration that each pair belongs to."""
+        """Return the configuration number (N,) of each pair."""
         return configurations(self.joints)
 
     @cached_property
     def stops(self) -> NDArray[np.intp]:
-        """Return (N,) the number of the stop, in sequence, at which each pair was taken."""
+        """Return the stop number (N,) of each pair, in sequence."""
         return stops(self.joints)
 
 
 def _numbers(name: str, values: object) -> FloatArray:
-    """Return values as an array; NaN where a masked array has none."""
+    """Return values as an array, masked ones as NaN."""
     try:
         array = np.ma.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as err:
@@ -304,7 +299,6 @@ def _numbers(name: str, values: object) -> FloatArray:
 
 
 def _refuse_other_than_rotations(turns: FloatArray) -> None:
-    """Refuse matrices (N, 3, 3) if one is far from any rotation."""
     square = np.einsum('nij,nik->njk', turns, turns)
     wrong = np.abs(square - np.eye(3)).max(axis=(1, 2), initial=0.0) > NO_ROTATION
     wrong |= np.linalg.det(turns) < 0.0
@@ -318,10 +312,7 @@ def _refuse_other_than_rotations(turns: FloatArray) -> None:
 
 
 def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
-    """Return the numbers (N,) of the configurations of each set, counted over all of them.
-
-    What several targets or sessions show of one configuration has its number in common.
-    """
+    """Return the configuration numbers (N,) of each set, counted over all sets."""
     if len(sets) == 1:
         return (sets[0].configurations,)
     numbers = configurations(np.concatenate([each.joints for each in sets]))

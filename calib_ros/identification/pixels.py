@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels of known points of a board, for the solver.
+"""Pixels of known board points, for the solver.
 
 The residual of a point is u_measured - u in pixels. All points of an image see the same pose, so
 their rows are
 
     [ G T | L ]        G (2 K, 6) by the pose's twist, T (6, P) the arm, L (2 K, 9) the lens
 
-and their products follow from those of G with [G | L | residual]: (6, 16) for an image at most,
-however many points it shows. Gross errors are told point by point, and image by image.
+and their products follow from those of G with [G | L | residual]: at most (6, 16) for an image,
+however many points it shows. Gross errors are detected by point and by image.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from calib_ros.kinematics.se3 import FloatArray
 
 @dataclass(frozen=True, eq=False)
 class _Images:
-    """Some images, linearised.
+    """A linearised block of images.
 
     `columns` (6 + K + 1, 2, C) are the derivatives of all points by twist and lens, the residual
-    last, times robust weights; `begins` (b,) and `owner` (C,) tell the first point of each image
-    and the image of each point, both counted from the block's first; `twist` (P, 6, b) is what
-    parameters do to the pose of each image; `lens` the numbers of the K of the lens among the P.
+    last, times robust weights; `begins` (b,) is the first point of each image, `owner` (C,) the
+    image of each point, both within the block; `twist` (P, 6, b) is the pose's derivative by the
+    parameters; `lens` are the numbers of the K lens parameters among the P.
     """
 
     part: slice
@@ -84,7 +84,7 @@ class PixelSamples(Samples):
         count: int = 1,
         folds: NDArray[np.intp] | None = None,
     ) -> FloatArray:
-        """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
+        """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
         size = len(names)
         found = np.zeros((count, 2, size + 1, size + 1))
         for block in self._linearised(chain, names):
@@ -105,7 +105,7 @@ class PixelSamples(Samples):
         return found / self.sigmas[0] ** 2
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
-        """Yield the rows (P + 1, 2, C) of all points, a block at a time."""
+        """Yield the rows (P + 1, 2, C) of all points in blocks."""
         shifts = np.empty((self.count, 2, 3))
         for block in self._linearised(chain, names):
             for k in range(2):
@@ -120,22 +120,22 @@ class PixelSamples(Samples):
         self._shifts = shifts
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
-        """Return what weighted residuals (rows,) are at the board, (N, 3) [m].
+        """Return weighted residuals (rows,) as shifts at the board, (N, 3) [m].
 
-        By the chain at which rows were asked for last; robust weights are taken to be one.
+        By the chain of the last call for rows; robust weights count as one.
         """
         assert self._shifts is not None
         return np.asarray(np.einsum('kn,nkc->nc', residuals.reshape(2, -1), self._shifts))
 
     def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals in sigma (N, 2), and NaN (N, 3) in place of an orientation."""
+        """Return residuals in sigma (N, 2), and NaN (N, 3) for the orientation."""
         pixels, _ = seen_residuals(chain, self.observations)
         return pixels / self.sigmas[0], np.full((self.count, 3), np.nan)
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
-        """Yield the residuals (M, 2) of all points, and of all images: what their points share.
+        """Yield the residuals (M, 2) of all points, then the shared ones of all images.
 
-        No point counts for more than INNER usual ones in its image.
+        Points beyond INNER times the usual residual of their image count as much as that.
         """
         found, _ = self.whitened_residuals(chain)
         yield found, slice(None)
@@ -147,7 +147,7 @@ class PixelSamples(Samples):
         yield sums / np.sqrt(np.bincount(self._images))[:, np.newaxis], self._images
 
     def _linearised(self, chain: Chain, names: Sequence[str]) -> Iterator[_Images]:
-        """Yield blocks of images that hold about four BLOCKs of points."""
+        """Yield blocks of images with about four BLOCKs of points."""
         seen_by = self.observations
         model = ErrorModel(chain, names, seen_by.base, seen_by.tool)
         lens = require_lens(chain.frame(seen_by.camera).lens, seen_by.camera)
@@ -179,7 +179,7 @@ class PixelSamples(Samples):
         turning = model.order < model.rotations
         twist = np.zeros((len(turning), 6, origin.shape[1]))
         twist[:, :3], twist[turning, 3:] = shift[model.order], turn[model.order[turning]]
-        if self.observations.on_flange:  # along the camera's axes, as it moves the other way
+        if self.observations.on_flange:  # in the axes of the camera, which moves the other way
             flat = twist.reshape(len(twist), 2, 3, -1)
             twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)
         return axes, origin, twist
@@ -188,7 +188,7 @@ class PixelSamples(Samples):
 def samples_of(
     observations: Observations, sigmas: tuple[float, float], sigma_pixel: float
 ) -> Samples:
-    """Return observations of any kind as the solver takes them; sigmas [m, rad] and [px]."""
+    """Return observations of any kind for the solver; sigmas [m, rad] and [px]."""
     if observations.pixels is not None:
         return PixelSamples(observations, sigma_pixel)
     return Samples(observations, *sigmas)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is known before an identification."""
+"""The input of an identification."""
 
 from __future__ import annotations
 
@@ -28,18 +28,13 @@ from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 
 SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
-
-
 TOOL = 1.0
-"""Length [m] that no target on a flange exceeds, assumed."""
+"""Largest length [m] of a target on a flange, assumed."""
 
 
 @dataclass(frozen=True)
 class Learned:
-    """What a first fit has told: sizes of errors [m, rad] by parameter, and that of the noise.
-
-    The latter in units of the sigmas given.
-    """
+    """Sizes of errors [m, rad] by parameter, and of the noise [sigma given], from a first fit."""
 
     priors: Mapping[str, float]
     noise: float = 1.0
@@ -47,7 +42,7 @@ class Learned:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Problem(Shown):
-    """What is known before an identification.
+    """The input of an identification.
 
     Parameters
     ----------
@@ -57,10 +52,10 @@ class Problem(Shown):
         Pairs to fit; further sets in the same fit: other sessions or targets with their own
         frames, other kinds of measurement.
     separations : sequence of (str, str, float)
-        Pairs of base frames whose origins are a known distance [m] apart: sockets that held a ball
-        on the flange. Their worlds are parallel to the arm's base.
+        Pairs of base frames whose origins are a known distance [m] apart: sockets of a ball on the
+        flange. Their worlds are parallel to the arm's base.
     world_frame : str
-        Frame in which the poses were measured, for the record.
+        Frame of the measured poses, for the record.
     held_out : Observations or several, optional
         Pairs that judge the result and are never fitted. Without them it is judged by
         cross-validation over whole configurations.
@@ -68,7 +63,8 @@ class Problem(Shown):
         Standard deviations [m, rad] of measurements without a covariance. Their ratio weights
         position against orientation; the size of the noise is estimated.
     sigma_pixel, sigma_touch : float
-        The same [px] for each image coordinate of a board point, and [m] for heights over a plane.
+        Standard deviations [px] of image coordinates of a board point, and [m] of heights over a
+        plane.
     sigma_scale : float
         Standard deviation of the scale of the measuring device [1], if checked with a known
         length; otherwise 0.
@@ -76,7 +72,7 @@ class Problem(Shown):
         Treatment of gross errors (`robust.py`).
     priors : mapping of str to float
         Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
-        such as `*.a`; the first match applies. None by default.
+        such as `*.a`; the first match applies.
     effects : sequence of str
         Non-geometric effects to fit, by name or by group (`effects.py`).
     fixed : sequence of str
@@ -84,14 +80,13 @@ class Problem(Shown):
     folds : int
         Number of cross-validation folds.
     largest_length, largest_angle : float
-        Offsets [m, rad] beyond any fault of the right robot; a larger one is not accepted.
+        Largest accepted offsets [m, rad], beyond any fault of the right robot.
     largest_error : float
-        Largest RMS position error [m] on held-out poses that is accepted.
+        Largest accepted RMS position error [m] on held-out poses.
     learned : Learned, optional
         Priors estimated from the data, for parameters without one (`evidence.py`).
     of_messages : bool
         True if the samples were messages, to which table options do not apply.
-
     """
 
     chain: Chain
@@ -117,7 +112,7 @@ class Problem(Shown):
     of_messages: bool = False
 
     def __post_init__(self) -> None:
-        """Check what does not depend on the measured values."""
+        """Check the arguments."""
         priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
         for name, sigma in (self.sigmas | priors).items():
             if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
@@ -160,9 +155,9 @@ class Problem(Shown):
                 raise ConfigError(f'the distance of sockets must be positive, not {distance}')
 
     def _check_distances(self, distances: FloatArray) -> None:
-        """Refuse distances that vary by more than any point on the flange can move.
+        """Refuse distances that vary by more than the flange can move.
 
-        Half of them tell: some may be gross errors.
+        By their quartiles: some may be gross errors.
         """
         reach = TOOL
         for joint in self.chain.joints:
@@ -208,30 +203,30 @@ class Problem(Shown):
                 raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
 
     def _places(self, pattern: str) -> bool:
-        """Tell whether a pattern is that of the place of a frame, not of a lens there."""
+        """Tell whether a pattern matches the place of a frame, not a lens there."""
         place = self.model.owns_frame(pattern)
         return place and not fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
 
     @cached_property
     def sets(self) -> tuple[Observations, ...]:
-        """Return all sets of observations to fit."""
+        """Return all sets to fit."""
         return (self.observations, *self.more)
 
     @cached_property
     def judging(self) -> tuple[Observations, ...]:
-        """Return the held-out sets that hold anything."""
+        """Return the held-out sets that are not empty."""
         held_out = self.held_out or ()
         sets = (held_out,) if isinstance(held_out, Observations) else held_out
         return tuple(each for each in sets if len(each))
 
     @property
     def all_sets(self) -> tuple[Observations, ...]:
-        """Return the sets to fit, then those held out."""
+        """Return the sets to fit, then the held-out ones."""
         return (*self.sets, *self.judging)
 
     @cached_property
     def configurations(self) -> tuple[NDArray[np.intp], ...]:
-        """Return the numbers (N,) of the configurations of each set to fit, over all of them."""
+        """Return the configuration numbers (N,) of each set to fit, counted over all sets."""
         return numbered(self.sets)
 
     @cached_property
@@ -252,7 +247,7 @@ class Problem(Shown):
 
     @cached_property
     def model(self) -> Chain:
-        """Return the nominal chain with every frame and effect that is to be fitted."""
+        """Return the nominal chain with all frames and effects to fit."""
         chain = self.chain
         known = dict(chain.frames)
         added = {n for each in self.sets for n in (each.base, each.tool)} - set(chain.frame_names)
@@ -272,7 +267,7 @@ class Problem(Shown):
 
     @cached_property
     def prior_sigmas(self) -> Mapping[str, float]:
-        """Return the standard deviations [m, rad] of the priors of all parameters that have one.
+        """Return the standard deviations [m, rad] of all priors.
 
         Frames have none; effects always have one.
         """
@@ -283,7 +278,7 @@ class Problem(Shown):
 
     @cached_property
     def given(self) -> Mapping[str, float]:
-        """Return the standard deviations [m, rad] of the priors that were given, by name."""
+        """Return the standard deviations [m, rad] of the given priors by name."""
         sigmas: dict[str, float] = {}
         for name in self.free:
             fits = [x for pattern, x in self.priors.items() if fnmatch.fnmatchcase(name, pattern)]
@@ -293,19 +288,16 @@ class Problem(Shown):
 
     @cached_property
     def informed(self) -> frozenset[str]:
-        """Return the DH parameters whose prior says more than common sense does."""
+        """Return the DH parameters whose prior is tighter than common sense."""
         known = {n for n, sigma in self.given.items() if sigma < self.common_sense(n)}
         return frozenset(known - dict(self.model.effects).keys())
 
     def common_sense(self, name: str) -> float:
-        """Return a third of the offset [m, rad] that no faulty but right robot exceeds."""
+        """Return a third of the largest offset [m, rad] of a faulty robot."""
         return (self.largest_length if Parameter(name).is_length else self.largest_angle) / 3.0
 
     def system(self, sets: Sequence[Observations], learned: bool = True) -> System:
-        """Return sets of observations, and the priors, as the solver takes them.
-
-        Without the priors that were `learned` from the data if asked.
-        """
+        """Return sets and priors for the solver, without `learned` priors if asked."""
         if not learned and self.learned is not None:
             return replace(self, learned=None).system(sets)
         sigmas = self.prior_sigmas
@@ -321,10 +313,10 @@ class Problem(Shown):
 
     @cached_property
     def free(self) -> tuple[Parameter, ...]:
-        """Return the parameters that may be fitted, in the order of their priority.
+        """Return the parameters to fit, by priority.
 
         Of parameters that trade against each other the last are kept nominal: effects, and before
-        them lengths d, which are what grows absurd between nearly parallel axes.
+        them lengths d, which become absurd between nearly parallel axes.
         """
         model = self.model
         used = {name for each in self.sets for name in (each.base, each.tool)}

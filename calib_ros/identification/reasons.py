@@ -12,11 +12,11 @@ Rule = Enum(
     'OUTLIERS GAIN DRIFT REGION GAIN_WITH_OUTLIERS ROUNDING ORIENTATION SCALE MISTAKE '
     'UNKNOWN_LOSS UNREADABLE DROPPED POSED',
 )
-"""What a result can fail; `acceptance.py` says how each is judged."""
+"""What a result can fail (`acceptance.py`)."""
 
 
 class Reason(str):
-    """The sentence for a reader; `rule` is what failed."""
+    """The sentence for a reader, with the failed `rule`."""
 
     __slots__ = ('rule',)
     rule: Rule
@@ -28,5 +28,4 @@ class Reason(str):
         return reason
 
     def __getnewargs__(self) -> tuple[Rule, str]:  # type: ignore[override]
-        """Return what a copy is made of."""
         return self.rule, str(self)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The outcome of a recalibration: accepted or not, and in words."""
+"""The outcome of a recalibration."""
 
 from __future__ import annotations
 
@@ -18,17 +18,16 @@ from calib_ros.shown import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recalibration(Shown):
-    """An earlier calibration, brought up to date by some new poses.
+    """An earlier calibration, updated with new poses.
 
-    `changed` is what has changed, one after the other: the best explanation of each change, and
-    those that cannot be told apart from it; `unexplained` is the probability of residuals as large
-    as those that are left. `before` and `after` are errors of the new poses by the earlier
-    calibration, and by what the other poses tell; `known_before` and `known_after` are to what RMS
-    [m] positions over the joint range are known (one sigma), `moved` by what they change. If new
-    frames are fitted to all of the new poses for `before`, errors of poses that were left out are
-    larger by a ratio `anew`. `reused` is the share of the poses that the earlier calibration was
-    fitted to: they would count twice. `odd` names the pose without which the others would be
-    accepted, if there is one.
+    `changed` lists the changes, each with those indistinguishable from it; `unexplained` is the
+    probability of residuals as large as the remaining ones. `before` and `after` are errors of the
+    new poses by the earlier calibration, and predicted from the other poses. `known_before` and
+    `known_after` are the RMS uncertainty [m] of positions over the joint range, `moved` is their
+    change. If new frames are fitted to all new poses for `before`, `refitted` is the ratio by
+    which held-out errors are larger. `reused` is the share of poses that the earlier calibration
+    was fitted to: they would count twice. `odd` names a pose without which the others would be
+    accepted.
     """
 
     calibration: Calibration
@@ -40,13 +39,13 @@ class Recalibration(Shown):
     known_after: float
     moved: float
     reused: float = 0.0
-    anew: float = 1.0
+    refitted: float = 1.0
     odd: str = ''
 
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
-        better = self.after.rms_mm <= self.anew * self.before.rms_mm
+        better = self.after.rms_mm <= self.refitted * self.before.rms_mm
         agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
         fits = self.unexplained > changes.FALSE and bool(agrees)
         return fits and self.determined and not (self.reused or self.scale)
@@ -55,20 +54,20 @@ class Recalibration(Shown):
     def determined(self) -> bool:
         """Tell whether other poses confirm a change, and the arm is then known well enough.
 
-        That is about as well as before, or far better than it changed.
+        About as well as before, or far better than it changed.
         """
-        confirmed = not self.changed or self.after.rms_mm < self.anew * self.before.rms_mm
+        confirmed = not self.changed or self.after.rms_mm < self.refitted * self.before.rms_mm
         known = self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
         return confirmed and known
 
     @property
     def scale(self) -> Explanation | None:
-        """Return by how much the device's scale has changed, if that explains most."""
+        """Return the change of the device's scale, if that explains most."""
         first = (reasons[0] for reasons in self.changed)
         return next((e for e in first if e.names == (changes.SCALE_OF_DEVICE,)), None)
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the result as plain values."""
         return {
             'accepted': self.accepted,
             'refusal': ': '.join(filter(None, self.refusal())),
@@ -83,7 +82,7 @@ class Recalibration(Shown):
         }
 
     def refusal(self) -> tuple[str, str]:
-        """Return why it must not be used, and what to do; both empty if it is accepted."""
+        """Return why it must not be used, and what to do; empty if accepted."""
         if self.accepted:
             return '', ''
         if self.reused:
@@ -102,7 +101,7 @@ class Recalibration(Shown):
         if not self.determined:
             step = 'measure more poses, all over the joint range'
             return 'the new poses do not show well enough what has changed', step
-        if self.anew > 1.0:
+        if self.refitted > 1.0:
             return (
                 'the earlier calibration, in new frames, fits the new poses better',
                 'keep it, or identify again from more poses',

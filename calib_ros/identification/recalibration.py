@@ -5,11 +5,11 @@
 The earlier parameters x have the covariance C, and each of the arm's parameters has drifted since
 by a growth g per root of a year (a random walk). The residuals r of the new poses at the earlier
 arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ N(0, C + g^2 t). A
-larger change must have a cause that changed few parameters (`changes.py`). These become free (if
-two causes cannot be distinguished, those of both), and the estimate is the mean of dx given A and
-b, relinearised until it converges. Smooth errors of the device (`considered.py`), then and now,
-are no change of the arm. The result is used if the arm is then known about as well as before, or
-far better than it changed: by few poses, or poses much alike, one cause imitates another.
+larger change must have a cause that affects few parameters (`changes.py`). These become free (of
+both causes if indistinguishable), and the estimate is the mean of dx given A and b, relinearised
+until it converges. Smooth device errors (`considered.py`), then and now, are no change of the arm.
+The result is used if the arm is then known about as well as before, or far better than it changed:
+with few or similar poses, one cause imitates another.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ import numpy as np
 from calib_ros.errors import InputError
 from calib_ros.identification import changes
 from calib_ros.identification.calibration import Calibration, about, made
-from calib_ros.identification.changes import SCALE_OF_DEVICE, Columns, Explanation, Told
+from calib_ros.identification.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.considered import told_of
+from calib_ros.identification.considered import products_with_doubts
 from calib_ros.identification.leastsquares import System, minimise, products_of
 from calib_ros.identification.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.identification.noise import Noise
@@ -44,7 +44,7 @@ from calib_ros.settings import GROWTH
 
 
 def years_since(record: Mapping[str, Any]) -> float:
-    """Return the age [years] of a calibration by its record; a year if that does not tell."""
+    """Return the age [years] of a calibration by its record, or 1 if not recorded."""
     try:
         age = datetime.now(timezone.utc) - datetime.fromisoformat(str(record.get('created')))
     except (ValueError, TypeError):
@@ -66,9 +66,9 @@ def recalibrate(
     previous : Calibration
         With its covariance.
     problem : Problem
-        The new poses, between frames that the calibration knows, and their noise.
+        The new poses, between frames of the calibration, and their noise.
     years : float
-        Since then.
+        Time since then.
     growth : float
         Standard deviation [m] of the drift of lengths in a year; of angles twice that [rad].
     new : sequence of str
@@ -78,7 +78,6 @@ def recalibrate(
     ------
     InputError
         If the calibration has no covariance, or does not know a frame.
-
     """
     found, arm = _recalibrated(previous, problem, years, growth, new)
     if found.accepted or found.reused or found.scale is not None:
@@ -98,7 +97,7 @@ def recalibrate(
 
 
 def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Problem]]:
-    """Yield set and pose of those with the largest errors by a chain, and all without it."""
+    """Yield set and pose with the largest errors by a chain, and the problem without it."""
     sets = problem.all_sets
     sizes = [norms(residuals(chain, each).position) for each in sets]
     order = np.argsort(-np.concatenate(sizes))
@@ -120,7 +119,7 @@ def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Pro
 def _recalibrated(
     previous: Calibration, problem: Problem, years: float, growth: float, new: Sequence[str]
 ) -> tuple[Recalibration, Chain]:
-    """Return what comes of the poses of a problem, and the earlier arm in new frames."""
+    """Return the recalibration, and the earlier arm in new frames."""
     sets = problem.all_sets
     arm = _Arm.of(previous, sets, years, growth)
     system = _system(problem, sets, previous)
@@ -137,14 +136,14 @@ def _recalibrated(
     changed: list[tuple[Explanation, ...]] = []
     earlier, before = arm.changed(np.zeros(len(arm.names))), arm.square
     found = arm.solved(system)
-    while len(changed) < SEVERAL and (reasons := arm.reasons(found.told, columns)):
+    while len(changed) < SEVERAL and (reasons := arm.reasons(found.information, columns)):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
             columns = Columns(arm.chain, arm.names, movable)  # as much is usual
             continue
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
-    left = found.squares - float(found.told.vector @ found.told.mean(arm.doubted)[0])
+    left = found.squares - float(found.information.vector @ found.information.mean(arm.doubted)[0])
     result = Recalibration(
         _updated(arm, found, problem, changed),
         tuple(changed),
@@ -152,20 +151,20 @@ def _recalibrated(
         *_judged(arm, earlier, found, system, sets),
         *_known(arm, before, found),
         previous.reused(sets),
-        _left_out_by(system.rows, len(names)),
+        _left_out_ratio(system.rows, len(names)),
     )
     return result, earlier
 
 
-def _left_out_by(rows: int, fitted: int) -> float:
-    """Return by what ratio errors grow if rows are left out of a fit of so many parameters."""
+def _left_out_ratio(rows: int, fitted: int) -> float:
+    """Return the ratio of held-out to fitted errors."""
     return float(np.sqrt((rows + fitted) / (rows - fitted))) if rows > fitted else np.inf
 
 
 def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:
-    """Return the RMS [m] over the joint range of what was unknown, of what is, and of the change.
+    """Return the RMS position [m] of uncertainty before and after, and of the change.
 
-    Expected squares of the parameters' errors `before` are (P, P).
+    Over the joint range; `before` (P, P) are expected squares of the parameters' errors.
     """
     positions = changes.predicted(arm.chain, arm.names)
     squares = before, found.covariance, np.outer(found.change, found.change)
@@ -174,9 +173,9 @@ def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, 
 
 
 def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
-    """Tell whether all was measured by one device whose scale would show in positions.
+    """Tell whether one device measured all, with a scale that positions would show.
 
-    The travel of prismatic joints, which no parameter stretches, would not grow with it.
+    No parameter stretches the travel of prismatic joints.
     """
     base, *others = {each.base for each in sets}
     if (
@@ -193,23 +192,22 @@ def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """The solution at new poses: the change (P,), its covariance, and what was told about it.
+    """The change (P,) by new poses, its covariance, and the information about it.
 
     `squares` are those of the residuals at the earlier arm, to second order.
     """
 
     change: FloatArray
     covariance: FloatArray
-    told: Told
+    information: Information
     squares: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Arm:
-    """The earlier arm, parameters that are known to a covariance (P, P), effects considered.
+    """The earlier arm with considered effects, and the covariance (P, P) of its parameters.
 
-    A device that stands elsewhere, or another, may show them off by `device` (P, P) as well; that
-    is no change of the arm.
+    `device` (P, P) is added for a moved or another device; that is no change of the arm.
     """
 
     previous: Calibration
@@ -222,7 +220,7 @@ class _Arm:
     def of(
         cls, previous: Calibration, sets: Sequence[Observations], years: float, growth: float
     ) -> _Arm:
-        """Return that of a calibration that has a covariance and knows the frames of the sets."""
+        """Return the arm of a calibration with covariance and the frames of the sets."""
         if previous.covariance is None:
             raise InputError(
                 'the earlier calibration has no parameter covariance: identify it again with '
@@ -248,37 +246,37 @@ class _Arm:
 
     @property
     def doubted(self) -> FloatArray:
-        """Return the covariance (P, P) by what is not known of the arm, and by the device."""
+        """Return the covariance (P, P) of arm and device."""
         return self.square + self.device
 
-    def reasons(self, told: Told, columns: Columns) -> tuple[Explanation, ...]:
-        """Return what has changed; of what the device may do by itself only another scale."""
+    def reasons(self, information: Information, columns: Columns) -> tuple[Explanation, ...]:
+        """Return what has changed; of possible device errors only another scale."""
         freedom = self.previous.freedom
-        found = changes.reasons_of(told.beside(self.square), columns, freedom)
+        found = changes.reasons_of(information.marginalised(self.square), columns, freedom)
         if found and found[0].names == (SCALE_OF_DEVICE,):
             return found
-        return changes.reasons_of(told.beside(self.doubted), columns, freedom)
+        return changes.reasons_of(information.marginalised(self.doubted), columns, freedom)
 
     @property
     def own(self) -> list[int]:
-        """Return which parameters are the calibration's: what it fitted, or held nominal."""
+        """Return the indices of the calibration's parameters, fitted or held nominal."""
         known = self.previous.names
         return [k for k, name in enumerate(self.names) if name in known or name.of_dh]
 
     def changed(self, change: FloatArray) -> Chain:
-        """Return the chain with changes (P,); effects that were considered stay zero."""
+        """Return the chain with changes (P,); considered effects stay zero."""
         own: dict[str, float] = {self.names[k]: float(change[k]) for k in self.own}
         return replace(self.chain, effects=self.previous.chain.effects).with_offsets(own)
 
     def solved(self, system: System) -> _Found:
-        """Return the mean change given the new poses, relinearised until it stands still.
+        """Return the mean change given the new poses, relinearised until it converges.
 
-        What is known before is a whole covariance, where `leastsquares` takes single sigmas.
+        The prior is a whole covariance, while `leastsquares` takes single sigmas.
         """
         change = np.zeros(len(self.names))
-        for _ in range(4):  # of changes by millimetres the second moves nothing any more
+        for _ in range(4):  # changes of millimetres converge in two
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
-            plain, cross, doubtful = told_of(
+            plain, cross, doubtful = products_with_doubts(
                 chain,
                 self.names,
                 system,
@@ -291,24 +289,24 @@ class _Arm:
             )
             products = plain - cross @ np.linalg.solve(doubtful, cross.T)
             matrix, gradient = products[:-1, :-1], products[:-1, -1]
-            told = Told(self.names, matrix, gradient + matrix @ change)
-            squares = float(products[-1, -1] + change @ (gradient + told.vector))
-            change, covariance = told.mean(self.square)
-        return _Found(change, covariance, told, squares)
+            information = Information(self.names, matrix, gradient + matrix @ change)
+            squares = float(products[-1, -1] + change @ (gradient + information.vector))
+            change, covariance = information.mean(self.square)
+        return _Found(change, covariance, information, squares)
 
 
 def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
-    """Return the new poses with the noise that was found with the earlier ones."""
+    """Return the new poses with the noise found in the earlier ones."""
     if previous.noise is not None:
         problem = replace(problem, **_sigmas(problem.sigmas, previous.noise))
     return System(problem.system(sets).sets)
 
 
 def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
-    """Return the sigmas of new poses, by those stated and the noise of the earlier ones.
+    """Return the sigmas of new poses from the stated ones and the earlier noise.
 
-    One left at its default is the earlier one. Larger residuals than the earlier sigma allowed
-    need not come from the device: the excess is added to a new sigma too.
+    A default sigma becomes the earlier one. Residuals larger than the earlier sigma need not come
+    from the device: the excess is added to a new sigma too.
     """
     found = {}
     for name, sigma in stated.items():
@@ -327,7 +325,7 @@ def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
 def _judged(
     arm: _Arm, earlier: Chain, found: _Found, system: System, sets: Sequence[Observations]
 ) -> tuple[ErrorFigures, ErrorFigures]:
-    """Return the errors of the new poses by the earlier arm, and by what the other poses tell."""
+    """Return the errors of the new poses by the earlier arm, and predicted from the others."""
     groups = numbered(sets)
     count = min(SOME_POSES, distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
@@ -335,8 +333,8 @@ def _judged(
     chains = []
     parts = products_of(chain, arm.names, system, folds).sum(axis=1)
     for products in parts.sum(axis=0) - parts:
-        information = products[:-1, :-1]
-        rest = Told(arm.names, information, products[:-1, -1] + information @ found.change)
+        matrix = products[:-1, :-1]
+        rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
         chains.append((earlier, arm.changed(rest.mean(arm.square)[0])))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
@@ -346,7 +344,6 @@ def _judged(
 def _updated(
     arm: _Arm, found: _Found, problem: Problem, changed: Sequence[Sequence[Explanation]]
 ) -> Calibration:
-    """Return the calibration with the changes in it."""
     previous, chain = arm.previous, arm.changed(found.change)
     before = previous.before
     for name in before.frame_names:

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The record of a calibration in its file: the key `calibration` of a chain file.
+"""The record of a calibration: the key `calibration` of a chain file.
 
-A few hundred numbers in it identify the measurements that were fitted. Each row has a hash. The
-smallest `KEPT` hashes are a random sample of the rows. A further row with a hash up to the largest
-kept one is either among them or was not fitted (Broder 1997).
+A few hundred numbers in it identify the fitted measurements. Each row has a hash; the smallest
+`KEPT` hashes are a random sample of the rows. A further row with a hash up to the largest kept one
+is either among them or was not fitted (Broder 1997).
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from calib_ros.settings import Settings
 from calib_ros.values import parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
-"""Session, whether a camera on the flange measured, whether it is a socket; device or target."""
+"""Session, camera on the flange, socket; device or target."""
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
 ALWAYS = ('table_sha256', 'nominal', 'region')
-"""Keys of every record that calib_ros makes, which follow those that every one begins with."""
+"""Keys of every record that calib_ros writes, after those that all records start with."""
 Hashes: TypeAlias = NDArray[np.uint64]
 KEPT = 256
-"""Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept.
-Part of the format of files, as GRID."""
+"""Of 1,000 rows fitted, 12 repeated ones are detected in 95 % of cases: one in four is kept.
+Part of the file format, as GRID."""
 GRID = 1.618e-6
-"""Values [rad, m or px] in one cell are equal; no decimal number is near the edge of a cell."""
+"""Cell size [rad, m or px] of equal values; no decimal number is near an edge."""
 
 
 def packed(square: FloatArray) -> list[str]:
-    """Return a positive matrix (P, P) as the rows of its lower Cholesky factor, in text."""
+    """Return the rows of the lower Cholesky factor of a positive matrix (P, P) as text."""
     scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
     scaled = square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
     root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
@@ -55,13 +55,12 @@ def packed(square: FloatArray) -> list[str]:
 
 
 def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
-    """Return the matrix (P, K) of rows of numbers, to the diagonal of a `triangular` one.
+    """Return the matrix (P, K) of rows of numbers, up to the diagonal if `triangular`.
 
     Raises
     ------
     ValueError
-        When they are not so many, of other lengths, or not finite.
-
+        If the number or length of the rows is wrong, or a value is not finite.
     """
     numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
     widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
@@ -76,13 +75,13 @@ def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> Flo
 
 
 def unpacked(rows: Sequence[str], size: int) -> FloatArray:
-    """Return the matrix (P, P) of rows that `packed` made."""
+    """Return the matrix (P, P) from the rows of `packed`."""
     root = parse_rows(rows, size, triangular=True)
     return np.asarray(root @ root.T)
 
 
 def nominal_document(nominal: Chain) -> dict[str, Any]:
-    """Return the numbers of the chain that a calibration belongs to, row by row."""
+    """Return the numbers of the nominal chain, row by row."""
     rows = dict(zip(nominal.joint_names, nominal.table.tolist(), strict=True))
     effects = {name: float(value) for name, value in nominal.effects if value}
     more = {'effects': effects} if effects else {}
@@ -90,12 +89,12 @@ def nominal_document(nominal: Chain) -> dict[str, Any]:
 
 
 def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
-    """Return which session, device or target each frame is of, as plain values."""
+    """Return the owners of the frames as plain values."""
     return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
 
 
 def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
-    """Refuse a calibration of an arm with other joints than the nominal chain's."""
+    """Refuse a calibration with other joints than the nominal chain."""
     ours, theirs = (
         [f'{joint.name} ({joint.type})' for joint in each.joints] for each in (nominal, chain)
     )
@@ -108,7 +107,7 @@ def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What a calibration says of itself; `where` names it in errors."""
+    """The record of a calibration; `where` names it in errors."""
 
     content: Mapping[str, Any]
     where: str
@@ -120,8 +119,7 @@ class Record:
         Raises
         ------
         ConfigError
-            When it says nothing, was not accepted, or could not be judged or published.
-
+            If it is missing, was not accepted, or is incomplete.
         """
         record = calibration_record(text)
         if not record:
@@ -130,8 +128,10 @@ class Record:
                 'come from (key "calibration"); give the calibration.yaml from calib_ros identify'
             )
         if not isinstance(record.get('accepted', True), bool):
-            told = record['accepted']
-            raise ConfigError(f'{where}: calibration.accepted must be true or false, not {told!r}')
+            given = record['accepted']
+            raise ConfigError(
+                f'{where}: calibration.accepted must be true or false, not {given!r}'
+            )
         if record.get('accepted') is False:
             raise ConfigError(
                 f'{where} was not accepted: identify again, from more or better poses'
@@ -165,7 +165,7 @@ class Record:
         return found
 
     def nominal(self, chain: Chain) -> Chain:
-        """Return the nominal chain of a corrected one."""
+        """Return the recorded nominal chain."""
         known, where = self._part('nominal'), self.where
         if known.get('convention') != chain.convention:
             raise ConfigError(
@@ -178,7 +178,7 @@ class Record:
         return replace(chain, joints=joints, effects=()).with_effect_values(values)
 
     def check_table(self, chain: Chain) -> None:
-        """Refuse a table that is not the one that was identified, if that is recorded.
+        """Refuse a table other than the identified one, if that is recorded.
 
         Programs that rewrite a file may sort its effects; the region lists them in their order.
         """
@@ -201,13 +201,12 @@ class Record:
         )
 
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
-        """Refuse a calibration that is not one of a nominal chain (`parse_calibration`)."""
+        """Refuse a calibration of another nominal chain (`parse_calibration`)."""
         self.check_table(chain)
-        # else there is nothing to compare
-        told = self._part('nominal').get('convention') == nominal.convention
-        if told:
+        comparable = self._part('nominal').get('convention') == nominal.convention
+        if comparable:
             self._check_effects(nominal)
-        for name, row in (self._rows(nominal) if told else {}).items():
+        for name, row in (self._rows(nominal) if comparable else {}).items():
             for kind, value in row.items():
                 wanted = nominal.value(f'{name}.{kind}')
                 if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits written
@@ -218,7 +217,7 @@ class Record:
                     )
         limits = settings or Settings()
         length, angle = limits.largest_length, limits.largest_angle
-        if told and settings is None:
+        if comparable and settings is None:
             length = angle = math.inf
         if differing := _differing(chain, nominal, length, angle):
             raise ConfigError(
@@ -228,7 +227,7 @@ class Record:
             )
 
     def _check_effects(self, nominal: Chain) -> None:
-        """Refuse a nominal chain with other effects than those recorded."""
+        """Refuse a nominal chain with effects other than the recorded ones."""
         where = f'{self.where}: calibration.nominal.effects'
         known = dictionary(self._part('nominal').get('effects'), where)
         ours = dict(nominal.effects)
@@ -241,7 +240,7 @@ class Record:
                 )
 
     def before(self, nominal: Chain, chain: Chain) -> Chain:
-        """Return the nominal chain in its recorded frames, else those closest to the other one."""
+        """Return the nominal chain in its recorded frames, else in those closest to the chain."""
         known = self._part('nominal')
         if {'base', 'tool'} & set(known):
             return replace(nominal, **parse_frames(known, f'{self.where}: calibration.nominal'))
@@ -268,7 +267,7 @@ class Record:
         return names, square, freedom
 
     def noise(self) -> Noise | None:
-        """Return the noise of the measurements, if it is recorded."""
+        """Return the noise of the measurements, if recorded."""
         known = self._part('noise_in_sigma')
         if not known:
             return None
@@ -286,20 +285,20 @@ class Record:
             raise damaged('noise_in_sigma', self.where, err) from err
 
     def owners(self) -> dict[str, Owner]:
-        """Return which session, device or target each frame is of, where that is recorded."""
+        """Return the recorded owners of the frames."""
         found = {}
         for name, row in self._part('frames').items():
             parts = dictionary(row, f'{self.where}: calibration.frames.{name}')
             session, eye, socket, label = (parts.get(key) for key in OWNER)
-            told = isinstance(session, str) and isinstance(label, str)
-            if not (told and isinstance(eye, bool) and isinstance(socket, bool)):
+            named = isinstance(session, str) and isinstance(label, str)
+            if not (named and isinstance(eye, bool) and isinstance(socket, bool)):
                 raise damaged(f'frames.{name}', self.where)
             found[name] = (str(session), bool(eye), bool(socket), str(label))
         return found
 
 
 def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> list[str]:
-    """Return what of the joints differs by more than errors of one robot can [m, rad]."""
+    """Return the parameters that differ by more than errors of one robot [m, rad]."""
     if chain.convention != nominal.convention:
         return [f'the conventions ({chain.convention}, {nominal.convention})']
     names = []
@@ -314,7 +313,7 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
 
 
 def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
-    """Return the error that says which part of a record is not as it was written."""
+    """Return the error for a damaged part of a record."""
     kind = '' if err is None else f' ({type(err).__name__})'
     return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
 
@@ -339,27 +338,27 @@ def hashes(sets: Sequence[Observations]) -> Hashes:
 
 @dataclass(frozen=True, eq=False)
 class Fingerprint:
-    """The least hashes of `count` rows, in ascending order."""
+    """The smallest hashes of `count` rows, in ascending order."""
 
     count: int
     least: Hashes
 
     @classmethod
     def of(cls, sets: Sequence[Observations], earlier: Fingerprint | None = None) -> Fingerprint:
-        """Return that of rows, and of those fitted earlier."""
+        """Return the fingerprint of rows and of those fitted earlier."""
         new = hashes(sets)
         earlier = earlier or cls(0, new[:0])
-        both = np.union1d(earlier.least, earlier.of_those(new))[:KEPT]
+        both = np.union1d(earlier.least, earlier.comparable(new))[:KEPT]
         return cls(earlier.count + len(new), both)
 
-    def of_those(self, rows: Hashes) -> Hashes:
-        """Return which hashes of rows (N,) would be among these if the rows were fitted."""
+    def comparable(self, rows: Hashes) -> Hashes:
+        """Return which hashes of rows (N,) would be here if the rows were fitted."""
         every = self.count <= len(self.least)
         return rows if every else rows[rows <= self.least.max(initial=0)]
 
     @classmethod
     def of_record(cls, record: Mapping[str, Any], where: str) -> Fingerprint | None:
-        """Return what the record of a calibration says, if it does."""
+        """Return the fingerprint in the record of a calibration, if any."""
         if 'rows' not in record:
             return None
         try:
@@ -370,12 +369,12 @@ class Fingerprint:
             raise ConfigError(f'{what}: {err}') from err
 
     def document(self) -> dict[str, Any]:
-        """Return it for the record of a calibration."""
+        """Return the fingerprint for the record."""
         return {'count': self.count, 'least': self.least.astype('>u8').tobytes().hex()}
 
     def share(self, sets: Sequence[Observations]) -> float:
-        """Return the share of rows that were fitted, as far as it shows."""
-        rows = self.of_those(hashes(sets))
+        """Return the estimated share of rows that were fitted."""
+        rows = self.comparable(hashes(sets))
         return float(np.isin(rows, self.least).mean()) if rows.size else 0.0
 
 

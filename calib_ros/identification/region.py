@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where a calibration may be used: where it is known to improve the arm, not only near its poses.
+"""Where a calibration may be used: where it improves the arm, also away from its poses.
 
 By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C); those of
 the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, it makes
@@ -8,11 +8,8 @@ the arm worse if
 
     |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
 
-The left side is normal, so this *risk* is a value of the normal distribution, or a mean of several
-for different sizes of errors, which are uncertain. The calibration may be used at the measured
-poses if the risk is below RISK there, and with all poses of the joint range that are predicted as
-well; further out, in shells of growing standard deviation of the predicted position, as long as
-that holds in each shell.
+The probability of that is the *risk*; docs/model.md (Region) describes the poses it is computed
+for.
 """
 
 from __future__ import annotations
@@ -39,23 +36,21 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
 
 RISK = 0.02
-"""Probability at which a calibration may make the arm worse over the poses of a shell
-(benchmarks/harm.py)."""
+"""Largest probability that the arm gets worse over the poses of a shell (benchmarks/harm.py)."""
 SHELL = SOME_POSES // 20
-"""Random configurations of a shell."""
+"""Random configurations per shell."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Region(Shown):
     """The joint values at which a calibration may be used.
 
-    `chain` is the calibrated arm with the effects considered, `square` (P, P) the expected squares
-    of the errors of its parameters `names` for the device that measured it. Another one adds the
-    product of `device` (P, K) with itself. Predicted positions may be off by `limit` [m], which
-    is infinite where the whole range of the joints is used; `share` is the share of it in use.
-    `base` and `tool` are the frames between which it was measured. `by_scale`, of none
-    that was loaded, is how probable it is that the device is out of scale and the arm gets worse
-    by it there.
+    `chain` is the calibrated arm with considered effects, `square` (P, P) the expected squares of
+    the errors of its parameters `names` for the measuring device; another device adds `device` (P,
+    K) times its transpose. Predicted positions may be off by `limit` [m], infinite if the whole
+    joint range is used; `share` is the used share of it. It was measured between `base` and
+    `tool`. `by_scale`, unknown for a loaded region, is the probability that the device is out of
+    scale and makes the arm worse there.
     """
 
     chain: Chain
@@ -74,7 +69,7 @@ class Region(Shown):
         return sigma_of(model, self.square, joints)
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
-        """Tell (N,) at which joint values (N, n) the calibration may be used."""
+        """Tell (N,) whether the calibration may be used at joint values (N, n)."""
         joints = self.chain.joint_values(joints)
         if np.isinf(self.limit):
             return np.ones(len(joints), dtype=bool)
@@ -82,7 +77,7 @@ class Region(Shown):
 
     @property
     def whole(self) -> bool:
-        """Tell whether it is the whole range of the joints."""
+        """Tell whether the region is the whole joint range."""
         return bool(np.isinf(self.limit))
 
     def in_words(self) -> str:
@@ -96,7 +91,7 @@ class Region(Shown):
         )
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain values, in text: a Cholesky factor, and rows of the device's."""
+        """Return the region as plain values: a Cholesky factor and the rows of the device."""
         return {
             'limit': None if self.whole else self.limit,
             'share': self.share,
@@ -111,9 +106,9 @@ class Region(Shown):
 def sigma_of(
     model: ErrorModel, square: FloatArray, joints: FloatArray, components: slice = np.s_[:3]
 ) -> FloatArray:
-    """Return the expected size (N,) of some components of errors of poses at (N, n).
+    """Return the expected size (N,) of some components of pose errors at joint values (N, n).
 
-    `square` (P, P) are the expected squares of the errors of the model's parameters.
+    `square` (P, P) are the expected squares of the parameter errors.
     """
     found = np.empty(len(joints))
     for first in range(0, len(joints), BLOCK):
@@ -123,20 +118,19 @@ def sigma_of(
 
 
 def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the expected sizes (N,) of what rows (N, c, P) make of errors of squares (P, P)."""
+    """Return the expected sizes (N,) of rows (N, c, P) times errors of squares (P, P)."""
     flat = rows.reshape(-1, rows.shape[2])
     squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
-    """Return the region of a calibrated chain from its record; None where it names none.
+    """Return the region in the record of a calibration, or None.
 
     Raises
     ------
     ConfigError
-        When it is not what `Region.document` makes; `where` names it.
-
+        If it is not as `Region.document` writes it; `where` names it.
     """
     document = record.get('region')
     if document is None:
@@ -171,9 +165,9 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
 
 
 def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
-    """Return where a calibration may be used; None where not even at the poses measured.
+    """Return where a calibration may be used; None if not even at the measured poses.
 
-    `freedom` are the degrees of freedom from which the noise was estimated.
+    `freedom` are the degrees of freedom of the noise estimate.
     """
     ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
@@ -211,7 +205,7 @@ _Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class _Judge:
-    """Tells how probable it is that a calibration makes the arm worse at some poses."""
+    """Probability that a calibration makes the arm worse at some poses."""
 
     def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
         chain, names = posterior.chain, posterior.names
@@ -224,24 +218,24 @@ class _Judge:
         self._offsets = posterior.offsets[self._arm]
 
     def rows(self, joints: FloatArray) -> FloatArray:
-        """Return the rows (N, 3, P + F) of positions at joint values (N, n).
+        """Return the position rows (N, 3, P + F) at joint values (N, n).
 
-        Columns are those of the posterior's names, then of frames that are not among them.
+        Columns are those of the posterior's names, then of further frame parameters.
         """
         return self._model.jacobian(joints)[:, :3]
 
     def products(self, rows: FloatArray) -> FloatArray:
-        """Return (K, K) the products of columns of frames, then of the arm, over some rows."""
+        """Return products (K, K) of the columns of frames, then of the arm."""
         flat = rows[..., self._own].reshape(-1, len(self._own))
         return np.asarray(flat.T @ flat)
 
     def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
-        """Return what may be of all offsets, as in `Posterior.doubted`, for those of the arm."""
+        """Return plausible offsets, as in `Posterior.doubted`, for the arm only."""
         weights, means, covariances = (np.array(each) for each in zip(*doubted, strict=True))
         return weights, means[:, self._arm], covariances[:, self._arm][:, :, self._arm]
 
     def risk(self, which: FloatArray, around: FloatArray, doubts: _Doubts) -> float:
-        """Return it for some poses, in frames fitted to those around; both by their products."""
+        """Return the risk at some poses, in frames fitted to poses around; by their products."""
         frames, arm = np.s_[: self._placed], np.s_[self._placed :]
         root = inverse_root(around[frames, frames], np.diag(around)[frames])
         taken = root @ (root.T @ around[frames, arm])

@@ -3,9 +3,9 @@
 """The pose of a flat board in each image, from its points alone (PnP).
 
 A homography from the board to the undistorted image, linear in its nine entries, gives a first
-pose (Zhang 2000), and Gauss-Newton steps on the pixels the pose. A small or distant board looks
-much the same when it is turned to the other side of the line of sight (Oberkampf et al. 1996), so
-that pose is refined as well, and the one with the smaller residuals counts.
+pose (Zhang 2000), refined by Gauss-Newton steps on the pixels. A small or distant board looks much
+the same when turned to the other side of the line of sight (Oberkampf et al. 1996), so that pose
+is refined as well, and the one with smaller residuals is returned.
 """
 
 from __future__ import annotations
@@ -26,20 +26,19 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 
 
 def board_poses(observations: Observations, lens: Lens) -> Observations:
-    """Return pixels as poses, one for each image that tells one.
+    """Return pixels as poses, one for each image that determines one.
 
     Raises
     ------
     InputError
-        When no image shows enough points, or half of those that do fit no pose of the board.
-
+        If no image shows enough points, or half of those that do fit no pose of the board.
     """
-    told = _tell_a_pose(observations, observations.images)
-    if not told.any():
+    usable = _determine_a_pose(observations, observations.images)
+    if not usable.any():
         raise InputError(
             'no image shows 4 board points that are not in line: the camera cannot be located'
         )
-    rows = observations.select(told[observations.images])
+    rows = observations.select(usable[observations.images])
     poses, rms = resect(rows, lens)
     _require_fit(rows, rms)
     first = np.flatnonzero(np.diff(rows.images, prepend=-1))
@@ -60,7 +59,7 @@ def _per_image(rows: FloatArray, index: NDArray[np.intp]) -> FloatArray:
 
 
 def _require_fit(observations: Observations, rms: FloatArray) -> None:
-    """Raise unless a pose of the board explains most of where most images show its points."""
+    """Raise unless poses of the board explain the points in most images."""
     assert observations.pixels is not None
     index, pixels = observations.images, observations.pixels
     beside_the_centre = pixels - _per_image(pixels, index)[index]
@@ -75,7 +74,7 @@ def _require_fit(observations: Observations, rms: FloatArray) -> None:
 
 
 def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> FloatArray:
-    """Return the covariances (M, 6, 6) of poses (M, 4, 4) of the board, for noise of 1 px.
+    """Return the covariances (M, 6, 6) of board poses (M, 4, 4), for noise of 1 px.
 
     Of x, y, z [m] and the rotation about the camera's axes [rad], to first order.
     """
@@ -88,7 +87,7 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
 
 
 def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatArray) -> View:
-    """Return what a camera sees of points (3, C) by the poses (M, 4, 4) of the board."""
+    """Return the view of points (3, C) at board poses (M, 4, 4)."""
     axes, origin = poses[:, :3, :3].transpose(2, 1, 0), poses[:, :3, 3].T
     return view(lens, axes, origin, index, points, False)
 
@@ -96,7 +95,7 @@ def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatA
 def image_products(
     rows: FloatArray, begins: NDArray[np.intp], first: int | None = None
 ) -> FloatArray:
-    """Return (M, F, S) the products of the first of rows (S, 2, C) with all, image by image."""
+    """Return products (M, F, S) of the first F rows (S, 2, C) with all, image by image."""
     size, _, count = rows.shape
     points = np.diff(begins, append=count)
     most = int(points.max())
@@ -137,18 +136,18 @@ def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArr
     return poses @ se3.invert(board), np.minimum(rms, others)
 
 
-def _tell_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Return (M,) which images show enough points that are not in line, nor are there."""
+def _determine_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which images (M,) show enough points, not in line on board or image."""
     assert observations.points is not None
     assert observations.pixels is not None
-    told = np.bincount(index) >= 4
+    usable = np.bincount(index) >= 4
     for places in (observations.points, observations.pixels):
         rest = places - _per_image(places, index)[index]
         spread = np.linalg.eigvalsh(
             _per_image(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
         )
-        told &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
-    return np.asarray(told)
+        usable &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
+    return np.asarray(usable)
 
 
 def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:

@@ -36,20 +36,19 @@ class Identification(Shown):
     before: Chain
     """The nominal chain. Both have fitted frames."""
     parameters: tuple[ParameterRow, ...]
-    """Every parameter of the model."""
     names: tuple[str, ...]
     """Fitted parameters, (P,)."""
     uncertainty: identifiability.Uncertainty
-    """Their covariance for the noise found in the residuals."""
+    """Of the fitted parameters, for the noise found in the residuals."""
     fitted: Comparison
-    """Residuals on the fitted pairs."""
+    """Residuals of the fitted pairs."""
     validation: Comparison | None
-    """Residuals on pairs that were not fitted; None if there are too few poses for that."""
+    """Residuals of held-out pairs; None if there are too few poses."""
     validated_by: str
     """How these pairs were held out."""
     noise: Noise
     distances: tuple[FloatArray, ...]
-    """Size (N,) of the residuals of each set's samples, in the usual one (`robust.py`)."""
+    """Residuals (N,) of each set's samples in units of the usual one (`robust.py`)."""
     outliers: tuple[Outlier, ...]
     """Samples with gross errors; they carry little or no weight in the fit."""
     gauges: dict[str, list[str]]
@@ -61,19 +60,18 @@ class Identification(Shown):
     iterations: int
     converged: bool
     chance: float | None
-    """Probability that errors shared by what was measured in succession, as of a drifting tracker,
-    would let the arm's parameters explain as much. None for a target in sockets."""
+    """Probability that drift of the device, shared by successive measurements, would let the arm's
+    parameters explain as much. None for a target in sockets."""
     refusals: tuple[Reason, ...]
     """Failed acceptance rules, in words; empty if the result is accepted."""
     posterior: Posterior
-    """What is known of the arm, unmodelled effects included."""
+    """The posterior of the arm, unmodelled effects included."""
     region: Region | None
     """Where the calibration may be used; None if nowhere."""
     weak: tuple[str, ...] = ()
-    """Parameters that the poses hardly determine, held near nominal by a prior of the size of this
-    arm's errors."""
+    """Parameters that the poses hardly determine, held near nominal by a prior."""
     verdicts: tuple[effects.Verdict, ...] = ()
-    """If the model was chosen: what reduced the error and what did not."""
+    """Effects tried if the model was chosen."""
     step: Step | None = None
     """What moved during the measurement (`steps.py`)."""
     remarks: tuple[str, ...] = ()
@@ -90,7 +88,7 @@ class Identification(Shown):
 
     @property
     def rank(self) -> int:
-        """Return the number of parameters that the poses determine."""
+        """Return the number of fitted parameters."""
         return len(self.names)
 
     @property
@@ -109,18 +107,18 @@ class Identification(Shown):
         return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
     def pose_covariance(self, q: FloatArray) -> FloatArray:
-        """Return the expected squares (N, 6, 6) [m, rad] of errors of the pose at q (N, n).
+        """Return the expected squares (N, 6, 6) [m, rad] of pose errors at q (N, n), in world
+        axes.
 
-        They include the uncertainty of the parameters and of unmodelled effects; position and
-        rotation in world axes.
+        They include the uncertainty of parameters and unmodelled effects.
         """
         return self.posterior.expected(q)
 
     def confidence_ellipsoid(self, q: FloatArray, level: float = CONFIDENT) -> FloatArray:
         """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
 
-        By the F distribution if the noise was estimated from the residuals, by chi-squared (its
-        limit) if the given sigmas are right.
+        By the F distribution if the noise was estimated, by chi-squared (its limit) if it is
+        given.
         """
         if not 0.0 < level < 1.0:
             raise ConfigError(f'level must be between 0 and 1, as 0.95, not {level}')
@@ -135,9 +133,9 @@ class Identification(Shown):
         return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
 
     def predicted_sigma(self, count: int = 300) -> FloatArray:
-        """Return standard deviations (count,) [m] of positions predicted over the joint range.
+        """Return standard deviations (count,) [m] of positions over the joint range.
 
-        The root of the trace of the position's covariance, at seeded random configurations.
+        The root of the trace of the position covariance at seeded random configurations.
         """
         q = self.chain.random_joints(count, np.random.default_rng(0))
         return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
@@ -162,7 +160,6 @@ class Identification(Shown):
         )
 
     def _repr_html_(self) -> str:
-        """Return the verdict, its reasons and what was fitted, for notebooks."""
         before, after = (self.validation or self.fitted).figures
         rows = [('parameter', 'offset [mm, mrad]', '± (95 %)')]
         rows += [

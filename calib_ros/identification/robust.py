@@ -1,23 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Robust least squares, and the names of gross errors.
+"""Robust least squares, and the names of gross errors (docs/model.md, Fit).
 
-A sample's distance is the length of its residual in units of a scale estimated from the data (the
-median of all lengths): the larger of position and orientation, or of a corner and the sum over its
-image. Weights depend on the distance, and the fit is repeated until they converge (iteratively
-reweighted least squares; Holland and Welsch 1977):
+A sample's distance is the length of its residual in units of the median length of all, the larger
+one of position and orientation, or of a corner and the sum over its image. Fits are repeated with
+weights by distance until they converge (Holland and Welsch 1977):
 
     first        w = min(1, 1 / distance)                  least absolute lengths
     redescending w = 1 below INNER, 0 beyond OUTER, falling in between (Hampel 1974)
     huber        w = min(1, INNER / distance)              (Huber 1964)
 
-Clean data keep the weight 1, so nothing is lost against least squares.
-
-Gross errors that agree with each other, as from a bumped target, are a second model; the first fit
-may settle between the two, or at the wrong one. If it finds outliers, or larger residuals than the
-given sigmas explain, the fit is repeated from the best half of the samples (`trimmed.py`). The
-second fit is kept if it shrinks half of the residuals, and if it excludes more than chance would
-exclude from few samples.
+If that finds outliers, or larger residuals than the given sigmas explain, the fit is repeated from
+the best half of the samples (`trimmed.py`): gross errors may agree with each other, and are then a
+second model.
 """
 
 from __future__ import annotations
@@ -41,26 +36,22 @@ from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
 OUTLIER = 6.0
-"""Distance [scale] beyond which a sample is named as an outlier: where it has lost half of its
-weight; a convention (Hampel 1974)."""
+"""Distance [scale] beyond which a sample is named as an outlier, at half its weight; a convention
+(Hampel 1974)."""
 INNER, OUTER = OUTLIER - 1.0, OUTLIER + 1.0
 """Distances [scale] at which a sample begins to lose weight, and has none left. Of Gaussian
 errors in three directions 2 of 100,000 lie beyond the first."""
 MANY = 100 * SOME_POSES
-"""Samples that tell which of them are gross errors, a sample in ten thousand aside
-(benchmarks/end_to_end.py)."""
+"""Samples that suffice to detect gross errors (benchmarks/end_to_end.py)."""
 SUSPICIOUS = 1.2
-"""Ratio of residuals to those expected from which gross errors, or errors that the samples of a
-configuration share, may hide in them; a convention, which benchmarks/outliers.py does not tell
-from 1.5."""
+"""Ratio of actual to expected residuals at which gross errors, or errors shared by a
+configuration, may hide in them; a convention, which benchmarks/outliers.py does not tell from
+1.5."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robust:
-    """A robust fit: the fit itself, and the distances (N,) of all samples of each set.
-
-    `system` has the weights with which it was made.
-    """
+    """A robust fit, the weighted system, and the distances (N,) of the samples of each set."""
 
     fit: Fit
     system: System
@@ -71,19 +62,19 @@ class Robust:
 
     @property
     def good(self) -> tuple[NDArray[np.bool_], ...]:
-        """Return (N,) which samples of each set are near enough to be no gross errors."""
+        """Return which samples (N,) of each set are no gross errors."""
         return tuple(each <= OUTLIER for each in self.distances)
 
     @property
     def outliers(self) -> NDArray[np.bool_]:
-        """Return (N,) which samples of all sets, one after the other, are of gross error."""
+        """Return which samples (N,) of all sets are gross errors."""
         return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')
 
 
 def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
-    """Fit as `robust_fit` does, and from the best half of the samples if that looks suspicious.
+    """Fit as `robust_fit`, then from the best half of the samples if that looks suspicious.
 
-    Of more than MANY samples an even spread tells which model it is; all are fitted from there.
+    More than MANY samples are thinned to choose between the two; all are fitted from there.
     """
     if system.count > MANY:
         few = thorough_fit(chain, names, system.spread(MANY), loss)
@@ -95,17 +86,17 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
         return first
     second = reweighted(trimmed_start(chain, names, system), names, system, loss)
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
-    another = sums[0] > ALIKE**2 * sums[1]  # not a detail of the first
+    another = sums[0] > ALIKE**2 * sums[1]
     if another and _chance(names, system, first, second) < 1.0 - SURE:
         return replace(second, iterations=first.iterations + second.iterations)
     return first
 
 
 def _chance(names: Sequence[str], system: System, first: Robust, second: Robust) -> float:
-    """Return the most by which errors of one size would let a fit leave so many samples out.
+    """Return the probability that a fit leaves so many samples out by chance, at most.
 
     The F test of a shift of each of them (Cook and Weisberg 1982), times the number of ways to
-    choose them. Its tail is bounded as by Chernoff (1952), for it may be too small for a float.
+    choose them, with a tail bound (Chernoff 1952), because it may underflow.
     """
     out = int(second.outliers.sum())
     if not out:
@@ -124,7 +115,7 @@ def _chance(names: Sequence[str], system: System, first: Robust, second: Robust)
 
 
 def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
-    """Fit the named parameters, giving gross errors no weight."""
+    """Fit the named parameters without gross errors."""
     if loss not in LOSSES:
         raise UnknownNameError('loss', loss, LOSSES)
     fit = minimise(chain, names, system)
@@ -132,7 +123,7 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
     distances = distances_of(fit.chain, names, system)
     if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
         return Robust(fit, system, distances, True, iterations, loss)
-    if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # led away from a good start
+    if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # misled from a good start
         fit = replace(fit, chain=chain)
         distances = distances_of(chain, names, system)
     for _ in range(ROUNDS):
@@ -157,12 +148,11 @@ def reweighted(
     simpler: Sequence[FloatArray] | None = None,
     tolerance: float = 1e-3,
 ) -> Robust:
-    """Fit with the weights of a loss from a start that is good enough to tell gross errors.
+    """Fit with the weights of a loss, from a start that is good enough to detect gross errors.
 
-    Up to a `tolerance` before these stand still.
-
-    With the distances (N,) of all samples by a `simpler` model, samples that it explains are no
-    gross errors: a richer model has to explain them as well.
+    Fits are repeated to a `tolerance` until the weights converge. With the distances (N,) of all
+    samples by a `simpler` model, samples that it explains are no gross errors: a richer model has
+    to explain them too.
     """
 
     def judged(chain: Chain) -> tuple[FloatArray, ...]:
@@ -188,7 +178,7 @@ def reweighted(
         fit = minimise(chain, names, system, tolerance)
         chain, iterations = fit.chain, iterations + fit.iterations
         distances = judged(chain)
-        if not fit.converged:  # nor will the next one
+        if not fit.converged:
             break
     if not (settled and fit.left < STEP_TOLERANCE):
         fit = minimise(chain, names, system)
@@ -199,10 +189,10 @@ def reweighted(
 def _steadied(
     found: list[FloatArray], last: list[FloatArray], before: list[FloatArray]
 ) -> list[FloatArray]:
-    """Return the weights found (N,) set by set, half way back if they swing about the last ones.
+    """Return the weights found (N,), set by set, averaged with the last ones if they oscillate.
 
-    A sample at the edge may lose weight for its distance and come nearer for its lost weight, for
-    ever. Empty lists are weights that have not been found yet.
+    A sample at the edge may lose weight and come nearer for that, for ever. Empty lists are
+    weights not found yet.
     """
     steps = zip(found, last, before, strict=True) if before else ()
     swings = sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0
@@ -235,6 +225,5 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
     return tuple(found)
 
 
-def _median_length(dimensions: int) -> float:
-    """Return the median length of a vector of standard normal components."""
+def _median_length(dimensions: int) -> float:  # of a standard normal vector
     return float(np.sqrt(special.chdtri(dimensions, 0.5)))

@@ -3,11 +3,11 @@
 """Rounded joint values: does the arm explain the gain, or the rounding?
 
 Values that are multiples of a step are off by up to half a step, identically wherever a joint has
-the same value. A model follows that, even on left-out poses with the same values. So an F test
-tells whether the arm explains more of the nominal residuals y, frames projected out, than chance
+the same value. A model can follow that, even on held-out poses with the same values. So an F test
+decides whether the arm explains more of the nominal residuals y, frames projected out, than chance
 would if rounding explained them all,
 
-    y ~ N(0, k (I + C C^T))        C: a column for each value of each joint, as large as its error
+    y ~ N(0, k (I + C C^T))        C: a column for each value of each joint, scaled to its error
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from calib_ros.identification.changes import Told
+from calib_ros.identification.changes import Information
 from calib_ros.identification.leastsquares import owners, stacked
 from calib_ros.identification.levels import CLEARLY, SURE, chance_of
 from calib_ros.identification.problem import Problem
@@ -28,7 +28,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED
 
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
-"""Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are wanted."""
+"""Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are intended."""
 
 
 def rounded(problem: Problem) -> dict[str, float]:
@@ -39,10 +39,10 @@ def rounded(problem: Problem) -> dict[str, float]:
 
 
 def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, float]:
-    """Return the error [rad or m] that rounding gives to each joint's zero, by parameter.
+    """Return the error [rad or m] of each joint's zero by rounding, by parameter.
 
-    The root of the mean square of the mean over all values, uniform within a step; a value that
-    most poses share hardly averages out.
+    The RMS of the mean over all values, uniform within a step; a value shared by most poses hardly
+    averages out.
     """
     joints = np.concatenate([each.joints for each in problem.sets])
     found: dict[str, float] = {}
@@ -55,7 +55,7 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 
 
 def _step(values: FloatArray) -> float:
-    """Return the step that different values (N,) are multiples of; zero where there is none."""
+    """Return the step that distinct values (N,) are multiples of; zero if none."""
     few = values[:3, np.newaxis] / STEPS
     likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
     step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
@@ -74,10 +74,10 @@ def may_be_rounding(
     steps: Mapping[str, float],
     good: Sequence[NDArray[np.bool_]],
 ) -> bool:
-    """Tell whether rounding of joint values explains what the nominal chain leaves as well.
+    """Tell whether rounding of joint values explains the nominal residuals as well.
 
-    `before` is the nominal chain with fitted frames, `names` is what is fitted, `steps` are those
-    of rounded joints, and `good` (N,) tells which samples of each set are not outliers.
+    `before` is the nominal chain with fitted frames, `names` are fitted, `steps` belong to rounded
+    joints, `good` (N,) excludes outliers of each set.
     """
     sets = [each.select(which).spread() for each, which in zip(problem.sets, good, strict=True)]
     joints = np.concatenate([each.joints for each in sets])
@@ -106,8 +106,8 @@ def may_be_rounding(
     prior = np.diag(np.arange(beside.shape[1]) >= len(frames)).astype(float)
     taken = linalg.solve(products[first, first] + prior, products[first, rest], assume_a='pos')
     left = products[rest, rest] - products[rest, first] @ taken
-    told = Told(tuple(map(Parameter, arm)), left[:-1, :-1], left[:-1, -1])
-    gain, _, _, rank = told.explained(np.eye(len(arm)))
+    information = Information(tuple(map(Parameter, arm)), left[:-1, :-1], left[:-1, -1])
+    gain, _, _, rank = information.explained(np.eye(len(arm)))
     freedom = max(len(rows) - len(frames) - rank, 1)
     noise = max(float(left[-1, -1]) - gain, 1e-300) / freedom
     return chance_of(gain / noise, rank, freedom) > 1.0 - SURE

@@ -1,14 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of one set of observations as the solver takes them: weighted rows, block by block.
+"""Samples of one set of observations for the solver: weighted rows, block by block.
 
 Residual of a sample: p_measured - p and the rotation vector from the model's orientation to the
-measured one, both in world axes, weighted by the inverse of the measurement's covariance. Its
-derivative with respect to the parameters is the error model's, with the sign reversed. The
-orientation part leaves out the Jacobian of the logarithm: with equal weights on the three axes
-the gradient does not change, because that Jacobian leaves the residual itself as it is. A measured
-distance has the residual L - |p|, and its derivative is the position's along p. Pixels of a board
-have a module of their own (`pixels.py`).
+measured one, both in world axes, weighted by the inverse covariance of the measurement. Its
+derivative by the parameters is minus that of the error model. The orientation part omits the
+Jacobian of the logarithm, which leaves the residual itself unchanged: with equal weights on the
+three axes the gradient is the same. A measured distance has the residual L - |p|, and its
+derivative is the position's along p. Pixels of a board are in `pixels.py`.
 """
 
 from __future__ import annotations
@@ -41,13 +40,12 @@ class Samples:
     ----------
     observations : Observations
     sigma_position, sigma_orientation : float
-        Standard deviations [m, rad] of measurements that bring no covariance of their own.
+        Standard deviations [m, rad] of measurements without a covariance.
 
     Attributes
     ----------
     moments : Observations
-        One of each joint values that are linearised: the observations, or one of each image.
-
+        One per linearised joint values: the observations, or one of each image.
     """
 
     def __init__(
@@ -70,22 +68,22 @@ class Samples:
         if mixed or (observations.covariance is not None and self.distances is None):
             self.whitening = _whitening(observations, sigma_position, sigma_orientation)
         self.weights: FloatArray | None = None
-        """Square roots of the weights (N,) of a robust loss; None where all count fully."""
+        """Square roots of the robust weights (N,); None for ones."""
 
     def select(self, index: NDArray[np.generic]) -> Samples:
-        """Return the samples chosen by a mask (N,) or by indices (K,), with their weights."""
+        """Return the samples chosen by a mask (N,) or indices (K,), with their weights."""
         few = type(self)(self.observations.select(index), *self.sigmas)
         few.weights = None if self.weights is None else self.weights[index]
         return few
 
     def weighted(self, weights: FloatArray | None) -> Samples:
-        """Return the samples with weights (N,) of a robust loss; None for all ones."""
+        """Return the samples with robust weights (N,); None for ones."""
         found = copy.copy(self)
         found.weights = None if weights is None else np.sqrt(weights)
         return found
 
     def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
-        """Yield weighted rows of Jacobian and residual, a block of samples at a time.
+        """Yield weighted rows of Jacobian and residual in blocks.
 
         Yields
         ------
@@ -94,10 +92,9 @@ class Samples:
         shift : (P + 1, c, B)
             Weighted derivative of the residual; the last row is the residual.
         turn : (P_rotational + 1, 3, B) or (0, 0, 0)
-            The same of the orientation where it is kept apart: rotational parameters only.
+            The same for a separate orientation: rotational parameters only.
         model : ErrorModel
-            Knows the order of the parameters in the rows.
-
+            Holds the order of the parameters in the rows.
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         nothing = np.zeros((0, 0, 0))
@@ -133,11 +130,11 @@ class Samples:
         count: int = 1,
         folds: NDArray[np.intp] | None = None,
     ) -> FloatArray:
-        """Return (K, 2, P + 1, P + 1) the products of rows by fold (N,); see `products_of`."""
+        """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
         size = len(names) + 1
         found = np.zeros((count, 2, size, size))
         order, samples, ends = np.arange(size), self, np.array([0, self.count])
-        if folds is not None:  # one after the other
+        if folds is not None:
             samples = self.select(np.argsort(folds, kind='stable'))
             ends = np.append(0, np.cumsum(np.bincount(folds, minlength=count)))
         for which, shift, turn, model in samples.blocks(chain, names):
@@ -160,9 +157,8 @@ class Samples:
     def sums(
         self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
     ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
-        """Yield numbers (n,) of groups (N,) of successive samples and the sums of their rows.
-
-        They are (P + 1, c, n) by part, in blocks.
+        """Yield group numbers (n,) of successive samples (N,), and sums of rows (P + 1, c, n) by
+        part.
         """
         first = 0
         for block in self.parts(chain, names):
@@ -174,7 +170,7 @@ class Samples:
             yield index[begins], block
 
     def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
-        """Return joint values (n, N) at the device's delay, and velocities where it has one."""
+        """Return joint values (n, N) at the device's delay, and velocities if it has one."""
         delay = chain.frame(self.observations.base).delay
         if self.moments.velocity is None or delay is None:
             return self.joints, None
@@ -183,10 +179,10 @@ class Samples:
         return np.ascontiguousarray(then.joints.T), velocity
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
-        """Yield the same rows by position and orientation, (P + 1, c, B) each, a block at a time.
+        """Yield the rows by position and orientation, (P + 1, c, B) each, in blocks.
 
-        Parameters stand in the order of their names, the residual last. Where orientation is
-        whitened together with the position, or not measured, there is one part only.
+        Parameters are in the order of their names, the residual last. Without a separate
+        orientation there is one part.
         """
         for _, shift, turn, model in self.blocks(chain, names):
             order = [*model.order, len(names)]
@@ -200,11 +196,11 @@ class Samples:
 
     @property
     def width(self) -> int:
-        """Return the number of rows of a sample's position, or of all of it where whitened."""
+        """Return the number of rows of a sample: of its position, or of all if whitened."""
         return 1 if self.distances is not None else 6 if self.whitening is not None else 3
 
     def rows_of(self, chain: Chain, names: Sequence[str]) -> FloatArray:
-        """Return (P + 1, c, N) the weighted rows sample by sample, the residual last."""
+        """Return the weighted rows (P + 1, c, N) sample by sample, the residual last."""
         found = [np.concatenate(parts, axis=1) for parts in self.parts(chain, names)]
         return found[0] if len(found) == 1 else np.concatenate(found, axis=2)
 
@@ -221,10 +217,10 @@ class Samples:
     def position_errors(self, residuals: FloatArray) -> FloatArray:
         """Return position errors (N, 3) [m] of weighted residuals (rows,).
 
-        They stand component by component, as rows do; of distances the error is the first.
+        Residuals are ordered component by component, as rows; of distances the error is the first.
         """
         rows = residuals.reshape(-1, self.count).T
-        if self.whitening is not None:  # lower triangular, so that position is not mixed
+        if self.whitening is not None:  # lower triangular: no orientation in it
             mixing = self.whitening[:3, :3].transpose(2, 0, 1)
             return np.asarray(np.linalg.solve(mixing, rows[:, :3, np.newaxis])[..., 0])
         errors = np.zeros((self.count, 3))
@@ -233,10 +229,10 @@ class Samples:
         return errors
 
     def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals in sigma: position (N, 3 or 1), orientation (N, 3).
+        """Return residuals in sigma: position (N, 3 or 1), orientation (N, 3).
 
-        NaN where nothing was measured. Samples with covariances of their own are whitened as a
-        whole; their two parts are then only nearly those of position and orientation.
+        NaN where not measured. With covariances, samples are whitened as a whole, so the two parts
+        are only approximate.
         """
         position, orientation = residual_arrays(chain, self.observations)
         if self.whitening is not None:
@@ -247,16 +243,15 @@ class Samples:
         return position / self.sigmas[0], orientation / self.sigmas[1]
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
-        """Yield residuals (M, c) in sigma that tell gross errors, and the (N,) row of each sample.
-
-        NaN where nothing was measured.
+        """Yield residuals (M, c) in sigma for gross errors, NaN if not measured, and each sample's
+        row (N,).
         """
         for part in self.whitened_residuals(chain):
             yield part, slice(None)
 
 
-def _kept(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:
-    """Return a function of residuals that keeps in observations those of the last chain."""
+def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:
+    """Cache the residuals of the last chain in the observations."""
 
     @wraps(find)
     def found(chain: Chain, observations: Observations) -> Both:
@@ -271,11 +266,11 @@ def _kept(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Obser
     return found
 
 
-@_kept
+@_cached
 def residual_arrays(chain: Chain, observations: Observations) -> Both:
     """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
 
-    Measured distances give (N, 1). Rotation vectors are NaN where none was measured.
+    Distances give (N, 1). Rotation vectors are NaN where not measured.
     """
     then = observations.earlier(chain.frame(observations.base).delay)
     distances = observations.distances
@@ -301,11 +296,11 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
     return position, orientation
 
 
-@_kept
+@_cached
 def seen_residuals(chain: Chain, observations: Observations) -> Both:
-    """Return measured minus predicted: pixels (N, 2), and the same at the board (N, 3) [m].
+    """Return measured minus predicted pixels (N, 2), and as shifts at the board (N, 3) [m].
 
-    Up to LARGEST: more comes of points behind the camera, or far away, and means nothing.
+    Clipped to LARGEST: points behind the camera or far away give meaningless values.
     """
     camera = observations.camera
     lens = require_lens(chain.frame(camera).lens, camera)
@@ -328,10 +323,7 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
 def _along(
     origin: FloatArray, shift: FloatArray, distances: FloatArray, plane: bool
 ) -> FloatArray:
-    """Return (P + 1, 1, B): position columns along the line of sight, and L - |p|.
-
-    Over a plane they are along its normal z.
-    """
+    """Return rows (P + 1, 1, B) along the line of sight or a plane's normal z, and L - |p|."""
     if plane:
         along = np.ascontiguousarray(shift[:, 2:])
         along[-1, 0] = distances - origin[2]
@@ -345,7 +337,7 @@ def _along(
 def _whitening(
     observations: Observations, sigma_position: float, sigma_orientation: float
 ) -> FloatArray:
-    """Return W (6, 6, N) with W^T W the inverse covariance; zero rows for what is not measured."""
+    """Return W (6, 6, N) with W^T W the inverse covariance; zero rows if not measured."""
     covariance = observations.covariances((sigma_position, sigma_orientation))
     covariance[~observations.oriented, 3:, :] = 0.0
     covariance[~observations.oriented, 3:, 3:] = np.eye(3)

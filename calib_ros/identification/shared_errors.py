@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors that neighbouring poses share.
+"""Errors shared by neighbouring poses.
 
-A tracker drifts, and what a model lacks changes slowly over the joint space, so neighbours err
-alike and tell less than their number. Configurations are neighbours in succession or near each
-other in joint space. Residuals r of white noise of unit variance have the covariance B = I - Q Q^T
-(Q: orthonormal columns of the Jacobian), so a quadratic form r^T A r has
+A tracker drifts, and model errors change slowly over the joint space, so neighbours have similar
+errors and carry less information than their number. Configurations are neighbours in succession or
+in joint space. Residuals r of white noise of unit variance have the covariance B = I - Q Q^T (Q:
+orthonormal columns of the Jacobian), so a quadratic form r^T A r has
 
     mean tr(A B)        covariance with r^T C r: 2 tr(A B C B)
 
 With A the links of neighbours, r^T A r / r^T r is tested against its mean (Moran's I of residuals,
-Cliff and Ord 1972; for successive ones that of Durbin and Watson 1950). Where the test finds
-neighbours alike, the noise is taken as a sum of what is independent and what fades with distance,
+Cliff and Ord 1972; for successive ones that of Durbin and Watson 1950). If the test finds similar
+neighbours, the noise is modelled as a sum of independent and fading parts,
 
     V = v_0 I + sum_k v_k K_k        K_k = exp(-distance / length_k)
 
-and the sizes v_k >= 0 follow from making the forms r^T K_k r equal to their expected values
-(MINQUE, Rao 1971), which allows for the errors that the fit itself has taken up. The covariance of
-the parameters is then H^-1 (J^T V J) H^-1.
+where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971),
+which allows for errors absorbed by the fit. The covariance of the parameters is then
+H^-1 (J^T V J) H^-1.
 """
 
 from __future__ import annotations
@@ -39,29 +39,28 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
-"""Lengths over which shared errors fade: stops, and rad (m) of all joints together."""
+"""Decay lengths of shared errors: stops, and rad (m) of all joints together."""
 NEARBY = SEVERAL
-"""Neighbours in joint space of each configuration that are tested; benchmarks/drift.py --quick
-does not tell them from 1."""
+"""Neighbours in joint space tested per configuration; benchmarks/drift.py --quick does not tell
+them from 1."""
 MOST_STOPS = 2 * SOME_POSES
-"""Stops on which sizes are estimated; of more, every so many runs of a twentieth."""
+"""Stops used to estimate sizes; of more, every k-th run of a twentieth."""
 ELSEWHERE = 4.0 * LARGEST
-"""Distance between stops of different sets, which are not neighbours."""
+"""Distance between stops of different sets, which are no neighbours."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """How alike neighbours are, and the noise by parts (position, orientation) where they are.
+    """Correlation of neighbours, and the noise by parts if they share errors.
 
     Attributes
     ----------
     successive, near : float
         Correlation of the residuals of neighbours, the larger one of the parts.
     found : tuple of str
-        The kinds of neighbours that share errors by the test.
+        Kinds of neighbours that share errors by the test.
     middles : dict of int to (P, P)
-        J^T V J of each part (0 position, 1 orientation) in which neighbours share errors.
-
+        J^T V J of each part (0 position, 1 orientation) with shared errors.
     """
 
     successive: float
@@ -72,11 +71,11 @@ class Shared:
 
 @dataclass(frozen=True, eq=False)
 class _Stops:
-    """Rows of stops, added up over the samples of each.
+    """Rows of stops, summed over the samples of each.
 
-    `parts` are (P + 1, c, n), by position and orientation, zero where nothing was measured;
-    `count` (n,) samples a stop; `place` (n, D) in joint space, angles on the unit circle, and
-    `time` (n,) the number of the stop; both far apart between sets.
+    `parts` are (P + 1, c, n), by position and orientation, zero if not measured; `count` (n,)
+    samples per stop; `place` (n, D) in joint space, angles on the unit circle, and `time` (n,) the
+    stop number; both far apart between sets.
     """
 
     parts: list[FloatArray]
@@ -93,7 +92,7 @@ class _Stops:
         return np.asarray(np.abs(self.time[:, np.newaxis] - self.time))
 
     def links(self, kind: str) -> csr_array:
-        """Return (n, n): 1 where two stops are neighbours."""
+        """Return (n, n): 1 for neighbours."""
         count = len(self)
         if kind == 'successive':
             first = np.flatnonzero(np.diff(self.time) == 1.0)
@@ -109,13 +108,13 @@ class _Stops:
         return links
 
     def kernel(self, kind: str, length: float) -> FloatArray:
-        """Return (n, n): covariance of the sums over each stop's samples, per root of count."""
+        """Return (n, n): covariance of the sums over each stop, per root of count."""
         root = np.sqrt(self.count)
         return np.asarray(np.outer(root, root) * np.exp(-self.distances(kind) / length))
 
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
-    """Return which neighbours share errors, and the noise that follows."""
+    """Return which neighbours share errors, and the resulting noise."""
     kinds = tuple(LENGTHS)
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // MOST_STOPS))
@@ -149,7 +148,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
         white, *rest = sizes[part]
         middles[part] = white * fit.normal.parts[part]
         for (kind, length), size in zip(kernels[part], rest, strict=True):
-            if size and kind == 'near':  # sizes are never negative
+            if size and kind == 'near':
                 middles[part] += size * _near(even, part, length, share)
             elif size:
                 by_time.setdefault(part, []).append((length, size))
@@ -160,7 +159,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
 
 
 class _Forms:
-    """Quadratic forms of residuals, and their moments, for stops with known rows."""
+    """Quadratic forms of residuals, and their moments."""
 
     def __init__(self, units: _Stops, extra: FloatArray) -> None:
         self._units = units
@@ -187,7 +186,7 @@ class _Forms:
             self.parts.append(part)
 
     def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
-        """Return (F, F) the traces tr(A B C B) of forms, whose matrices (K, n, n) are by part."""
+        """Return the traces (F, F) tr(A B C B) of forms with matrices (K, n, n) by part."""
         inner, alone = list[FloatArray](), list[FloatArray]()
         for part, own in matrices.items():
             basis, known, count = self._basis[part], self._known[part], len(own)
@@ -202,14 +201,13 @@ class _Forms:
         return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
 
     def _values(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
-        """Return (F,) the forms r^T A r."""
+        """Return the forms (F,) r^T A r."""
         pairs = [(self._residual[part], own) for part, own in matrices.items()]
         return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
     def test(self, part: int, links: csr_array) -> tuple[float, float]:
-        """Return the correlation of linked residuals beyond the expected one, and its score.
-
-        The score is standard normal where nothing is shared.
+        """Return the excess correlation of linked residuals, and its score, N(0, 1) if none is
+        shared.
         """
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
         product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
@@ -218,7 +216,7 @@ class _Forms:
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())
         freedom = float(known.sum() - np.trace(white))
-        if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # of one every ratio is the same
+        if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # one alone has a constant ratio
             return 0.0, 0.0
         ratio = -float(np.trace(linked)) / freedom
         both = float((linked**2).sum() + pairs - 2.0 * (product**2).sum())
@@ -229,8 +227,8 @@ class _Forms:
         return excess / pairs, excess / float(np.sqrt(variance))
 
     def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
-        """Return, by part, the sizes (1 + K,) of what is independent and of each kernel."""
-        from scipy import optimize  # as below, what most fits do not need
+        """Return, by part, the sizes (1 + K,) of the independent part and each kernel."""
+        from scipy import optimize  # slow to import, rarely needed
 
         white = np.eye(len(self._units))
         every = dict.fromkeys(kernel for own in kernels.values() for kernel in own)
@@ -242,11 +240,11 @@ class _Forms:
         moments = self._moments(matrices)
         scale = np.sqrt(np.maximum(np.diag(moments), HALF_THE_DIGITS))
         scaled = moments / np.outer(scale, scale)
-        # the covariance of the forms under white noise weighs the equations; those of no spread,
-        # where hardly more was measured than fitted, say nothing
+        # weighted by the covariance of the forms under white noise; those without spread, if
+        # hardly more was measured than fitted, carry no information
         squares, directions = linalg.eigh(scaled)
-        told = squares > HALF_THE_DIGITS * squares[-1]
-        roots, directions = np.sqrt(squares[told]), directions[:, told]
+        informative = squares > HALF_THE_DIGITS * squares[-1]
+        roots, directions = np.sqrt(squares[informative]), directions[:, informative]
         values = self._values(matrices) / scale
         sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, values @ directions / roots)[0]
         ends = np.cumsum([len(own) for own in matrices.values()])[:-1]
@@ -254,13 +252,13 @@ class _Forms:
 
 
 def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return (P, P) the products of columns (n, c, P) with others."""
+    """Return products (P, P) of columns (n, c, P)."""
     size = first.shape[2]
     return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
 
 
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:
-    """Return the stops of all sets; of many, every `share`-th run of so many."""
+    """Return the stops of all sets; of many, every `share`-th run of `run` stops."""
     widths = (max(samples.width for samples in system.sets), 3)
     parts: list[list[FloatArray]] = [[], []]
     counts, places, times = [], [], []
@@ -300,9 +298,8 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
 
 
 def _near(units: _Stops, part: int, length: float, share: int) -> FloatArray:
-    """Return J^T K J of errors that fade in joint space, from every `share`-th stop.
-
-    Pairs of stops grow with the square of their number.
+    """Return J^T K J of errors fading in joint space, from every `share`-th stop: pairs are
+    quadratic.
     """
     kernel = units.kernel('near', length)
     own = np.diag(kernel) * (share - share**2)
@@ -317,7 +314,7 @@ def _successive(
     system: System,
     kernels: Mapping[int, Sequence[tuple[float, float]]],
 ) -> dict[int, FloatArray]:
-    """Return by part J^T K J of errors that fade in succession, for (length, size) each."""
+    """Return by part J^T K J of errors fading in succession, for (length, size) each."""
     found = {part: np.zeros((len(names), len(names))) for part in kernels}
     for samples in system.sets if kernels else ():
         states: dict[int, FloatArray] = {}
@@ -337,10 +334,10 @@ def _successive(
 def _faded(
     rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return for each column of (R, n) the faded sum (R, n) of those before it and half of itself.
+    """Return the faded sum (R, n) of the columns before each of (R, n), and half of itself.
 
-    And by kernel (length, size) the sum (R, K) so far, which goes on from `state`. Runs of about
-    the root of n columns make both one product with a small matrix.
+    With it, for each kernel (length, size), the sum (R, K) so far, which continues `state`. Runs
+    of about the root of n columns make both a product with a small matrix.
     """
     lengths, sizes = np.array(kernels).T
     run = int(np.sqrt(rows.shape[1]))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sizes of the errors of each kind: those that make the data most probable (`evidence.py`)."""
+"""Sizes of the errors of each kind: the most probable given the data (`evidence.py`)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': EXPECTED['gear'], 'coupling':
 TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backlash')}
 """Size [m, rad] of the errors that arms have, by group."""
 SPREAD = 10.0
-"""Factor by which the size of one arm's errors differs from TYPICAL (one standard deviation;
+"""Factor between the error sizes of one arm and TYPICAL (one standard deviation;
 benchmarks/harm.py)."""
 TAILS = 3.0
 """Degrees of freedom of the prior (benchmarks/harm.py)."""
@@ -27,9 +27,9 @@ SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
 """Logarithms of the ratio of probabilities beyond which effects show, and from which those of
 usual size are refuted."""
 SETTLED = 0.02
-"""Change of the logarithm of a size from which on it stands still; a convention."""
+"""Change of the log of a size at convergence; a convention."""
 LEAST_SIZE = SPREAD**-3
-"""Share of TYPICAL below which, and above the inverse of which, no size is looked for."""
+"""Smallest size searched, relative to TYPICAL; its inverse is the largest."""
 
 
 def solved(
@@ -48,7 +48,7 @@ def solved(
 def mixed(
     solutions: Sequence[tuple[FloatArray, FloatArray]], weights: Sequence[float]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean (P,) and covariance (P, P) over means and roots that may as well be."""
+    """Return mean (P,) and covariance (P, P) of a weighted mixture of means and roots."""
     means = np.array([mean for mean, _ in solutions])
     mean = np.average(means, axis=0, weights=weights)
     away = [np.outer(each - mean, each - mean) for each in means]
@@ -57,17 +57,17 @@ def mixed(
 
 
 def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return matrices (..., P, P) of unit diagonal with precisions (..., P) added, and scales."""
+    """Return matrices (..., P, P) + precisions (..., P), scaled to unit diagonal, and scales."""
     size = np.arange(len(matrix))
     diagonal = matrix[size, size] + precision
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
     scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
-    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # which cannot make it singular
+    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # never singular
     return scaled, scale
 
 
 class Evidence:
-    """How probable sizes of the errors make the data."""
+    """Evidence of the data for sizes of the errors."""
 
     def __init__(
         self,
@@ -85,11 +85,10 @@ class Evidence:
         self._own = np.array([group in ('length', 'angle') for group in groups])
         self._tails = np.ones(len(groups))
 
-    def told(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
-        """Return the logarithm of the size of each group (G,), and the curvature (G,) there.
+    def most_probable(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
+        """Return the log size of each group (G,), and the curvature (G,) there.
 
-        Effects that are only considered are of no size where the data would show the usual ones,
-        and do not show any.
+        Considered effects have size zero if the data rule out the usual size and show no effect.
         """
         size, width = self._typical.copy(), np.log(SPREAD) ** -2
         if self._own.sum() == self._member.sum():
@@ -99,9 +98,9 @@ class Evidence:
         for _ in range(ROUNDS):
             weight = self._weight(size)
             mean, variance = self._means(size)
-            told = (self._member - weight * variance).sum(axis=1)
-            slope = weight @ mean**2 - told - width * (size - self._typical)
-            step = np.clip(slope / (2.0 * np.maximum(told, 0.0) + width), -1.0, 1.0)
+            gamma = (self._member - weight * variance).sum(axis=1)
+            slope = weight @ mean**2 - gamma - width * (size - self._typical)
+            step = np.clip(slope / (2.0 * np.maximum(gamma, 0.0) + width), -1.0, 1.0)
             size = self._within(size + step)
             self._lengthen(mean**2 + variance, 0.0, size)
             if np.abs(step).max(initial=0.0) < SETTLED:
@@ -113,15 +112,14 @@ class Evidence:
                 here, without, usual = self._of(tried).tolist()
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
-        return size, 2.0 * np.maximum(told, 0.0) + width
+        return size, 2.0 * np.maximum(gamma, 0.0) + width
 
     def rival(
         self, group: str, std: float, size: FloatArray, considered: set[str | None]
     ) -> tuple[float, FloatArray]:
-        """Return how much more probable a group of size `std` is, and the precision (P,) then.
+        """Return the log odds of a group having size `std`, and the precision (P,) then.
 
-        As the logarithm of the ratio to what was `told`, of sizes (G,); those of the other groups
-        are searched for again.
+        Against the most probable log sizes (G,); the other groups are searched again.
         """
         own = self._names.index(group)
         rest = [k for k in range(len(self._names)) if k != own]
@@ -129,13 +127,13 @@ class Evidence:
         other._given = np.where(self._member[own] > 0.0, std**-2, self._given)
         other._names = [self._names[k] for k in rest]
         other._member, other._typical = self._member[rest], self._typical[rest]
-        found, _ = other.told(considered - {group})
+        found, _ = other.most_probable(considered - {group})
         more = other._probable(found) - self._probable(size)
         other.widen(found)
         return more, other.precision(found)
 
     def _probable(self, size: FloatArray) -> float:
-        """Return how probable the data and sizes (G,) are, but for a constant, by Laplace."""
+        """Return the log probability of data and log sizes (G,), but for a constant (Laplace)."""
         mean, root = solved(self._matrix, self._vector, self.precision(size))
         fit = mean @ self._vector - 0.5 * mean @ self._matrix @ mean
         known = self._member.any(axis=0)
@@ -151,11 +149,11 @@ class Evidence:
         return float(fit - usual + np.log(np.abs(np.diag(root))).sum())
 
     def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
-        """Return sizes that may as well be, with their weights, by the curvature (G,) there.
+        """Return plausible log sizes with their weights, from the curvature (G,).
 
-        One group differs at a time, up and down, by as much as makes means right to the second
-        order (the unscented transform, Julier and Uhlmann 1997); the evidence weighs both. What
-        is of no size stays so, and so does the scale of the device, which is no group.
+        One group differs at a time, up and down, by as much as makes means right to second order
+        (unscented transform, Julier and Uhlmann 1997), weighted by their evidence. Groups of size
+        zero stay so, and so does the scale of the device.
         """
         arms = np.array([name in TYPICAL for name in self._names])
         some = np.flatnonzero(arms & (size > self._typical + np.log(LEAST_SIZE)))
@@ -170,12 +168,12 @@ class Evidence:
         return list(zip(weights.tolist(), tried, strict=True))
 
     def _within(self, size: FloatArray) -> FloatArray:
-        """Return sizes (G,) no further from the typical ones than any that are looked for."""
+        """Return log sizes (G,) clipped to the searched range."""
         most = -np.log(LEAST_SIZE)
         return self._typical + np.clip(size - self._typical, -most, most)
 
     def widen(self, size: FloatArray) -> None:
-        """Give offsets the variances that the prior's tails have in the mean, for sizes (G,)."""
+        """Set the variances to the mean over the tails of the prior, for log sizes (G,)."""
         for _ in range(ROUNDS):
             mean, variance = self._means(size)
             last = self._tails
@@ -184,34 +182,34 @@ class Evidence:
                 break
 
     def _means(self, size: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return means and variances (P,) for sizes (G,), by logarithms."""
+        """Return means and variances (P,) for log sizes (G,)."""
         mean, root = solved(self._matrix, self._vector, self.precision(size))
         return mean, (root**2).sum(axis=1)
 
     def precision(self, size: FloatArray) -> FloatArray:
-        """Return what the priors of the parameters (P,) tell for sizes (G,), by logarithms."""
+        """Return the prior precision (P,) of the parameters for log sizes (G,)."""
         return np.asarray(self._given + self._weight(size).sum(axis=0))
 
     def named(self, size: FloatArray) -> dict[str, float]:
-        """Return the size [m, rad] of each group, given by their logarithms (G,)."""
+        """Return the size [m, rad] of each group from log sizes (G,)."""
         return dict(zip(self._names, np.exp(size).tolist(), strict=True))
 
     def _lengthen(
         self, squares: FloatArray, more: float, size: FloatArray, freedom: float = TAILS + 1.0
     ) -> None:
-        """Give offsets of expected squares (P,), larger by `more` sizes, the tails of the prior.
+        """Set the tails of the prior for offsets of expected squares (P,), plus `more` sizes.
 
-        Effects have none: what a drive does is a matter of its make.
+        Effects have none: drives of one make are alike.
         """
         far = self._member.T @ np.exp(-2.0 * size) * squares + more
         self._tails = np.where(self._own, freedom / (TAILS + far), 1.0)
 
     def _weight(self, size: FloatArray) -> FloatArray:
-        """Return (G, P) the inverse variances of the parameters of each group."""
+        """Return the inverse variances (G, P) of the parameters of each group."""
         return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
 
     def _of(self, sizes: FloatArray) -> FloatArray:
-        """Return the logarithm of the evidence of sizes (S, G), given by their logarithms."""
+        """Return the log evidence of log sizes (S, G)."""
         weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
         scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
         seen = (scale * self._vector)[:, :, np.newaxis]

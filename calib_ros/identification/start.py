@@ -6,15 +6,15 @@ With the nominal arm K_i = A_1 ... A_n, a measured pose is M_i = T_world_base K_
 
 Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading singular vectors
 of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013). Positions: a point set
-registration of the flange positions (Umeyama 1991) that leaves the tool out, and the linear system
+registration of the flange positions (Umeyama 1991), which omits the tool, and the linear system
 p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row. Translations are linear once R_B is
-known. Where orientations hardly vary, the tool's translation is the shortest one, the base takes
-the rest, and rotations come from the registration.
+known. If orientations hardly vary, the tool's translation is the shortest one, the base takes the
+rest, and rotations come from the registration.
 Distances: their squares are linear in the base's position and its square. A touched plane:
-n p_K + n R_K t = d is linear in n, n t^T and d, or with the tool given it is the plane through the
+n p_K + n R_K t = d is linear in n, n t^T and d, or with a given tool it is the plane through the
 points. Pixels: the pose of the board in each image (`resection.py`).
 
-Every start is polished by least squares on the frames alone; the best one counts. Where none fits
+Every start is polished by least squares on the frames alone; the best one is used. If none fits
 (few or degenerate poses), the 24 rotations of a cube are tried as well.
 """
 
@@ -49,8 +49,7 @@ def start_frames(
 ) -> Chain:
     """Return the chain with base and tool frames that bring it close to the measurements.
 
-    Sets are taken one after the other; frames that an earlier set has found are kept for later
-    ones.
+    Sets are processed in order; frames found by earlier sets are kept.
     """
     found: set[str] = set()
     for observations in sets:
@@ -94,24 +93,23 @@ def _start_one(
     for starts in _starts(chain, subset):
         for start in starts:
             away = norms(residual_arrays(start, subset)[0] - left)
-            if np.median(away) <= EXCEPTION * spread:  # the same, before it is fitted
+            if np.median(away) <= EXCEPTION * spread:  # the same valley
                 continue
             normal = normal_equations(start, names, system)
-            told = excited(factor_of(start, names, system, normal), names)
-            known = normal if len(told) == len(names) else None
-            fitted = minimise(start, told, system, tolerance=1e-3, normal=known).chain
-            # the median, which gross errors do not touch
+            chosen = excited(factor_of(start, names, system, normal), names)
+            known = normal if len(chosen) == len(names) else None
+            fitted = minimise(start, chosen, system, tolerance=1e-3, normal=known).chain
             residual = residual_arrays(fitted, subset)[0]
-            error = np.median(norms(residual))
+            error = np.median(norms(residual))  # robust
             if error < least:
-                best, least, determined, left = fitted, error, told, residual
-        if least <= EXCEPTION * spread:  # no other valley is as low: no search is needed
+                best, least, determined, left = fitted, error, chosen, residual
+        if least <= EXCEPTION * spread:  # no other valley is as low
             break
     return robust_fit(best, determined, system, loss).fit.chain
 
 
 def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
-    """Yield starts to polish, and further ones if none of those is good."""
+    """Yield starts to polish, then further ones if none of those is good."""
     arm = flange(chain, observations)
     if observations.plane:
         yield _on_plane(chain, arm, observations)
@@ -128,7 +126,7 @@ def flange(chain: Chain, observations: Observations) -> FloatArray:
 
 
 def movable(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
-    """Return the parameters of those of some frames that are not fixed."""
+    """Return the parameters of the frames that are not fixed."""
     return [n for each in frames if not chain.frame(each).fixed for n in parameters_of(each)]
 
 
@@ -139,10 +137,10 @@ def likened(
     joints: FloatArray,
     sigma_orientation: float = Settings.sigma_orientation,
 ) -> tuple[Chain, float]:
-    """Return a chain that does as an arm does at joint values (N, n), and the RMS distance [m].
+    """Return a chain fitted to an arm at joint values (N, n), and the RMS distance [m].
 
-    Parameters are fitted, the first ones of those that do the same, to exact poses; a turn by
-    `sigma_orientation` [rad] counts as much as a shift by the usual sigma.
+    Of redundant parameters the first are fitted, to exact poses; a turn by `sigma_orientation`
+    [rad] counts as much as a shift by the default sigma.
     """
     poses = arm.forward(joints)
     seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
@@ -157,7 +155,7 @@ def closed_forms(
 ) -> Iterator[Chain]:
     """Yield the chain with base and tool for poses, positions or a socket, in closed form.
 
-    `arm` (N, 4, 4) are the poses of the bare arm, if they are known.
+    `arm` (N, 4, 4) are the poses of the bare arm, if known.
     """
     arm = flange(chain, observations) if arm is None else arm
     for rotation in _closed_form(chain, arm, observations):
@@ -165,10 +163,7 @@ def closed_forms(
 
 
 def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
-    """Yield the chain with the plane z = 0 of the world through the places (N, 4, 4) of the arm.
-
-    With the tool as it is given, and with one that is told by the heights alone.
-    """
+    """Yield the chain on the plane z = 0 through poses (N, 4, 4), with given and found tool."""
     assert observations.distances is not None
     tool = chain.frame('tool')
     tips = [tool.matrix[:3, 3]]
@@ -187,7 +182,7 @@ def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iter
 
 
 def _placed(chain: Chain, base: FloatArray, tool: FloatArray) -> Chain:
-    """Return the chain with other matrices (4, 4) of those frames that are not fixed."""
+    """Return the chain with other matrices (4, 4) for frames that are not fixed."""
     for key, matrix in (('base', base), ('tool', tool)):
         if not chain.frame(key).fixed:
             chain = chain.with_frame(key, replace(chain.frame(key), matrix=matrix))
@@ -197,8 +192,8 @@ def _placed(chain: Chain, base: FloatArray, tool: FloatArray) -> Chain:
 def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
     """Return the chain placed by distances from the world's origin.
 
-    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; the base is not turned against the
-    world, because no distance from its origin tells.
+    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; distances do not determine the
+    orientation of the base, which stays parallel to the world.
     """
     assert observations.distances is not None
     tool = chain.frame('tool').matrix
@@ -212,7 +207,7 @@ def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> 
 def _closed_form(
     chain: Chain, arm: FloatArray, observations: Observations
 ) -> Iterator[FloatArray]:
-    """Yield rotations of the base (3, 3) from what is given and from closed forms."""
+    """Yield rotations of the base (3, 3) from the given frames and closed forms."""
     if observations.socket:
         yield np.eye(3)  # the world's axes are the base's
         return
@@ -230,8 +225,8 @@ def _closed_form(
             )
         system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
         matrix = np.linalg.svd(system)[2][0].reshape(3, 3, order='F')
-        # the singular vector's sign is open, its determinant is not
-        yield se3.nearest_rotation(np.sign(np.linalg.det(matrix)) * matrix)
+        sign = np.sign(np.linalg.det(matrix))  # arbitrary in a singular vector
+        yield se3.nearest_rotation(sign * matrix)
     positions = observations.positions - observations.positions.mean(axis=0)
     reached = (arm @ chain.frame('tool').matrix)[:, :3, 3]
     yield se3.nearest_rotation(positions.T @ (reached - reached.mean(axis=0)))
@@ -244,7 +239,7 @@ def _closed_form(
 def _complete(
     chain: Chain, arm: FloatArray, observations: Observations, rotation: FloatArray
 ) -> Chain:
-    """Return the chain with the rest of its frames in closed form, the base's rotation given."""
+    """Return the chain with the rest of its frames in closed form, for a base rotation."""
     base, tool = chain.frame('base'), chain.frame('tool')
     base_matrix, tool_matrix = base.matrix.copy(), tool.matrix.copy()
     oriented = observations.oriented
@@ -268,10 +263,10 @@ def _complete(
 
 
 def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
-    """Return the shortest t (3,) [m] with which R_i t + b comes near wanted (N, 3) [m].
+    """Return the shortest t (3,) [m] that brings R_i t + b close to wanted (N, 3) [m].
 
-    Directions in which rotations (N, 3, 3) hardly vary stay zero. b is anywhere where it is
-    `free`, else zero.
+    Zero in directions in which rotations (N, 3, 3) hardly vary. b is arbitrary if `free`, else
+    zero.
     """
     if free:
         turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)

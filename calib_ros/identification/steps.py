@@ -2,19 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Something moved during the session: one step in time of a base, a tool or a joint's zero.
 
-A bumped target, a moved tracker or a slipped encoder adds a group of columns X to the linear
-model, switched on at some stop. At the fit, with J the columns of the parameters and r the
-residuals, a group explains, of the remaining squares,
+Each of these adds a group of columns X to the linear model, switched on at some stop. At the fit,
+with J the columns of the parameters and r the residuals, a group explains, of the remaining
+squares,
 
     e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
 
-Products of all columns are summed from the end of the session and serve every stop. Gross errors
-excluded by the robust fit are included with bounded influence, because a step may hide there,
-unless they are fewer than a step has on the shorter side (`few_gross`). Known distances between
-sockets are not, for they say nothing about time.
-
-Unmodelled effects follow the joints, and no step in time explains more than half of their
-residuals. A drift is not a step: a few cosines over the session explain it better.
+Products of all columns are summed from the end of the session and serve every stop. docs/model.md
+(Judgement) describes the search. Known distances between sockets say nothing about time.
 """
 
 from __future__ import annotations
@@ -40,20 +35,19 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 
 EXPLAINED = 0.5
-"""Share of the squares of the residuals from which on something explains them: most of them
-(benchmarks/harm.py)."""
+"""Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
 
 
 @dataclass(frozen=True)
 class Step:
     """What moved, when and by how much.
 
-    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `thing` is what the frame
-    is of, another with the device on the flange. `set`, `sample`, the `image` of it and `stamp_ns`
-    are those of the first sample after it. `size` is the RMS change of positions ('m') or, where
-    it weighs more, of orientations ('rad'); of a joint that of its zero. `share` is what it
-    explains of the squares of the residuals beyond as many useless parameters. If all that was
-    measured on one side are outliers, `unused` says which: the fit is not spoilt by it.
+    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `thing` names the device
+    or target there. `set`, `sample`, its `image` and `stamp_ns` belong to the first sample after
+    the step. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
+    ('rad'); of a joint that of its zero. `share` is its share of the squared residuals beyond that
+    of as many useless parameters. If all measurements on one side are outliers, `unused` says
+    which: the fit is not affected.
     """
 
     what: str
@@ -70,19 +64,18 @@ class Step:
 
     @property
     def harmful(self) -> bool:
-        """Tell whether the fit is that of no arm: of none before or after, or of one no more."""
+        """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
         return self.kind == 'joint' or not self.unused
 
     @property
     def reason(self) -> Reason:
-        """Return why a result is refused for it."""
+        """Return the reason to refuse a result."""
         return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
 
     def __str__(self) -> str:
-        """Return what moved, and when."""
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         line, fraction = divmod(self.stamp_ns, 10**9)
-        if line < 10**6 and not fraction:  # no clock, the numbers of rows
+        if line < 10**6 and not fraction:  # row numbers instead of a clock
             when = f'line {line}, if rows are in the order of measurement'
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
         text = f'something moved before {where}'
@@ -97,7 +90,7 @@ class Step:
 
 
 def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:
-    """Return the step that explains more than half of the residuals of a fit, if there is one."""
+    """Return the step that explains more than half of the residuals of a fit, if any."""
     scan = _Scan(problem, names, robust)
     found = scan.best()
     if found is not None and scan.few_gross(found):
@@ -107,9 +100,9 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
 
 
 def _some_places(stops: int) -> NDArray[np.intp]:
-    """Return stops at which a step is looked for first: apart by a tenth of those on one side.
+    """Return stops for a coarse search: spaced by a tenth of those on the shorter side.
 
-    A step between two of them is still explained to nine tenths there.
+    A step between two of them is still explained to nine tenths.
     """
     every = range(LEAST_ASIDE, stops - LEAST_ASIDE + 1)
     some = [*every[:1]]
@@ -121,7 +114,7 @@ def _some_places(stops: int) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Columns that are switched on together: a frame of some sets, or the zero of a joint."""
+    """Columns switched on together: a frame of some sets, or the zero of a joint."""
 
     what: str
     kind: str
@@ -131,10 +124,9 @@ class _Group:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """A step: its group, its first stop, its size by parameter, and what it leaves.
+    """A step: its group, its first stop, and its size by parameter.
 
-    `share` is what it explains of the squares, `variance` what it leaves for each degree of
-    freedom.
+    `share` is the explained share of the squares, `variance` the rest per degree of freedom.
     """
 
     group: _Group
@@ -145,7 +137,7 @@ class _Found:
 
 
 class _Scan:
-    """The linear model at a fit, with columns of all that may have moved."""
+    """The linear model at a fit, with columns of everything that may have moved."""
 
     def __init__(
         self, problem: Problem, names: Sequence[str], robust: Robust, gross: bool = True
@@ -179,15 +171,15 @@ class _Scan:
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
 
-    def _of(self, group: _Group) -> tuple[float, float, float]:
-        """Return the equations of a group's sets, their freedom, and the squares left there."""
+    def _budget(self, group: _Group) -> tuple[float, float, float]:
+        """Return equations, degrees of freedom and remaining squares of a group's sets."""
         sets = list(group.sets)
         equations = float(self._equations[sets].sum())
         freedom = equations * (1.0 - self._fitted / float(self._equations.sum()))
         return equations, freedom, float(self._left[sets].sum())
 
     def best(self) -> _Found | None:
-        """Return the best step at one of the stops, if it explains most of the squares."""
+        """Return the best step, if it explains most of the squares."""
         some = _some_places(self._stops)
         near = self._best_of(some, 0.5 * EXPLAINED) if len(some) else None
         if near is None:
@@ -216,7 +208,7 @@ class _Scan:
             rank = good.sum(axis=1)
             along = np.einsum('bij,bi->bj', axes, size * vector[:, columns]) * good
             inverse = 1.0 / np.where(good, values, 1.0)
-            equations, freedom, left = self._of(group)
+            equations, freedom, left = self._budget(group)
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
             gain = (along**2 * inverse).sum(axis=1)
@@ -224,7 +216,7 @@ class _Scan:
             k = int(np.argmax(share))
             rest = (1.0 - share[k]) / (freedom - rank[k])
             beyond = 1.0 - rest * freedom
-            # of the squares of all sets: those of one with few equations may be of no freedom
+            # over all sets: one with few equations may have no freedom left
             whole = float(self._equations.sum()) - self._fitted - float(rank[k])
             squares = float(gain[k]) * whole / max(total - float(gain[k]), 1e-300)
             trials = self._stops * len(self._groups)
@@ -237,10 +229,7 @@ class _Scan:
         return found
 
     def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
-        """Return (B, K, P + 1) the products of what may have moved with all columns.
-
-        From each of the stops to the end.
-        """
+        """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
         own = [self._names.index(name) for name in self._added]
         found = np.zeros((len(places), len(own), len(self._names) + 1))
         for rows, numbers in zip(self._rows, self._numbers, strict=True):
@@ -254,9 +243,9 @@ class _Scan:
         return np.asarray(np.cumsum(found[::-1], axis=0)[::-1])
 
     def few_gross(self, found: _Found) -> bool:
-        """Tell whether some stops on the shorter side are gross errors, too few for a step.
+        """Tell whether stops on the shorter side are gross errors, too few for a step.
 
-        The freedoms of a frame explain one or two positions whatever is wrong with them.
+        The freedoms of a frame explain one or two positions whatever their errors.
         """
         sets = found.group.sets
         kept = np.concatenate([self._weights[k] > 0.0 for k in sets])
@@ -283,12 +272,12 @@ class _Scan:
         own = matrix[self._fitted : -1, self._fitted : -1]
         root = inverse_root(own - cross.T @ cross, np.diag(own))
         gain = root.T @ (matrix[self._fitted : -1, -1] - cross.T @ self._known)
-        _, freedom, left = self._of(found.group)
+        _, freedom, left = self._budget(found.group)
         freedom -= float(root.any(axis=0).sum())
         return freedom > 0.0 and float(left - gain @ gain) / freedom < found.variance
 
     def described(self, found: _Found) -> Step:
-        """Return a step with its first sample, and the size of what it did to the poses."""
+        """Return a step with its first sample and its effect on the poses."""
         group, problem = found.group, self._problem
         first: list[tuple[int, int, int]] = []
         moved: list[FloatArray] = []
@@ -320,7 +309,7 @@ class _Scan:
 
 
 def _thing(kind: str, seen: Observations) -> str:
-    """Return what the base or tool frame of a set is of, a joint's zero of the joint itself."""
+    """Return what the base or tool frame of a set belongs to, or the joint."""
     if kind == 'joint':
         return 'the joint'
     of_images = seen.pixels is not None
@@ -332,7 +321,6 @@ def _thing(kind: str, seen: Observations) -> str:
 
 
 def _groups(problem: Problem) -> list[_Group]:
-    """Return what may have moved."""
     found = []
     for kind in ('base', 'tool'):
         for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The usual mistakes in the input: how each is undone, and what to do."""
+"""The usual mistakes in the input: how to undo each, and what to do."""
 
 from __future__ import annotations
 
@@ -27,20 +27,19 @@ ANGLES = (
     ('degrees', 'radians', 'deg', np.radians(1.0)),
     ('radians', 'degrees', 'rad', np.degrees(1.0)),
 )
-"""The unit that angles are in, the one that was given, its option, and its size in that."""
+"""Actual unit of angles, assumed unit, option, and size of the actual in the assumed one."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
 
 
 @dataclass(frozen=True, eq=False)
 class Suspect:
-    """A mistake that may have been made, in words, and the option to give with a table.
+    """A possible mistake, in words, and the option to give with a table.
 
-    `changes`, one after the other, make of the samples those that should have been given, `chain`
-    is the nominal one as it had to be; joint values stand so many `rows` below their measurement.
-    Of those that explain the same, the lowest in `rank` are named. `published` is what to do about
-    messages, live or of a bag. Mistakes of different parts, what is `measured` or a `joint`, may
-    come together.
+    `changes` in order undo it in the samples, `chain` is the corrected nominal one, joint values
+    are `rows` below their measurement. Of equivalent mistakes, those of lowest `rank` are named.
+    `published` is the remedy for messages, live or from a bag. Mistakes of different parts
+    (`measured` or a joint) may occur together.
     """
 
     what: str
@@ -53,7 +52,7 @@ class Suspect:
     part: str = ''
 
     def undone(self, sets: Sets) -> Sets:
-        """Return the samples that should have been given."""
+        """Return the corrected samples."""
         for change in self.changes:
             sets = tuple(map(change, sets))
         return sets
@@ -64,13 +63,13 @@ ORIENTATIONS = Suspect(
     'check their convention, their units and their columns, or leave them out',
     published='check the orientations where they are published',
 )
-"""What is left to say where no other mistake explains what was measured."""
+"""Named if no other mistake explains the measurements."""
 
 
 def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Suspect]:
-    """Yield what may have gone wrong, the most usual first.
+    """Yield possible mistakes, the most usual first.
 
-    Poses `of_images` are those of a board in a camera; joint values stand in a table of places.
+    Poses `of_images` are those of a board in a camera; joint values come from a table of places.
     """
     if of_images:
         yield from _measured(_of_boards(sets[0].inverse))
@@ -96,7 +95,7 @@ def _measured(found: Iterator[Suspect]) -> Iterator[Suspect]:
 
 
 def _of_places(chain: Chain) -> Iterator[Suspect]:
-    """Yield what may be wrong about joint values and the arm."""
+    """Yield mistakes of joint values and the arm."""
     for one, other, unit, size in ANGLES:
         what = f'the joint values are in {one}, not {other}'
         change = _of_kind(chain, 'revolute', size)
@@ -113,7 +112,7 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
 
 
 def _of_boards(inverse: bool) -> Iterator[Suspect]:
-    """Yield what may be wrong about a camera and its board."""
+    """Yield mistakes of a camera and its board."""
     what, remedy = 'the camera is on the flange', '--eye-in-hand (or eye_in_hand)'
     if inverse:
         what, remedy = NOT_ON_FLANGE
@@ -155,11 +154,11 @@ def _units(chain: Chain) -> Iterator[Suspect]:
 
 
 def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
-    """Yield ways to write a pose, with lengths in millimetres or joint values in degrees, too.
+    """Yield ways to write a pose, also with lengths in mm or joint values in degrees.
 
-    Only poses that all have an orientation may be those of a camera on the flange.
+    Only if all poses have an orientation, a camera on the flange may have measured them.
     """
-    back = (Observations.inverted,) if seen.inverse else ()  # to the poses as they were measured
+    back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
     ways: list[tuple[str, str, tuple[Change, ...], str]] = [
         (
             'the quaternions are w x y z, not x y z w',
@@ -207,9 +206,9 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 
 
 def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
-    """Yield other conventions that the rotations may have been written in.
+    """Yield other conventions of the rotations.
 
-    Base and tool leave the angle between two poses as it is: it must be that between two flanges.
+    Base and tool preserve the angle between two poses: it must equal that between the flanges.
     """
     arm = replace(chain, base=None, tool=None).forward(seen.joints)[seen.oriented, :3, :3]
     between = se3.angles_between(arm[:-1], arm[1:])
@@ -253,7 +252,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
 
 
 def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
-    """Yield that the angles of one joint have another unit than those of the others."""
+    """Yield that one joint has another angle unit than the others."""
     turning = [k for k, joint in enumerate(chain.joints) if joint.type == 'revolute']
     for k in turning if len(turning) > 1 else ():
         name, column = chain.joint_names[k], f'q{k + 1}'
@@ -267,9 +266,9 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
 
 
 def dead(chain: Chain, sets: Sets) -> Suspect | None:
-    """Return which coordinates of positions have the same value throughout though the arm moves.
+    """Return position coordinates that are constant although the arm moves.
 
-    A device that stands square to a planar arm sees no more.
+    A device square to a planar arm measures no more.
     """
     for each in sets:
         if each.socket or len(each) < TELLING:
@@ -289,7 +288,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
 
 
 def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
-    """Return that a joint counts the other way round, has another zero [rad], or both."""
+    """Return that a joint has the other sign, another zero [rad], or both."""
     parts, column = [], f'q{k + 1}'
     if sign < 0.0:
         parts.append(('counts the other way round', f'sign: {-chain.joints[k].sign}'))
@@ -337,7 +336,6 @@ def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
 
 
 def _of_kind(chain: Chain, kind: str, size: float) -> Change:
-    """Return a change of the values of joints of one kind."""
     return _joints(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
 
 
@@ -355,7 +353,7 @@ def _with(turn: Turn) -> Change:
 
 
 def _mirrored(each: Observations) -> Observations:
-    """Return what a device with its y axis the other way round should have measured."""
+    """Return the measurements with the y axis of the device reversed."""
     mirror = np.diag([1.0, -1.0, 1.0])
     return replace(
         each, positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror

@@ -1,35 +1,20 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Suspicious results with good figures: one sentence each, and what to do.
+"""Suspicious results with good figures: one sentence each, and what to do (docs/model.md).
 
-Scale. A device with a scale error s makes all lengths of the arm seem to grow alike; so does its
-temperature. With L the derivative of the fitted lengths by s (the frames take their share), x
-their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s, with tau
-estimated from the scatter about the line (Paule and Mandel 1982), as an arm's own offsets scatter.
-A scale certainly beyond what any arm grows by is the device's: the result is refused, because it
-is good in the device's metres only. A smaller one may be the arm's own growth. Few lengths that
-scatter tell no scale with certainty; so a result is also refused if the device is more than
-HARMFUL likely to be out of scale and the calibration to make the arm worse by that (`region.py`).
+Scale. With L the derivative of the fitted lengths by the scale s of the device (the frames take
+their share), x their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s;
+tau is estimated from the scatter about the line (Paule and Mandel 1982).
 
-Sister. One of the shipped robots may be much closer to the identified arm than the nominal one, by
-the positions that both reach in the best base and tool.
-
-Gravity. If effects of gravity are fitted, another direction may explain clearly more than the
-given one. The base frame found does not tell which way is up: the device may have any orientation.
-
-Coupling. Joint values without the couplings of a wrist leave residuals that these explain.
-
-Lens. If other intrinsics of a camera explain most of what is left, the given ones are those of
-another zoom, focus or size of images. If the arm found imitates the lens, it is refused: fitted
-with it, it would be another one, not just a more accurate one.
+Lens. If other intrinsics of a camera explain most of the residuals, the given ones belong to
+another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
+the lens it would be another arm, not just a more accurate one.
 
 Board. Printers stretch one side of a page. The residuals at the board, averaged over the images,
-tell by how much one side of it is longer than stated, compared with the other; the scale of both
-together is as unsure, and the arm takes it on.
+show the ratio of its sides; the arm absorbs the scale of both together, which is as uncertain.
 
 Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
-the poses tell less of the arm than is known before. A remark names a sigma that is larger than
-the errors that any result may leave, or of which the residuals are a small part.
+the poses add nothing to the priors.
 """
 
 from __future__ import annotations
@@ -64,32 +49,32 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import EXACT, EXCEPTION
 
 LEAST_SCALE = 0.5 * SCALE
-"""Of a device, from which it is remarked: half of what those of good ones scatter by."""
+"""Scale of a device that is remarked: half the scatter of good ones."""
 LARGEST_SCALE = 10.0 * SCALE
-"""More than any arm grows by: 40 degrees do it, if all of it is of aluminium (23 ppm a degree)."""
+"""More than any arm grows: by 40 degrees, if all aluminium (23 ppm a degree)."""
 HARMFUL = 0.15
-"""Probability of harm by the scale of the device from which a result is refused: of 607 good ones
-8 are; of 1,890 arms with such an error 64 are accepted and get worse (benchmarks/scale.py)."""
+"""Probability of harm by the device's scale at which a result is refused: of 607 good ones 8
+are; of 1,890 arms with such an error 64 are accepted and get worse (benchmarks/scale.py)."""
 LEAST_NOISE = NEARER * EXCEPTION
-"""Residuals in units of the sigmas given below which these are wrong: clearly less than a tenth,
-by which devices repeat better than they measure, while mm are thousandths."""
+"""Residuals in units of the given sigmas below which these are wrong: clearly less than a
+tenth, by which devices repeat better than they measure, while mm are thousandths."""
 SIMULATED = EXACT
-"""Residuals [m or rad] below which no device measured them."""
+"""Residuals [m or rad] too small for any device."""
 COUPLED = (
     'couplings of the last joints explain most of the residuals: are the joint values those '
     'of the motors? If so, add the effects "coupling"'
 )
 SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
-"""Standard deviations [m] of arms' own offsets of lengths, to choose from."""
+"""Candidate standard deviations [m] of an arm's own length offsets."""
 
 
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
-    """Return the result with what is suspicious in it, refused where it cannot be right.
+    """Return the result with what is suspicious in it, refused if it cannot be right.
 
-    `another` is false if a mistake is named already, which comes first.
+    `another` is false if a mistake is already named, which comes first.
     """
     if any(each.socket or each.plane for each in problem.sets):
-        return result  # one place tells nothing of what follows
+        return result  # one place shows none of these
     sister = _sister(problem, result) if another else ''
     scale, certain = ('', False) if sister else _scale(problem, result)
     lens, imitated = _lens(problem, result) if another else ('', False)
@@ -111,9 +96,9 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 
 
 def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:
-    """Return the common scale of all lengths, its standard deviation, and degrees of freedom.
+    """Return the common scale of all lengths, its standard deviation and degrees of freedom.
 
-    The freedom is zero where there are not three lengths to tell.
+    Zero degrees of freedom with fewer than three lengths.
     """
     chain, first = result.chain, problem.sets[0]
     arm = [n for n in chain.parameter_names if n.is_length and not chain.owns_frame(n)]
@@ -130,7 +115,7 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
 def _common(
     offsets: FloatArray, growth: FloatArray, covariance: FloatArray
 ) -> tuple[float, float, float]:
-    """Return s, its standard deviation and freedom of offsets (P,) = s * growth (P,) + noise."""
+    """Return s, its standard deviation and freedom, for offsets (P,) = s growth (P,) + noise."""
     freedom = len(offsets) - 1
     variances, axes = np.linalg.eigh(covariance)
     offsets, growth = axes.T @ offsets, axes.T @ growth
@@ -138,12 +123,12 @@ def _common(
     weight = weights @ growth**2
     scale = (weights @ (growth * offsets)) / np.maximum(weight, 1e-300)
     left = (weights * (offsets - scale[:, np.newaxis] * growth) ** 2).sum(axis=1)
-    k = int(np.argmax(left <= freedom))  # the least that lets the offsets scatter as they do
+    k = int(np.argmax(left <= freedom))  # the smallest tau that explains the scatter
     return float(scale[k]), float(max(weight[k], 1e-300) ** -0.5), float(freedom)
 
 
 def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
-    """Return the suspicion of a common scale in words, and whether it is refused."""
+    """Return the suspicion of a common scale in words, and whether it refuses."""
     if text := _out_of_scale(result):
         return text, True
     scale, std, freedom = scale_of(problem, result)
@@ -159,7 +144,7 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
 
 
 def _out_of_scale(result: Identification) -> str:
-    """Return in words that the scale of the device may make the calibrated arm worse."""
+    """Return that the scale of the device may make the calibrated arm worse."""
     region, rival = result.region, result.posterior.rival
     if result.refusals or region is None or rival is None or region.by_scale < HARMFUL:
         return ''
@@ -180,7 +165,7 @@ def _percent(share: float) -> str:
 
 
 def _sister(problem: Problem, result: Identification) -> str:
-    """Return in words which shipped robot is much nearer to the arm found than the nominal."""
+    """Return the shipped robot that is much nearer to the identified arm than the nominal."""
     far = SPREAD * TYPICAL['length'], SPREAD * TYPICAL['angle']
     if not any(each.beyond(*far) for each in result.parameters):
         return ''
@@ -199,13 +184,13 @@ def _sister(problem: Problem, result: Identification) -> str:
 
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
-    """Return the RMS distance [m] of two arms' targets at (N, n), in the best base and tool."""
+    """Return the RMS distance [m] of two arms at (N, n), in the best base and tool."""
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
     return likened(start, [*parameters_of('base'), *parameters_of('tool')], found, joints)[1]
 
 
 def _gravity(problem: Problem, result: Identification) -> str:
-    """Return in words which direction of gravity explains clearly more than the one given."""
+    """Return the direction of gravity that explains clearly more than the given one."""
     bent = [n for n, _ in result.chain.effects if effects.group_of(n) in ('gravity', 'compliance')]
     if not bent:
         return ''
@@ -214,7 +199,7 @@ def _gravity(problem: Problem, result: Identification) -> str:
     given = _explained(problem, straight, rest, bent)
     best, words = 0.0, ''
     for axis, along in zip('xyz', np.linalg.norm(problem.chain.gravity) * np.eye(3), strict=True):
-        x, y, z = along.tolist()  # the sign is the coefficients'
+        x, y, z = along.tolist()  # coefficients have the sign
         share = _explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
         best, words = max((best, words), (share, axis))
     if not best - given > EXPLAINED * (1.0 - given):
@@ -227,7 +212,7 @@ def _gravity(problem: Problem, result: Identification) -> str:
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:
-    """Return in words which sigmas are far larger than what is left, or that of turns smaller."""
+    """Return sigmas far larger than the residuals, and orientation sigmas far smaller."""
     noise, found = result.noise, []
     if noise.consistent or any(each.pixels is not None for each in problem.sets):
         return ''
@@ -257,11 +242,11 @@ def _sigmas(problem: Problem, result: Identification) -> str:
 
 
 def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
-    """Return in words that other intrinsics than those given explain what is left.
+    """Return that other intrinsics explain the residuals, and whether the arm imitates them.
 
-    Most of it, or more than chance does where the arm found imitates them: fitted with them it is
-    another one, by as much as it may be nearer to the nominal. Whether it does, too. The points
-    of an image share its pose, so each image counts for the freedoms of that only.
+    They must explain most of the residuals, or more than chance if the arm imitates them: the arm
+    fitted with them then differs by as much as it may be nearer to the nominal. The points of an
+    image share its pose, so each image counts for six freedoms.
     """
     if not result.converged or (result.step is not None and result.step.harmful):
         return '', False
@@ -290,7 +275,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
 
 
 def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
-    """Tell whether a fit of another nominal chain finds another arm, as far as this one counts."""
+    """Tell whether a fit with a free lens finds another arm, within the region of this one."""
     try:
         other = fit(replace(problem, chain=freed))[2].chain
     except (InputError, np.linalg.LinAlgError):
@@ -306,14 +291,14 @@ def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
 
 
 def _board(problem: Problem, result: Identification) -> str:
-    """Return in words that a board is wider or narrower for its height than stated."""
+    """Return that a board is wider or narrower for its height than stated."""
     for each, far in zip(problem.sets, result.distances, strict=True):
         kept = far < OUTLIER
         if each.points is None or distinct(each.images[kept]) < 2:
             continue
         seen, points = each.select(kept), each.points[kept]
         _, shifts = seen_residuals(result.chain, seen)
-        if each.on_flange:  # shifts of the camera, along the axes of the board
+        if each.on_flange:  # the camera moves instead
             shifts = -shifts
         else:
             poses = result.chain.forward(seen.joints, seen.approach, seen.base, seen.tool)
@@ -337,9 +322,9 @@ def _board(problem: Problem, result: Identification) -> str:
 
 
 def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:
-    """Return the share of what a fit has left that couplings of the wrist explain.
+    """Return the share of the residuals that couplings of the wrist explain, if most of it.
 
-    Zero where that is not most of it. `noise` is the size of what is left [sigma given].
+    `noise` is the size of the residuals [sigma given].
     """
     known = [name for name, _ in chain.effects]
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
@@ -361,7 +346,7 @@ def _explained(
     scale = np.linalg.norm(rows, axis=0)
     scale[scale == 0.0] = 1.0
     factor = np.asarray(np.linalg.qr(rows / scale, mode='r'))
-    rest = factor[count:, count:]  # what those fitted cannot follow
-    gone = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
+    rest = factor[count:, count:]  # beyond the fitted parameters
+    left = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
     total = float(rest[:, -1] @ rest[:, -1])
-    return 1.0 - float(gone @ gone) / total if total > 0.0 else 0.0
+    return 1.0 - float(left @ left) / total if total > 0.0 else 0.0

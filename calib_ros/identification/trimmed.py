@@ -4,14 +4,12 @@
 
 Least trimmed squares: the fit to the half of the samples that fits best (Rousseeuw 1984), found as
 in FAST-LTS (Rousseeuw and van Driessen 2006). Many fits are made to a few randomly drawn
-configurations, as close to the start as these allow. Concentration steps improve each: take the
-half with the shortest residuals, fit it, repeat. All fits share one linearised model and are
-computed at once as matrix products; the model is linearised again at the best fit until its half
-no longer changes.
+configurations. Concentration steps improve each: take the half with the shortest residuals, fit
+it, repeat. All fits share one linearised model and are computed at once as matrix products; the
+model is linearised again at the best fit until its half no longer changes.
 
-Half means half of every set of observations, and slightly more: with P parameters and R equations
-(1 + P / R) / 2 of the samples, which tolerates the most gross errors, (1 - P / R) / 2 of them
-(Rousseeuw and Leroy 1987).
+Half means half of every set, and slightly more: with P parameters and R equations (1 + P / R) / 2
+of the samples, which tolerates the most gross errors (Rousseeuw and Leroy 1987).
 """
 
 from __future__ import annotations
@@ -28,16 +26,15 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, FloatArray
 
 STARTS = 500
-"""As many as FAST-LTS has."""
+"""As in FAST-LTS."""
 BEST = 10
-"""As many as FAST-LTS follows to their end, after two concentration steps from every start."""
+"""As in FAST-LTS, followed to convergence after two concentration steps from every start."""
 
 
 def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
     """Return the chain fitted to the best half of the samples, found from `chain`.
 
-    Samples are searched without the weights that they carry. A system without spare equations is
-    left as it is.
+    Weights of the samples are ignored. A system without spare equations returns `chain`.
     """
     few = _thinned(system)
     need = _need(names, few)
@@ -82,13 +79,13 @@ def unknown(names: Sequence[str], system: System) -> int:
 
 
 def _thinned(system: System) -> System:
-    """Return SOME_POSES evenly spread over all samples, of each set a tenth of them at least."""
+    """Return SOME_POSES samples evenly spread, at least a tenth of them from each set."""
     most = SOME_POSES // min(len(system.sets), 10)
     return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
 
 
 def _need(names: Sequence[str], system: System) -> float:
-    """Return parameters per equation: those without a prior, and one sample a configuration."""
+    """Return parameters without a prior per equation, with one sample per configuration."""
     rows = sum(
         samples.rows / samples.count * (samples.observations.configurations.max() + 1)
         for samples in system.sets
@@ -98,7 +95,7 @@ def _need(names: Sequence[str], system: System) -> float:
 
 
 class _Halves:
-    """Which samples of each set to draw and to keep; masks are (S, N) over all sets."""
+    """Samples of each set to draw and to keep; masks are (S, N) over all sets."""
 
     def __init__(self, system: System, need: float) -> None:
         ends = np.cumsum([0, *(samples.count for samples in system.sets)]).tolist()
@@ -109,7 +106,7 @@ class _Halves:
     def draw(self, need: float) -> NDArray[np.bool_]:
         """Return seeded starts: of every set half the configurations that all parameters need.
 
-        The fewer, the likelier is a start without gross errors; ties go by what was known before.
+        Fewer make a start without gross errors likelier; priors resolve ties.
         """
         rng = np.random.default_rng(0)
         masks = []
@@ -120,7 +117,7 @@ class _Halves:
         return np.concatenate(masks, axis=1)
 
     def concentrate(self, squares: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
-        """Return the samples of the shortest residuals, and the sums (S,) of their squares."""
+        """Return the samples with the shortest residuals, and the sums (S,) of their squares."""
         masks = np.zeros(squares.shape, dtype=bool)
         for part, size in zip(self.parts, self._sizes, strict=True):
             if size:
@@ -149,7 +146,7 @@ class _Linear:
         self._gradient = extra.T @ offset
 
     def squares(self, masks: NDArray[np.bool_]) -> FloatArray:
-        """Return the squared residuals (S, N) of all samples after a fit to those of each mask."""
+        """Return the squared residuals (S, N) of all samples after a fit to each mask."""
         count, width, size = self._columns.shape
         chosen = masks.astype(float)
         matrices = (chosen @ self._matrices.reshape(count, -1)).reshape(-1, size, size)

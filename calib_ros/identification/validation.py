@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Judging a result on poses that were not fitted."""
+"""Judging a result on held-out poses."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from calib_ros.kinematics.se3 import FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame
 
 COUNTS = 0.005
-"""Change of an RMS error that counts, of itself; less is chance (benchmarks/real_robots.py)."""
+"""Relative change of an RMS error that counts; less is chance (benchmarks/real_robots.py)."""
 
 
 @dataclass(frozen=True)
 class ParameterRow:
     """One parameter of the model: m for lengths, rad for angles.
 
-    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses
-    do not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
-    degrees of freedom from which `std` was estimated; infinite where the noise is known.
+    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses do
+    not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
+    degrees of freedom of `std`; infinite if the noise is known.
     """
 
     name: Parameter
@@ -47,20 +47,20 @@ class ParameterRow:
     freedom: float = np.inf
 
     def half_width(self, level: float = CONFIDENT) -> float | None:
-        """Return half the width of the interval that holds the truth, by Student's t."""
+        """Return the half width of the confidence interval, by Student's t."""
         if self.std is None:
             return None
         return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
 
     def beyond(self, length: float, angle: float) -> bool:
-        """Tell whether it is a DH parameter certainly further from nominal than a limit."""
+        """Tell whether a DH parameter is certainly further from nominal than a limit."""
         limit = length if self.name.is_length else angle
         return self.std is not None and self.name.of_dh and abs(self.offset) - 3 * self.std > limit
 
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Figures of the distance to the measurement over a set of poses, as ISO 9283 has them."""
+    """Figures of position errors over a set of poses, as in ISO 9283."""
 
     count: int
     rms_mm: float
@@ -75,9 +75,9 @@ class ErrorFigures:
 class Residuals:
     """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
 
-    Both in the world; the rotation is NaN where no orientation was measured. `configurations`
-    (N,) tells which pairs belong to one standing configuration. Of points of a board the position
-    is the shortest shift that explains the residual in `pixels` (N, 2), which are NaN elsewhere.
+    Both in the world; the rotation is NaN where not measured. `configurations` (N,) are the
+    configuration numbers. For board points the position is the shortest shift that explains the
+    residual in `pixels` (N, 2), which are NaN otherwise.
     """
 
     position: FloatArray
@@ -106,9 +106,9 @@ class Residuals:
 class Comparison(Shown):
     """Residuals of the same poses before and after.
 
-    Before is the nominal chain with base and tool frames fitted, so that the gain is the arm's
-    and not the frames'. `judged` (N,) is False for outliers; `repeated` (N,) is True for
-    held-out pairs at fitted configurations, which count in the figures and decide nothing.
+    Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
+    `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
+    configurations, which count in the figures but not for acceptance.
     """
 
     before: Residuals
@@ -118,12 +118,12 @@ class Comparison(Shown):
 
     @property
     def deciding(self) -> NDArray[np.bool_]:
-        """Return (N,) which pairs the rules of acceptance go by."""
+        """Return which pairs (N,) count for acceptance."""
         return self.judged if self.repeated is None else self.judged & ~self.repeated
 
     @property
     def outliers(self) -> int:
-        """Return how many pairs are named as outliers and left out of the figures."""
+        """Return the number of outliers, which are left out of the figures."""
         return int((~self.judged).sum())
 
     @cached_property
@@ -132,7 +132,7 @@ class Comparison(Shown):
         return self.before.figures(self.judged), self.after.figures(self.judged)
 
     def to_frame(self) -> Any:
-        """Return the residuals of position [m] before and after as a pandas.DataFrame."""
+        """Return the position residuals [m] before and after as a pandas.DataFrame."""
         columns = {
             f'{when}_{axis}': residuals.position[:, k]
             for when, residuals in (('before', self.before), ('after', self.after))
@@ -171,7 +171,7 @@ def compare(
 ) -> Comparison:
     """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
     numbers = np.concatenate(numbered(sets))
-    last, first = (  # those of the last are known where it has just been fitted
+    last, first = (  # `after` first: cached after a fit
         _joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)
     )
     every = np.ones(len(numbers), dtype=bool)
@@ -188,11 +188,10 @@ def validate(
 ) -> tuple[Comparison | None, str]:
     """Judge both chains on pairs that were not fitted.
 
-    Held-out pairs are outliers unless they are near what the fit predicts, or were `explained`
-    (N,) by a simpler model.
-
-    Configurations are dealt out to the folds one by one, so that none is on both sides.
-    Outliers keep in the folds the weight that they have in the fit; they are judged all the same.
+    Held-out pairs are outliers if they are far from the prediction and not `explained` (N,) by a
+    simpler model. In cross-validation, configurations are dealt to the folds one by one, so that
+    none is on both sides. Outliers keep their weight of the whole fit in the folds; they are
+    judged too.
     """
     repeated = _repeated(problem)
     if problem.judging and not repeated.all():
@@ -222,7 +221,6 @@ def _cross_validate(
     robust: Robust,
     said: str,
 ) -> tuple[Comparison | None, str]:
-    """Judge both chains on parts of the configurations that were left out in turn."""
     groups = problem.configurations
     count = distinct(np.concatenate(groups))
     rows = sum(
@@ -251,7 +249,7 @@ def left_out(
     groups: Sequence[NDArray[np.intp]],
     folds: Sequence[NDArray[np.intp]],
 ) -> tuple[Residuals, Residuals]:
-    """Return the residuals of every fold by two chains of its own, before and after.
+    """Return the residuals of every fold by its own two chains, before and after.
 
     `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
     """
@@ -271,8 +269,7 @@ def left_out(
     return before, after
 
 
-def _repeated(problem: Problem) -> NDArray[np.bool_]:
-    """Return (N,) which held-out pairs are at configurations that are fitted."""
+def _repeated(problem: Problem) -> NDArray[np.bool_]:  # held-out pairs (N,)
     if not problem.judging:
         return np.zeros(0, dtype=bool)
     numbers = numbered(problem.all_sets)
@@ -281,13 +278,13 @@ def _repeated(problem: Problem) -> NDArray[np.bool_]:
 
 
 def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
-    """Return into how many parts to deal the configurations; 0 where all are needed for the fit.
+    """Return the number of folds; 0 if all configurations are needed for the fit.
 
-    The other parts must determine what is fitted, with some equations to spare. Where they do so
-    by priors only, one configuration is left out at a time.
+    The other folds must determine the fit, with some equations to spare. If they do so only with
+    priors, one configuration is left out at a time.
     """
     known = dict(problem.model.effects)
-    names = [name for name in names if name not in known]  # which have priors
+    names = [name for name in names if name not in known]  # effects have priors
     folds = min(problem.folds, count)
     if folds > 1 and rows * (folds - 1) // folds >= len(names) + TELLING:
         return folds
@@ -303,7 +300,7 @@ def _joined(
     configurations: NDArray[np.intp],
     index: NDArray[np.intp] | slice = slice(None),
 ) -> Residuals:
-    """Return the residuals of several parts as one, put in order by an index (N,)."""
+    """Return the residuals of several parts as one, ordered by an index (N,)."""
     return Residuals(
         np.concatenate([piece.position for piece in pieces])[index],
         np.concatenate([piece.orientation for piece in pieces])[index],
@@ -313,7 +310,6 @@ def _joined(
 
 
 def _places(problem: Problem) -> list[set[str]]:
-    """Return the base frames of sockets, together those that are a known distance apart."""
     places = [{base} for base in dict.fromkeys(each.base for each in problem.sets)]
     for first, second, _ in problem.separations:
         one, other = (next(p for p in places if base in p) for base in (first, second))
@@ -333,8 +329,8 @@ def _leave_one_place_out(
 ) -> tuple[Comparison, str]:
     """Judge both chains on places of sockets that were not fitted.
 
-    Where the sockets of a place are is unknown; it is fitted to the place's own pairs, by arm and
-    tool of the others. Outliers keep the weight that they have in the fit to all.
+    The unknown positions of a place's sockets are fitted to its own pairs, with arm and tool of
+    the others. Outliers keep their weight of the whole fit.
     """
     pairs = list(zip(problem.sets, robust.system.sets, strict=True))
 
@@ -352,9 +348,11 @@ def _leave_one_place_out(
         kinds = [kind for kind in problem.kinds if kind.base not in place]
         for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
             rest = [name for name in fitted if name not in own]
-            # the place left out may have been the one that held a gauge
-            told = structurally_independent(problem.model, rest, kinds, others.separation_rows)
-            rest = [name for name in rest if name in told or name in problem.prior_sigmas]
+            # without this place a gauge may be free
+            determined = structurally_independent(
+                problem.model, rest, kinds, others.separation_rows
+            )
+            rest = [name for name in rest if name in determined or name in problem.prior_sigmas]
             found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)
     number = {base: k for k, place in enumerate(places) for base in place}
     parts = [
@@ -371,7 +369,7 @@ def _leave_one_place_out(
 
 
 def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:
-    """Return the mean squared errors (2, K) of K configurations by errors (N, 3) of pairs."""
+    """Return the mean squared errors (2, K) of K configurations, for errors (N, 3) of pairs."""
     squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
     known = ~np.isnan(squares).any(axis=0)
     _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
@@ -384,7 +382,7 @@ def log_gain(
     configurations: NDArray[np.intp],
     confidence: float = CONFIDENT,
 ) -> tuple[float, float]:
-    """Return the logarithm of RMS before / RMS after, and how large chance could make it.
+    """Return the log of RMS before / RMS after, and its size that chance could cause.
 
     Errors are (N, 3). The standard error is that of the difference of the two logarithms by the
     delta method, from the spread over configurations, because pairs of one are not independent.

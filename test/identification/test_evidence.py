@@ -275,11 +275,11 @@ def test_only_what_is_fitted_is_doubted(monkeypatch):
     class AskedError(Exception):
         pass
 
-    def told_of(chain, names, system, noise, beside, *_):
+    def products_with_doubts(chain, names, system, noise, beside, *_):
         assert (noise, beside) == (2.0, {'elbow_joint.theta': 1e-3})
         raise AskedError
 
-    monkeypatch.setattr(evidence, 'told_of', told_of)
+    monkeypatch.setattr(evidence, 'products_with_doubts', products_with_doubts)
     doubts = {'elbow_joint.theta': 1e-3, 'wrist_1_joint.theta': 2e-3}
     with pytest.raises(AskedError):
         evidence.posterior_of(

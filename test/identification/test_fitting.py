@@ -33,9 +33,9 @@ def noise(size, consistent=False, widened=1.0):
 )
 def test_what_the_model_lacks_weighs_priors_in_part(size, widened, told):
     """What neighbours do not share, over two; never below the sigmas given, or the noise found."""
-    assert fitting._told_by(noise(size, widened=widened), None) == pytest.approx(told)
-    assert fitting._told_by(noise(size, True, widened), None) == size
-    assert fitting._told_by(noise(size, widened=widened), SimpleNamespace()) == size
+    assert fitting._noise_for_priors(noise(size, widened=widened), None) == pytest.approx(told)
+    assert fitting._noise_for_priors(noise(size, True, widened), None) == size
+    assert fitting._noise_for_priors(noise(size, widened=widened), SimpleNamespace()) == size
 
 
 def test_only_what_is_told_worse_than_common_sense_is_guarded():
@@ -127,12 +127,12 @@ def test_priors_matter_if_they_hold_a_parameter_that_has_none():
     problem = Problem(UR10E, seen(), priors={'elbow_joint.a': 1.0})
     held = {'elbow_joint.a': 0.9, 'elbow_joint.d': 0.04}
     told = SimpleNamespace(held=held.get)
-    assert not fitting._matter(problem, tuple(held), told)
+    assert not fitting._priors_matter(problem, tuple(held), told)
     held['elbow_joint.d'] = 0.06
-    assert fitting._matter(problem, tuple(held), told)
+    assert fitting._priors_matter(problem, tuple(held), told)
     held['elbow_joint.d'] = 0.0
-    assert fitting._matter(replace(problem, learned=Learned({}, 1.0)), tuple(held), told)
-    assert fitting._matter(replace(problem, effects=('ratio',)), tuple(held), told)
+    assert fitting._priors_matter(replace(problem, learned=Learned({}, 1.0)), tuple(held), told)
+    assert fitting._priors_matter(replace(problem, effects=('ratio',)), tuple(held), told)
 
 
 @pytest.mark.parametrize('count', [120, 600])

@@ -161,9 +161,9 @@ def test_residuals_moved_in_time_are_explained_as_by_columns_made_at_once(model)
     """Columns of all harmonics are made joint by joint, of those chosen as well."""
     told, sets, linear = model
     waves, steps = ['wrist_3_joint.sin_7', 'wrist_3_joint.cos_7'], []
-    linear._of(FIRST)
+    linear._columns_of(FIRST)
     groups = [waves, [*SECOND, 'elbow_joint.ratio']]
-    linear._of(groups[1])
+    linear._columns_of(groups[1])
     for chosen in ((), FIRST):
         names = [*NAMES, *chosen, *waves, *groups[1]]
         chain = told.model.with_effects([n for n in names if n not in NAMES])

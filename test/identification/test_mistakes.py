@@ -134,7 +134,7 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     found = explained(Problem(UR, change(seen_of(oriented=oriented))))
     assert remedy in str(found)
     assert len(found.suspects) <= 2
-    assert 5.0 * found.so < found.given
+    assert 5.0 * found.corrected < found.given
     published = ' -- '.join(each.published for each in found.suspects)
     assert PUBLISHED.get(mistake, '') in published  # what is said of messages
     assert '--' not in published.replace(' -- ', '')
