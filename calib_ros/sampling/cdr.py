@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Serialised messages of a recording straight to arrays.
+"""Decoding of serialised messages of a recording straight to arrays.
 
-Messages of one topic mostly differ in their stamps and numbers only: the names in them, and so
-the places of the numbers (OMG Common Data Representation), are the same. The layout is read off
-the first message, others of its length are held against it byte by byte, and all numbers are
-taken and checked at once. What has no layout must be decoded by itself.
+Messages of one topic mostly differ only in stamps and numbers: the names, and so the offsets of
+the numbers (OMG Common Data Representation), are the same. The layout is derived from the first
+message, others of its length are compared with it byte by byte, and all numbers are read at once.
+Messages without a layout must be decoded one by one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from calib_ros.sampling.messages import JOINT_STATE, TRANSFORM, TRANSFORMS, Read
 from calib_ros.values import MOST_NAMES
 
 LITTLE_ENDIAN = b'\x00\x01'
-_HEAD = len(LITTLE_ENDIAN) + 2  # bytes of the encapsulation: how it is encoded, and options
+_HEAD = len(LITTLE_ENDIAN) + 2  # encapsulation: encoding and options
 _FORMS: dict[str, tuple[int, int, str, int]] = {
     JOINT_STATE: (1, 0, '<f8', 0),
     TRANSFORM: (2, 0, '<f8', 7),
@@ -35,11 +35,11 @@ _FORMS: dict[str, tuple[int, int, str, int]] = {
     'nav_msgs/msg/Odometry': (2, 0, '<f8', 43),
     'sensor_msgs/msg/Range': (1, 13, '<f4', 1),  # after field of view, least and greatest range
 }
-"""Of each type: strings before the numbers, bytes between, kind and count of the numbers."""
+"""By type: strings before the numbers, bytes between, kind and count of the numbers."""
 
 
 class Item(NamedTuple):
-    """What a message says of one thing: strings, and where stamp and numbers are."""
+    """Strings of one part of a message, and the offsets of its stamp and numbers."""
 
     strings: tuple[str, ...]
     stamp: int
@@ -50,51 +50,50 @@ class Item(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where in messages of one kind things are."""
+    """Offsets in messages of one kind."""
 
     items: tuple[Item, ...]
-    begin: int  # the place from which on they are alike
-    text: NDArray[np.uint8]  # the bytes that they have
-    mask: NDArray[np.uint8]  # 255 where they have them
-    last: slice  # of these bytes, in one piece
+    begin: int  # offset of the first common byte
+    text: NDArray[np.uint8]  # the common bytes
+    mask: NDArray[np.uint8]  # 255 for common bytes
+    last: slice  # the last block of these
 
     def among(self, rows: NDArray[np.uint8]) -> Flags:
-        """Tell which of some messages (N, ...) have this layout."""
+        """Tell which messages (N, ...) have this layout."""
         part = slice(self.begin, len(self.mask))
         if (rows[:, part] == self.text[part]).all():  # the usual case, at half the cost
             return np.ones(len(rows), dtype=bool)
-        equal = (rows[:, self.last] == self.text[self.last]).all(axis=1)  # mostly the last tells
+        equal = (rows[:, self.last] == self.text[self.last]).all(axis=1)  # usually decides
         equal[equal] = ~((rows[equal, part] ^ self.text[part]) & self.mask[part]).any(axis=1)
         return np.asarray(equal)
 
 
 @dataclass(frozen=True, eq=False)
 class Alike:
-    """Messages of one layout: which of a batch they are, and their bytes (N, ...)."""
+    """Messages of one layout: their indices in a batch, and their bytes (N, ...)."""
 
     layout: Layout
     which: Index
     rows: NDArray[np.uint8]
 
     def of(self, k: int) -> Readings:
-        """Return what each of them says of one thing."""
+        """Return the readings of item k."""
         strings, stamp, begin, kind, width = self.layout.items[k]
         seconds = _numbers(self.rows, stamp, '<i4', 1)[:, 0].astype(np.int64)
         stamps = seconds * 1_000_000_000 + _numbers(self.rows, stamp + 4, '<u4', 1)[:, 0]
         return Readings(stamps, strings, _numbers(self.rows, begin, kind, width).astype(float))
 
     def span(self, k: int) -> tuple[int, int]:
-        """Return the stamps of one thing in the first and the last of them."""
+        """Return the first and last stamp of item k."""
         at = self.layout.items[k].stamp
         (s, ns), (t, nt) = (struct.unpack_from('<iI', self.rows[end], at) for end in (0, -1))
         return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
 
 
 def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:
-    """Return messages of one type and length by their layouts; what has none is in none.
+    """Return messages of one type and length grouped by layout, without those that have none.
 
-    Layouts that are `known` by the length of messages need not be found again, and are added. Of
-    more than MOST_NAMES the others are in none.
+    Layouts `known` by message length are reused, and new ones added, up to MOST_NAMES.
     """
     length = len(blobs[0])
     if length < _HEAD or kind not in _FORMS:
@@ -127,7 +126,7 @@ def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> 
 
 
 def _layout(kind: str, blob: bytes) -> Layout:
-    """Return the layout of a message; an error says that it has none."""
+    """Return the layout of a message, or raise struct.error."""
     texts, between, numbers, count = _FORMS[kind]
     read = _Reader(blob)
     items = []
@@ -154,7 +153,7 @@ def _layout(kind: str, blob: bytes) -> Layout:
 
 
 class _Reader:
-    """Reads the names of a message from the place `at` on, and notes where they are `named`."""
+    """Reader of the names in a message from offset `at`; `named` are their slices."""
 
     def __init__(self, blob: bytes) -> None:
         self._blob, self._order = blob, '<' if blob[:2] == LITTLE_ENDIAN else '>'
@@ -175,7 +174,7 @@ class _Reader:
         return int(struct.unpack_from(f'{self._order}I', self._blob, begin)[0])
 
     def string(self) -> str:
-        """Return a text, which ends with a zero."""
+        """Return a zero-terminated text."""
         length = self.integer()
         begin, self.at = self.at, self.at + length
         self.named[-1] = slice(begin - 4, self.at)
@@ -189,10 +188,10 @@ def head(blob: bytes) -> tuple[int, str]:
 
 
 def trajectory_size(blob: bytes, most_names: int) -> tuple[int, int]:
-    """Return how many joints and points a serialised JointTrajectory has.
+    """Return the number of joints and points of a serialised JointTrajectory.
 
-    Zero points where names are too many to be passed over on the way to these, or cannot be read:
-    such a message cannot be decoded either.
+    Zero points if there are more than `most_names` names or they cannot be read: such a message
+    cannot be decoded either.
     """
     names = points = 0
     with suppress(struct.error, UnicodeDecodeError):
@@ -208,7 +207,7 @@ def trajectory_size(blob: bytes, most_names: int) -> tuple[int, int]:
 
 
 def _aligned(at: int, size: int) -> int:
-    """Return the next place that is a multiple of a size after the encapsulation."""
+    """Return the next offset aligned to a size after the encapsulation."""
     return at + (_HEAD - at) % size
 
 

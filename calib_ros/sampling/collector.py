@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From recent joint samples and measurements to samples for the identification.
+"""Recent joint samples and measurements, matched to samples for the identification.
 
-Messages wait in bounded buffers until everything about their time has come: `lateness` after the
-newest joint sample. Then a stop of the arm becomes one sample of each stream (mode `dwell`), or
-every measurement becomes one (mode `continuous`), or nothing does unless it is asked for (mode
-`triggered`). All decisions are taken by header stamps, so a replay takes the same samples as the
-live robot, and whatever is not used is counted by its cause.
+Messages wait in bounded buffers until everything of their time has arrived: `lateness` after the
+newest joint sample. Then a stop of the arm becomes one sample of each stream (mode `dwell`), every
+measurement becomes one (`continuous`), or only requested ones do (`triggered`). All decisions use
+header stamps, so a replay takes the same samples as the live robot. Unused messages are counted by
+cause.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 
 REST_S = 0.5 * Settings.shortest_stop
-"""Time [s] during which joints must have stayed where they are to be standing."""
+"""Time [s] without motion after which joints stand."""
 TWICE = 'same stamp twice'
 CONTRARY = 'different values with the same stamp (two publishers, or stamps too coarse?)'
 ADVANCE_NS = round(5e9 * REST_S)
-"""Time of the newest joint sample between two rounds of taking samples."""
+"""Time between two rounds of sampling, by joint stamps."""
 
 
 class Collector:
     """Bounded buffers of joint samples and measurements, and the samples made from them.
 
-    Joints that are `revolute` (n,) have angles for values.
+    `revolute` (n,) joints have angles as values.
     """
 
     def __init__(self, revolute: Sequence[bool], settings: Settings) -> None:
@@ -58,26 +58,26 @@ class Collector:
         self._known = Known(self._revolute, settings.pose_buffer)
         self._lateness_ns = round(settings.lateness * 1e9)
         self._newest_ns = 0  # the last joint sample
-        self._advanced_ns = 0  # that at the last round
-        self._settled_ns = 0  # measurements before have been dealt with
-        self._sampled_ns = 0  # a stop that stands at this moment has been sampled
+        self._advanced_ns = 0  # the same at the last round
+        self._settled_ns = 0  # measurements before this are settled
+        self._sampled_ns = 0  # a stop at this moment has been sampled
         self.rests = Rests(settings.pose_buffer)
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
-        """The delay of measurement stamps after joint stamps."""
+        """Delay of measurement stamps after joint stamps."""
         self.holding = False
-        """True while the delay is being looked for, so that nothing may be taken."""
+        """True while the delay is estimated and nothing is sampled."""
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
         self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
         self.unused: Counter[str] = Counter()
-        """What no sample is made of in the ordinary course of things, by cause."""
+        """Measurements normally not used, by cause."""
         self.notes: Counter[str] = Counter()
 
     def known(self, now_ns: int | None) -> tuple[Series, list[Series]]:
         """Return stamps and joint values, and stamps and rows (N, ROW_WIDTH) of waiting positions.
 
-        Only those older by `lateness` than the stamp `now_ns`, of which all has come; None: all.
+        Only complete ones, older than the stamp `now_ns` by `lateness`; None: all.
         """
         self._sort()
         until = np.iinfo(np.int64).max if now_ns is None else now_ns - self._lateness_ns
@@ -91,13 +91,13 @@ class Collector:
         return (stamps[complete], joints[complete]), positions
 
     def reach(self, given: Slice, calm: tuple[int, int]) -> int:
-        """Return how many of the first messages come up to one that gives something to do.
+        """Return how many messages to take up to the next that requires work.
 
-        Rounds that would come before it are made up for with the last one, as far as no message
-        can tell: none comes late for them, and there is room. That one is the first of those
-        beyond two stamps of joints between which nobody else has anything to do.
+        Rounds due before it are made up for with the last one if no message can tell the
+        difference: none is late for them, and there is room. It is the first joint sample beyond
+        the two stamps `calm`, between which nobody else has work.
         """
-        if self.track.full:  # the older half is let go: nothing may be held any longer
+        if self.track.full:  # sample before the older half is dropped
             self._round(self._complete_ns)
         if self.track.full:
             self.notes['joint states dropped, the joint buffer was full'] += self.track.halve()
@@ -105,7 +105,7 @@ class Collector:
         joints = given.where(JOINTS)
         stamps = given.times[joints]
         late = joints[stamps < self.track.horizon_ns]
-        if len(late):  # one by one
+        if len(late):  # handled one by one
             count = max(int(late[0]), 1)
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
             room = self.track.room(columns)
@@ -121,7 +121,7 @@ class Collector:
         return int(rounds[-1]) + 1
 
     def _rounds(self, stamps: Stamps, calm: tuple[int, int]) -> list[int]:
-        """Return at which joint samples a round is due, up to the first one that is not calm."""
+        """Return the joint samples at which a round is due, up to the first that is not calm."""
         found, last = [], self._advanced_ns
         first, end = (0, 0) if self.holding else calm
         for k, stamp in enumerate(stamps.tolist()):
@@ -133,10 +133,10 @@ class Collector:
         return found
 
     def _alike(self, given: Slice, begin: int, end: int) -> int:
-        """Return up to where, from a message on, all can be taken before or after a round."""
+        """Return the end of the messages that give the same before or after a round."""
         times, joints = given.times[:end], given.joints[:end]
         newest = np.maximum.accumulate(np.where(joints, times, self._newest_ns))
-        delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # that of the slice is off
+        delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # beyond that of the slice
         late = times - np.where(joints, 0, delay_ns) <= newest - self._late_ns
         end = begin + int(np.argmax(np.append(late[begin:], True)))
         room = self.waiting.room(given)
@@ -166,23 +166,23 @@ class Collector:
         return rounds
 
     def round(self, rounds: Sequence[int]) -> None:
-        """Make samples of what is complete, for rounds at some stamps of the joints."""
+        """Make samples of what is complete, for rounds at joint stamps."""
         self._advanced_ns = rounds[-1]
         if not self.holding:
             self._round(self._complete_ns, rounds)
 
     def hints(self, measurements: int) -> list[Hint]:
-        """Return what looks wrong with the joint states, of so many measurements."""
+        """Return what looks wrong with the joint states, given the number of measurements."""
         needed = self.rests.needed(self.settings.still)
         between = self.dropped[f'measurements: {APART}']
         found = [] if needed is None else [restless(needed, self.settings.still)]
         return found + sparse(between, measurements, self.settings.max_gap)
 
     def astray(self, measurements: int) -> list[Hint]:
-        """Tell of a stream whose clock is further from that of the joints than can be looked for.
+        """Report a stream whose clock differs from the joints' by more than can be estimated.
 
-        Its measurements wait for joint states, or those since the last match have found none; or
-        most of so many measurements have not.
+        Its measurements wait for joint states, or found none since the last match, or most of all
+        measurements did not.
         """
         causes = (TOO_LATE, *(f'measurements: {cause}' for cause in CAUSES[1:3]))
         most = max(measurements // 2, NO_ACCIDENT) < sum(self.dropped[each] for each in causes)
@@ -196,13 +196,13 @@ class Collector:
         return [apart(max(found, key=abs))] if found else []
 
     def flush(self) -> None:
-        """Make samples of everything that has come on both sides, as if nothing came late."""
+        """Make samples of everything that has arrived, as if nothing were late."""
         newest = [int(rows.stamps.max()) for rows in self.waiting.values() if rows.count]
         if newest:
             self._round(min(self.track.newest_ns, min(newest) - self.delay_ns), ends_here=True)
 
     def finish(self) -> None:
-        """Deal with everything; nothing more will come."""
+        """Process everything; nothing more will arrive."""
         self._round(self.track.newest_ns, ends_here=True)
         for rows in self.waiting.values():
             if rows.count:
@@ -210,7 +210,7 @@ class Collector:
                 rows.release(rows.count)
 
     def state(self) -> str:
-        """Return in words the state of the arm, as far as samples are concerned."""
+        """Return the state of the arm as far as sampling is concerned."""
         self._sort()
         newest = self.track.newest_ns
         if not newest or self.track.missing:
@@ -227,9 +227,9 @@ class Collector:
         return f'the arm stands for {1e-9 * (newest - int(stands[-1, 0])):.1f} s'
 
     def capture(self, place: str = '') -> tuple[int, str]:
-        """Take one sample of each stream now; return how many, and why not more in words.
+        """Take one sample of each stream now; return their number, or why there is none.
 
-        With a place the target sits in a socket there, and nothing needs to be measured.
+        With a place the target is in a socket there, and no measurement is needed.
         """
         if self.settings.mode == 'continuous':
             return 0, 'every measurement is taken in mode continuous'
@@ -254,7 +254,7 @@ class Collector:
             came = self.track.approach(stamps[:1], joints[:1])[0]
             self.maker.in_socket(place, int(stamps[-1]), joints, came)
             return 1, ''
-        self._round(begin)  # a stop before is not waited for any longer
+        self._round(begin)  # end earlier stops
         before, dropped = len(self.maker.fresh), self.dropped.copy()
         plan = Plan(self._settled_ns, self._sampled_ns)
         plan.sample(begin, newest)
@@ -267,18 +267,18 @@ class Collector:
 
     @property
     def _late_ns(self) -> int:
-        """Return by how much older measurements than the joints are complete [ns]."""
+        """Return the age relative to joints at which measurements are complete [ns]."""
         return max(self._lateness_ns + max(self.delay_ns, 0), round(REST_S * 1e9))
 
     @property
     def _complete_ns(self) -> int:
-        """Return the stamp of the joints up to which all has come, and stops can be told."""
+        """Return the joint stamp up to which everything has arrived and stops are certain."""
         return self.track.newest_ns - self._late_ns
 
     def _round(self, until: int, rounds: Sequence[int] = (), ends_here: bool = False) -> None:
-        """Make samples of everything up to a stamp of the joints, as of some `rounds`.
+        """Make samples of everything up to a joint stamp, as in several `rounds`.
 
-        With `ends_here` a stop that goes on is taken to end.
+        With `ends_here` an ongoing stop ends.
         """
         self._sort()
         if until <= self._settled_ns:
@@ -300,13 +300,13 @@ class Collector:
         for kind, rows, numbered in kept:
             before = rows.contrary
             twice = rows.sort()
-            contrary = 0 if numbered else rows.contrary - before  # no two images have one number
+            contrary = 0 if numbered else rows.contrary - before  # image numbers always differ
             for cause, count in ((TWICE, twice - contrary), (CONTRARY, contrary)):
                 if count:
                     self.dropped[f'{kind}: {cause}'] += count
 
     def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
-        """Plan a sample of each stop that ends before a stamp, and note which pass unseen."""
+        """Plan a sample of each stop that ends before a stamp, and note unseen ones."""
         settings = self.settings
         stands = self.track.standing(settings.still, REST_S)
         shortest = round(settings.shortest_stop * 1e9)
@@ -322,7 +322,6 @@ class Collector:
                     plan.why[k] = SAMPLED
 
     def _carry_out(self, plan: Plan) -> None:
-        """Make a sample of each stream at the stops of a plan, and count what is not used."""
         self.rests.sampled += len(plan.stops)
         moving = self.settings.mode == 'continuous'
         settle = 0 if moving else round(self.settings.settle * 1e9)
@@ -362,7 +361,7 @@ class Collector:
         self.maker.add(found)
 
     def forget(self, sample: Sample) -> None:
-        """Allow a sample of the same stamp again."""
+        """Allow another sample with the stamp of this one."""
         self.maker.forget(sample)
         self._known.forget(sample.stamp_ns - round(1e9 * sample.delay))
 
@@ -373,7 +372,7 @@ class Collector:
                 self.dropped[f'measurements: {text}'] += count
 
     def start_anew(self) -> None:
-        """Go on after the clock jumped back: finish what came before, keep the samples."""
+        """Continue after the clock jumped back: finish earlier messages, keep the samples."""
         self.finish()
         self.notes['the clock jumped back'] += 1
         settings = self.settings

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The delay of a measuring device's stamps, from the motion itself.
+"""Estimation of the delay of a device's stamps from the motion itself.
 
-The speed of the target by the joints and the chain, and the speed by the measurements, are the
-same signal twice. Angular speed depends on no frame; linear speed is that of the flange, near
-enough to that of the target for a start. The lag of the greatest correlation is refined by a
-parabola; in motion the identification then fits the rest as a parameter (`base.delay`).
+The speed of the target by joints and chain and the speed by the measurements are the same signal.
+Angular speed depends on no frame; linear speed is that of the flange, close enough to the target's
+for a start. The lag of highest correlation is refined by a parabola; in motion the identification
+then fits the rest as a parameter (`base.delay`).
 """
 
 from __future__ import annotations
@@ -29,26 +29,26 @@ from calib_ros.shown import NAMED
 from calib_ros.values import MOST_NAMES
 
 SMOOTHING = 0.5 * Settings.max_gap
-"""Time over which speeds are taken [s]; short against a move, long against the noise."""
+"""Time over which speeds are computed [s]; short compared with moves, long with the noise."""
 STEP = SMOOTHING / 10.0
-"""Time between two values of the speeds [s]."""
+"""Sampling time of the speeds [s]."""
 LEAST_MOTION = 3.0 * Settings.lateness
-"""Time in motion that is needed [s]: so that most of it is compared at every delay."""
+"""Motion needed [s], so that most of it is compared at every delay."""
 ALIKE_ENOUGH = float(np.sqrt(1.0 - MOST_OUTLIERS))
-"""Least correlation: no more of the speeds' variance may be something else than of samples."""
+"""Least correlation: the share of unexplained variance is that of outliers."""
 RISE = EXCEPTION * (1.0 - ALIKE_ENOUGH)
-"""Least rise of the correlation beyond a valley for another peak: a tenth of what it may lack."""
+"""Least rise of a correlation peak above a valley: a tenth of what it may lack."""
 MOST_TIME = 100.0 * LEAST_MOTION
-"""Time [s] that is looked at, the latest: it must not grow with a gap in the stamps."""
+"""Longest motion evaluated [s], the latest: it must not grow with gaps in the stamps."""
 
 
 @dataclass(frozen=True)
 class Delay:
-    """The delay of measurement stamps after joint stamps, and its certainty."""
+    """Delay of measurement stamps after joint stamps, and its certainty."""
 
     seconds: float
     correlation: float
-    rivals: tuple[float, ...] = ()  # [s] explain a motion that repeats itself nearly as well
+    rivals: tuple[float, ...] = ()  # [s] explain repetitive motion nearly as well
 
 
 def find_delay(
@@ -60,12 +60,11 @@ def find_delay(
     rotations: FloatArray | None,
     max_gap: float = Settings.lateness,
 ) -> Delay | None:
-    """Return the delay of measurements (N) against joint samples (M); None where none shows.
-
-    It is looked for up to the lateness that measurements may have.
+    """Return the delay of measurements (N) to joint samples (M), up to the lateness; None if
+    unclear.
 
     Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3). Between joint
-    samples further apart than `max_gap` [s] nothing is known of their motion.
+    samples further apart than `max_gap` [s] their motion is unknown.
     """
     if len(joint_stamps) < TELLING or len(stamps) < TELLING:
         return None
@@ -78,8 +77,8 @@ def find_delay(
     begin = max(begin, end - MOST_TIME)
     grid = np.arange(begin, end, STEP)
     coarse = np.interp(grid, joint_times, np.arange(len(joint_times)))
-    heard = np.diff(joint_times, append=np.inf)[coarse.astype(int)] <= max_gap
-    if heard.sum() * STEP < LEAST_MOTION:
+    known_motion = np.diff(joint_times, append=np.inf)[coarse.astype(int)] <= max_gap
+    if known_motion.sum() * STEP < LEAST_MOTION:
         return None
     nearest = np.unique(np.round(coarse).astype(int))
     if len(nearest) < TELLING:  # a gap
@@ -88,7 +87,7 @@ def find_delay(
     turns = None if rotations is None else poses[:, :3, :3]
     first = _speed(joint_times[nearest], poses[:, :3, 3], turns)
     by_joints = np.interp(grid, *first)
-    moving = heard & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
+    moving = known_motion & (by_joints > EXCEPTION * np.percentile(by_joints, 95))
     if moving.sum() * STEP < LEAST_MOTION:
         return None
     second = _speed(times, positions, rotations)
@@ -111,7 +110,7 @@ def find_delay(
 
 
 def _rivals(score: FloatArray, best: int) -> Index:
-    """Return at which other peaks of the correlation as much of the speeds is left."""
+    """Return the other correlation peaks that leave about as much of the speeds unexplained."""
     found = peaks(score, RISE)
     others = found[found != best]
     left, least = (np.sqrt(1.0 - np.maximum(score[k], 0.0) ** 2) for k in (others, best))
@@ -119,7 +118,7 @@ def _rivals(score: FloatArray, best: int) -> Index:
 
 
 def peaks(score: FloatArray, rise: float) -> Index:
-    """Return where correlations (N,) rise by so much above the valleys towards higher ones.
+    """Return peaks of correlations (N,) that rise this much above the valleys to higher ones.
 
     As scipy.signal.find_peaks, which takes 0.4 s and 35 MB to load.
     """
@@ -139,9 +138,9 @@ def peaks(score: FloatArray, rise: float) -> Index:
 def _speed(
     times: FloatArray, positions: FloatArray, rotations: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times and speeds, angular ones where rotations (N, 3, 3) are known.
+    """Return times and speeds, angular if rotations (N, 3, 3) are given.
 
-    They are taken over SMOOTHING, or from one measurement to the next.
+    Over SMOOTHING, or between successive measurements.
     """
     behind = np.searchsorted(times, times + SMOOTHING)
     behind = np.minimum(np.maximum(behind, np.arange(len(times)) + 1), len(times) - 1)
@@ -157,9 +156,9 @@ def _speed(
 
 
 def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int]) -> FloatArray:
-    """Return the correlations of a signal (N,) with the parts (N,) of a longer one.
+    """Return the correlations of a signal (N,) with the windows (N,) of a longer one.
 
-    Of the latter only what lies between two numbers is known; -1 stands where that is too little.
+    The latter is known between two indices; -1 if the overlap is too short.
     """
     lags = np.arange(len(second) - len(first) + 1)
     begin, end = (np.clip(each - lags, 0, len(first)) for each in known)
@@ -183,21 +182,20 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
 
 
 WATCH_NS = round(5e9 * LEAST_MOTION)
-"""Time over which a watch looks."""
+"""Time between two evaluations of the motion."""
 DENSE_NS = round(0.8e9 * STEP)
-"""Time in which it keeps one sample; more tell no more of speeds."""
+"""Interval in which one sample is kept; more add nothing to speeds."""
 EARLY = SMOOTHING / 2.0**0.5
-"""Time [s] by which measurements of a stop may be stamped too early: the accuracy of one delay. Of
-what then shows the arm leaving, most is left out as spikes; the rest moves the mean by less than
-the noise of a measurement."""
+"""How early [s] measurements of a stop may be stamped: the accuracy of one delay. Most that
+shows the arm leaving is rejected as spikes; the rest moves the mean by less than the noise."""
 
 
 class Clocks:
-    """Looks for the delay of the measurements: to use it in motion, and to warn of it at stops.
+    """Estimation of the measurement delay: used in motion, reported at stops.
 
-    Joint values and poses are watched while the arm moves. Once the clocks are seen to agree that
-    ends until measurements at stops show unrest: where a clock was moved they do, and are left out
-    or refused. In mode continuous, which has no stops, it goes on.
+    Joint values and poses are watched while the arm moves. Once the clocks agree this pauses until
+    measurements at stops show unrest, as they do if a clock was moved. In mode continuous, without
+    stops, it goes on.
     """
 
     def __init__(self, chain: Chain, settings: Settings) -> None:
@@ -211,13 +209,13 @@ class Clocks:
         self._unrest = self._taken = self._agreed = 0
         self._awake = True
         self._seen: Delay | None = None
-        self._unclear: Delay | None = None  # one with rivals, while no other was seen
+        self._unclear: Delay | None = None  # with rivals, before a clear one
         self._moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
-        """By how much [s] it changed, and after how many samples at least."""
+        """Changes of the delay [s], and the least number of samples before."""
 
     @property
     def delay(self) -> Delay | None:
-        """Return how late the measurements are stamped, as far as the motion shows."""
+        """Return the delay of the measurement stamps, if the motion shows it."""
         if not self._continuous:
             return self._seen
         return None if self._found is None or self._found.rivals else self._found
@@ -225,7 +223,7 @@ class Clocks:
     def wake(self, unrest: int, calm: int, taken: int) -> None:
         """Watch again if more measurements at stops were not at rest.
 
-        Before the first of these there were `calm` samples; so many are `taken` by now.
+        There were `calm` samples before the first of these, and `taken` by now.
         """
         if unrest > self._unrest and not self._awake:
             self._awake, self._agreed = True, calm
@@ -251,7 +249,7 @@ class Clocks:
         return int(self._joints.stamps[0]) if self._joints.count else None
 
     def calm(self, given: Slice) -> tuple[int, int]:
-        """Return stamps of joints between which there is nothing to look for."""
+        """Return joint stamps between which nothing needs to be evaluated."""
         begun = self._begun_ns
         if begun is None:
             begun = int(given.times[given.where(JOINTS)[:1]].sum())
@@ -272,8 +270,9 @@ class Clocks:
             return
         known = self._seen
         every = (found.seconds, *found.rivals)
-        # Speeds over SMOOTHING tell no finer difference.
-        if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
+        if (
+            known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING
+        ):  # the resolution of speeds
             if found.rivals:
                 self._unclear = found if known is None else None
                 return
@@ -284,9 +283,9 @@ class Clocks:
         self._awake = self._continuous
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
-        """Look for the delay after some time of motion, until it shows, for a collector to use.
+        """Estimate the delay for a collector, at intervals until it is clear.
 
-        Nothing is sampled before; at the end (None) what has come must do. One that has rivals is
+        Nothing is sampled before; at the end (None) the data so far must do. Ambiguous delays are
         not used.
         """
         if not collector.holding:
@@ -300,9 +299,9 @@ class Clocks:
         collector.holding = self.delay is None and now_ns is not None
 
     def _delay_of(self, joints: Series, streams: Sequence[Series]) -> Delay | None:
-        """Return how late poses are, by the stream that shows it best.
+        """Return the delay of poses, by the stream that shows it best.
 
-        Rows (N, 7 or more) of each stream have NaN where no rotation is known.
+        Rows (N, 7 or more) of each stream have NaN if the rotation is unknown.
         """
         found = []
         for stamps, rows in streams:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Admission by the names in messages (joints, frames, targets), and the samples kept."""
+"""Admission of messages by their names (joints, frames, targets), and the samples kept."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ OTHERS = 'none of the joints in the message'
 
 
 class JointNames:
-    """Finds the joints of a chain in messages that may name others, and only part of them.
+    """Finds the joints of a chain in messages that may name others, or only some of them.
 
-    `names` are those that messages have for the joints of the chain, in its order.
+    `names` are the chain's joints as messages name them.
     """
 
     def __init__(self, names: Sequence[str]) -> None:
         self._names = names
         self._layouts: dict[tuple[str, ...], Layout] = {}
         self.foreign: tuple[str, ...] = ()
-        """Names received while some of the chain's joints are never named."""
+        """Names received if some of the chain's joints are never named."""
 
     def layout(self, key: tuple[str, ...]) -> Layout:
-        """Return which joints of the chain messages name, and the columns of their values."""
+        """Return the joints of the chain in messages, and the columns of their values."""
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
@@ -47,7 +47,7 @@ class JointNames:
         return self._layouts[key]
 
     def foreign_ones(self, missing: Sequence[int]) -> str:
-        """Return in words that other joints come than those of some numbers; empty if none do."""
+        """Return a hint that other joints arrive than the missing ones; empty if none do."""
         if not (missing and self.foreign):
             return ''
         return (
@@ -57,21 +57,21 @@ class JointNames:
 
 
 class FrameNames:
-    """The frames in which each device has measured; there should be one of each."""
+    """Frames in which each device has measured; each should have one."""
 
     def __init__(self) -> None:
         self._known: dict[str, Counter[str]] = {}
         self.usual: dict[str, str] = {}
-        """The usual frames by device, where more than a few measurements have come."""
+        """The usual frames of devices with more than a few measurements."""
 
     def fault(self, device: str, frame_id: str, wanted: str, count: int) -> str:
-        """Note the frame of some measurements; return why it is none to use, empty if it is.
+        """Note the frame of some measurements; return why it cannot be used, or empty text.
 
-        Only the one `wanted` is, or the usual.
+        Only the frame `wanted` can, or else the usual one.
         """
         if wanted and frame_id != wanted:
             return f'in frame "{frame_id}", not in frame_id "{wanted}"'
-        if not frame_id.isprintable():  # it shall be a cell of a table
+        if not frame_id.isprintable():  # it is written to tables
             return 'in a frame whose name cannot be printed'
         if not self.note(device, frame_id, count):
             return f'in one of more than {MOST_NAMES} frames'
@@ -79,7 +79,7 @@ class FrameNames:
         return '' if frame_id == (wanted or usual) else strange(frame_id, usual)
 
     def note(self, device: str, frame_id: str, count: int) -> bool:
-        """Note the frame of measurements; return False where it is one too many."""
+        """Note the frame of measurements; return False beyond MOST_NAMES frames."""
         known = self._known.setdefault(device, Counter())
         if frame_id not in known and len(known) == MOST_NAMES:
             return False
@@ -89,7 +89,7 @@ class FrameNames:
         return True
 
     def main(self, device: str) -> str | None:
-        """Return the usual frame of a device, or the most frequent one while few have come."""
+        """Return the usual frame of a device, or the most frequent one so far."""
         known = self._known.get(device)
         return self.usual.get(device) or (max(known, key=known.__getitem__) if known else None)
 
@@ -100,10 +100,7 @@ class FrameNames:
 
     @property
     def different(self) -> tuple[str, ...]:
-        """Return the different frames in which one device measured; empty when none did.
-
-        A few measurements in others do not count.
-        """
+        """Return the different frames of one device, but for a few measurements; empty if none."""
         for known in self._known.values():
             if known.total() - max(known.values()) > EXCEPTION * known.total():
                 return tuple(sorted(known))
@@ -111,12 +108,12 @@ class FrameNames:
 
 
 def strange(frame_id: str, usual: str) -> str:
-    """Return in words that a measurement is not in the frame in which others are."""
+    """Return that a measurement is not in the usual frame."""
     return f'in frame "{frame_id}", not in "{usual}" like the others'
 
 
 class Part(NamedTuple):
-    """What messages of one stream say, and their places (N,) among others; source None: joints."""
+    """Readings of one stream and their places (N,) in a batch; source None for joints."""
 
     places: Index
     source: Source | None
@@ -124,7 +121,7 @@ class Part(NamedTuple):
 
 
 class Entry:
-    """Admit usable messages and count the others by cause."""
+    """Admission of usable messages; others are counted by cause."""
 
     def __init__(self, names: JointNames, frames: FrameNames, joint_count: int) -> None:
         self._names, self._frames, self._joint_count = names, frames, joint_count
@@ -132,17 +129,17 @@ class Entry:
         self.dropped: Counter[str] = Counter()
         self.unused: Counter[str] = Counter()
         self.refused: dict[str, str] = {}
-        """Why the last messages of a kind cannot be used; without kinds that can."""
+        """Why the last messages of a kind cannot be used."""
         self.latest: tuple[int, Sequence[float]] | None = None
 
     def pieces(self, parts: Sequence[Part], recording: bool, wanted: str) -> list[Piece]:
-        """Return what is to be kept; measurements in a frame `wanted`, if any is."""
+        """Return the messages to keep, measurements only in the frame `wanted` if given."""
         joints = [each for each in parts if each.source is None]
         measured = [each for each in parts if each.source is not None]
         return [*self._joints(joints, recording), *self._measured(measured, recording, wanted)]
 
     def miss(self, kind: str, count: int, cause: str) -> None:
-        """Count messages that came and cannot be used."""
+        """Count received messages that cannot be used."""
         self.received[kind] += count
         self.dropped[f'{kind}: {cause}'] += count
         if cause != OTHERS:
@@ -191,7 +188,7 @@ class Entry:
                 self.dropped[f'{POSES}: {fault}'] += count
             else:
                 width = readings.numbers.shape[1]
-                if width > 7:  # a covariance of zeros stands for none
+                if width > 7:  # a covariance of zeros means none
                     none = ~readings.numbers[:, 7:].any(axis=1)
                     readings.numbers[none, 7:] = np.nan
                 key = StreamKey(
@@ -206,7 +203,7 @@ class Entry:
                 yield Piece(key, places, readings.stamps_ns, readings.numbers)
 
     def _by_frame(self, parts: Sequence[Part]) -> list[Part]:
-        """Return measurements one by one while the usual one of several frames is undecided."""
+        """Return measurements one by one until the usual one of several frames is decided."""
         frames: dict[str, set[str]] = {}
         for each in parts:
             assert each.source is not None
@@ -222,9 +219,9 @@ class Entry:
 
 
 class Kept:
-    """Samples in the order in which they were taken; in the frame `wanted`, if any is.
+    """Samples in order, only in the frame `wanted` if given.
 
-    `removed` is called with one that is taken back.
+    `removed` is called with each sample that is taken back.
     """
 
     def __init__(
@@ -241,8 +238,8 @@ class Kept:
     def usable(self) -> list[Sample]:
         """Return the samples in the frame of their device, `frame_id` or the usual one.
 
-        Those of targets that were measured once are left out where others were more often: they
-        tell nothing about the arm, and hundreds of them would take minutes.
+        Targets measured once are left out if others were measured more often: they do not
+        constrain the arm, and hundreds of them would take minutes.
         """
         found = self.samples
         if self.wanted or self._frames.several:
@@ -254,12 +251,11 @@ class Kept:
         return [each for each in found if (each.device, each.target) not in once]
 
     def _frame_of(self, sample: Sample) -> str:
-        """Return in which frame a sample should be; some do not tell in which they are."""
         should = self.wanted or self._frames.main(sample.device)
         return (sample.frame_id and should) or sample.frame_id
 
     def leave_out_strange(self) -> None:
-        """Take back samples in strange frames, the first ones say, if there are only a few."""
+        """Take back samples in strange frames, if there are only a few."""
         for sample in tuple(self.samples):
             if self.is_strange(sample):
                 self.samples.remove(sample)
@@ -277,7 +273,7 @@ class Kept:
 
     @property
     def different(self) -> str:
-        """Return in words that one device measured in different frames, if it matters."""
+        """Return that one device measured in different frames, if it matters."""
         if self.wanted or not self._frames.different:
             return ''
         return f'poses came in different frames ({", ".join(self._frames.different)})'

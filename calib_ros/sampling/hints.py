@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The account of the messages, what looks wrong, and the progress of sampling, in words."""
+"""Text of the message account, hints, and the progress of sampling."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TWICE = re.compile(r'same stamp twice|already exists')
 
 @dataclass(frozen=True)
 class Account:
-    """Account of the messages: how many arrived, how many samples, what was dropped and why."""
+    """Counts of messages received, samples made, and what was dropped, by cause."""
 
     joint_states: int
     poses: int
@@ -41,7 +41,6 @@ class Account:
     foreign_names: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the account in words."""
         text = f'{self.joint_states} joint states and {self.poses} measurements gave '
         text += f'{self.samples} poses'
         if self.held_out:
@@ -74,9 +73,9 @@ class Hint(NamedTuple):
 
 
 def restless(needed: float, still: float) -> Hint:
-    """Tell that joints stand, but hardly ever within `still`; how much is `needed` [rad or m].
+    """Report joints at rest that hardly ever stay within `still`; `needed` is in rad or m.
 
-    No encoder is as noisy as different configurations are apart: then there are two arms.
+    Beyond the distance of configurations this is no encoder noise: two arms publish.
     """
     if needed > SCATTER:
         return Hint(
@@ -93,7 +92,7 @@ def restless(needed: float, still: float) -> Hint:
 
 
 def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
-    """Tell that so many of the measurements lie `between` joint states too far apart, if many."""
+    """Report measurements `between` joint states too far apart, if many."""
     if between < NO_ACCIDENT or between <= EXCEPTION * measurements:
         return []
     rate = f'{2.0 / max_gap:g} Hz or more'
@@ -105,10 +104,7 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
 
 
 def apart(ahead: float) -> Hint:
-    """Tell that clocks disagree by more than can be looked for.
-
-    The last measurement is stamped `ahead` of the last joint state [s].
-    """
+    """Report clocks too far apart: the last measurement is `ahead` of the joint states [s]."""
     words = (
         f'the newest measurement is stamped {abs(ahead):.0f} s '
         f'{"after" if ahead > 0.0 else "before"} the newest joint state: synchronise the clocks '
@@ -118,7 +114,7 @@ def apart(ahead: float) -> Hint:
 
 
 def unsettled(refused: int, stops: int) -> list[Hint]:
-    """Report that many stops are refused because the target moves at them."""
+    """Report that many stops are refused because the target still moves."""
     if refused < START or refused <= EXCEPTION * stops:
         return []
     words = (
@@ -130,10 +126,10 @@ def unsettled(refused: int, stops: int) -> list[Hint]:
 
 
 def lost(kind: str, came: int, dropped: Mapping[str, int]) -> tuple[float, str]:
-    """Return which share of the messages of a kind was lost, and the main cause in words.
+    """Return the share of messages of a kind that was lost, and the main cause.
 
-    Lost is what was dropped for its stamp or for want of room; what the device did not see is not,
-    nor what came twice.
+    Lost messages were dropped for their stamp or a full buffer; not those that the device did not
+    see, nor duplicates.
     """
     causes = {
         cause: count
@@ -145,7 +141,7 @@ def lost(kind: str, came: int, dropped: Mapping[str, int]) -> tuple[float, str]:
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:
-    """Tell that much of the messages received is lost, and the main cause."""
+    """Report a large share of lost messages, and the main cause."""
     found = []
     for kind in (JOINTS, POSES):
         came = received[kind]
@@ -157,7 +153,7 @@ def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint
 
 
 def disagreement(delay: float, known: float) -> Hint:
-    """Tell that the clocks disagree: the `delay` [s] that the motion shows is not the `known`."""
+    """Report that the `delay` [s] in the motion differs from the `known` one."""
     left = delay - known
     words = f'{left:.3f} s later' if left > 0.0 else f'{-left:.3f} s earlier'
     return Hint(
@@ -168,7 +164,7 @@ def disagreement(delay: float, known: float) -> Hint:
 
 
 def ambiguous(delays: Sequence[float]) -> Hint:
-    """Tell that several delays [s] explain a motion that repeats itself."""
+    """Report that several delays [s] explain a repetitive motion."""
     words = ' or '.join(f'{round(delay, 2) + 0.0:.2f}' for delay in sorted(delays))
     return Hint(
         f'delay not clear, {words} s: move less regularly',
@@ -178,7 +174,7 @@ def ambiguous(delays: Sequence[float]) -> Hint:
 
 
 def moved(steps: Collection[tuple[float, int]]) -> Hint:
-    """Tell by how much [s] the clocks moved against each other, and after how many samples."""
+    """Report shifts of the clocks [s], and after how many samples."""
     words = ', '.join(f'by {seconds:+.3f} s after about {count}' for seconds, count in steps)
     return Hint(
         f'clocks shifted after about {max(count for _, count in steps)} poses: synchronise them',
@@ -188,7 +184,7 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
 
 
 def frozen(samples: Sequence[Sample]) -> Hint | None:
-    """Tell that a device measures the same to the nanometre wherever the arm is, if it does."""
+    """Report a device that measures the same to the nanometre wherever the arm is, if it does."""
     places: dict[tuple[object, ...], list[FloatArray]] = {}
     for each in samples:
         if each.position is not None and not each.socket:
@@ -208,7 +204,7 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
 def progress(
     chain: Chain, fitted: Sequence[FloatArray], estimate: Estimate | None, settings: Settings
 ) -> list[str]:
-    """Return the number of samples to fit, their expected accuracy, and joints that hardly moved.
+    """Return number and expected accuracy of the samples to fit, and joints that hardly moved.
 
     `fitted` holds the joint values (n,) of each.
     """
@@ -220,7 +216,6 @@ def progress(
 
 
 def _forecast(estimate: Estimate, settings: Settings) -> str:
-    """Return in words what is still needed for the wanted accuracy."""
     wanted = settings.wanted_accuracy
     more = estimate.more_for(wanted)
     if not more:

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages into the session, by the batch: of live topics and of recordings.
+"""Messages into the session in batches, of live topics and of recordings.
 
-Serialised messages of one stream that are laid out alike are decoded at once; others are decoded
-each by itself, and those that name the same things are put together. Both ways end in the same
-arrays, with the place of each message in the batch.
+Serialised messages of one stream with the same layout are decoded at once; others one by one, and
+grouped by their names. Both give the same arrays, with the place of each message in the batch.
 """
 
 from __future__ import annotations
@@ -45,24 +44,24 @@ from calib_ros.sampling.transforms import STATIC, Linked, Links
 from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000
-"""Messages that are taken at once (benchmarks/bags.py, benchmarks/soak.py)."""
+"""Messages taken at once (benchmarks/bags.py, benchmarks/soak.py)."""
 OF_CAMERAS = (*PICTURES, CAMERA_INFO)
 Deserialise: TypeAlias = Callable[[Any, str], Any]
-"""Makes a message of its bytes and type."""
+"""Converts bytes and a type to a message."""
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
-"""Streams and what came on them, serialised or not, in the order in which it came."""
+"""Streams and their messages, serialised or not, in order of arrival."""
 Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
 """Place, stamp [ns] and numbers of one message."""
 Found: TypeAlias = 'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
-"""Of messages that name the same: places (N,), names, first and last stamp, what reads them."""
+"""Messages with the same names: places (N,), names, first and last stamp, reader."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """What comes on one topic: its message type, and what it measures; None for joint states.
+    """Messages of one topic: their type, and what they measure; None for joint states.
 
-    A topic of transforms between frames may measure several things, or hold what stands still; one
-    of CameraInfo belongs to the topic of the images.
+    A topic of transforms may measure several things, or hold static ones; a CameraInfo belongs to
+    the topic of the images.
     """
 
     topic: str
@@ -72,12 +71,12 @@ class Stream:
 
     @property
     def still(self) -> bool:
-        """Tell whether it holds links that stand still."""
+        """Tell whether it holds static links."""
         return self.links is not None and self.topic != self.links.topic
 
 
 def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream]:
-    """Return the streams of sources; message types (by topic) where they name none."""
+    """Return the streams of sources; `types` (by topic) apply where they name none."""
     streams = []
     linked: dict[tuple[str, str], list[Source]] = {}
     for source in sources:
@@ -96,14 +95,14 @@ def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream
 
 
 def links_of(streams: Iterable[Stream]) -> list[Links]:
-    """Return the links between frames that come on some streams."""
+    """Return the links between frames on some streams."""
     return list(dict.fromkeys(each.links for each in streams if each.links is not None))
 
 
 def batches(
     messages: Iterator[tuple[Stream, bytes]],
 ) -> Iterator[tuple[list[tuple[Stream, bytes]], Exception | None]]:
-    """Yield messages by the batch, up to an error, which is with the last ones."""
+    """Yield batches of messages; the last one has the error that ended them, if any."""
     error, ended = None, False
     while not ended:
         batch: list[tuple[Stream, bytes]] = []
@@ -122,10 +121,9 @@ def batches(
 
 
 def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) -> list[str]:
-    """Let a session take messages in their order; return what went wrong with some, in words.
+    """Pass messages to a session in order; return problems as text.
 
-    How they are divided into batches makes no difference. Those that are not decoded at once are
-    deserialised.
+    Batching makes no difference. `deserialise` decodes messages without a known layout.
     """
     found = Intake(batch, deserialise, session.pictures)
     for kind, causes in found.faults.items():
@@ -139,10 +137,10 @@ def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) ->
 
 
 class Intake:
-    """What a batch of messages holds.
+    """The content of a batch of messages.
 
-    That is the `parts` that can be used, how many cannot, by kind and cause (`faults`), and what
-    cannot be decoded in words (`problems`).
+    Usable `parts`, counts of others by kind and cause (`faults`), and texts about messages that
+    cannot be decoded (`problems`).
     """
 
     def __init__(
@@ -174,7 +172,7 @@ class Intake:
                 self._add(each.source, TRANSFORM, each.places, each.readings)
 
     def _read(self, groups: Mapping[tuple[str, int], Sequence[int]]) -> Iterator[Found]:
-        """Yield what messages say: at once those of a topic and length that are laid out alike."""
+        """Yield readings: those of a topic and length with the same layout at once."""
         single: list[int] = []
         for (_, size), group in groups.items():
             stream, places = self._batch[group[0]][0], np.array(group)
@@ -218,7 +216,7 @@ class Intake:
         self._add(source, stream.type, np.array([place]), found)
 
     def _decode(self, places: Sequence[int]) -> Iterator[Found]:
-        """Yield what messages say that are decoded one after the other, alike ones together."""
+        """Yield the readings of messages decoded one by one, grouped by names."""
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
             stream, data = self._batch[place]

@@ -11,7 +11,7 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.slices import Rows, Stamps
 
 MOVED = STILL
-"""A joint has moved, in one sense or the other, when its value [rad or m] changed by more."""
+"""Change of a value [rad or m] that counts as a move."""
 
 
 def interpolated(
@@ -20,7 +20,7 @@ def interpolated(
     """Return values, velocities and accelerations (N, n) of the cubic through four samples.
 
     Two before and two after the stamp (Lagrange). At the ends of the recording and beside equal
-    stamps, where there are fewer, values are interpolated linearly; with `straight` everywhere.
+    stamps, or always if `straight`, values are interpolated linearly.
     """
     known, values = rows.stamps, rows.values
     nothing = np.zeros((len(stamps), values.shape[1]))
@@ -40,7 +40,7 @@ def interpolated(
     if not near.size:
         return joints, velocity, nothing
     times = (known[near] - stamps[inner]) * 1e-9  # (4, N)
-    # A cubic over a pause in the samples would follow nothing that was measured.
+    # no cubic over a pause in the samples
     even = np.diff(times, axis=0).max(axis=0) < 3.0 * np.diff(times, axis=0).min(axis=0)
     inner[inner] = even
     near, times = near[:, even], times[:, even]
@@ -54,7 +54,7 @@ def interpolated(
 
 
 def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the weights (4, N) of four heights for value, slope and bend at time zero."""
+    """Return the weights (4, N) of four values for value, slope and bend at time zero."""
     at, slope, bend = (np.empty_like(times) for _ in range(3))
     for k in range(4):
         a, b, c = (times[i] for i in range(4) if i != k)
@@ -66,13 +66,13 @@ def _lagrange(times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def unwrapped(steps: FloatArray, revolute: Flags) -> FloatArray:
-    """Return differences (M, n) of joint values; a driver may count angles in one turn."""
+    """Return differences (M, n) of joint values without full turns of revolute joints."""
     turn = np.round(steps / (2.0 * np.pi)) * (2.0 * np.pi)
     return np.asarray(steps - np.where(revolute, turn, 0.0))
 
 
 def continuous(values: FloatArray, revolute: Flags) -> FloatArray:
-    """Return joint values (M, n) in sequence without jumps of a turn."""
+    """Return successive joint values (M, n) without jumps of a turn."""
     steps = unwrapped(np.diff(values, axis=0), revolute)
     return np.asarray(values[:1] + np.cumsum(np.vstack([0.0 * values[:1], steps]), axis=0))
 
@@ -80,10 +80,10 @@ def continuous(values: FloatArray, revolute: Flags) -> FloatArray:
 def last_moves(
     values: FloatArray, first: Index, now: FloatArray, came: FloatArray, revolute: Flags
 ) -> FloatArray:
-    """Return the signs (N, n) of the last move of each joint before it stood as it does now.
+    """Return the signs (N, n) of the last move of each joint before its present value.
 
-    The last of the samples (M, n) up to index `first` (N,) from which a joint has moved tells;
-    where there is none, `came` (n,) holds the signs from before them.
+    Relative to the last of the samples (M, n) up to index `first` (N,) that differs; without one,
+    `came` (n,) holds earlier signs.
     """
     if len(values) == 0:
         return np.tile(came, (len(now), 1))
@@ -95,10 +95,11 @@ def last_moves(
 
 
 def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatArray) -> Index:
-    """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high.
+    """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high, or
+    -1.
 
-    It is -1 where there is none. By the extremes of blocks of 1, 2, 4, ... values: first over
-    ever larger blocks to the one that holds it, then into the half that does.
+    By the extremes of blocks of 1, 2, 4, ... values: over larger and larger blocks to the one that
+    holds it, then down into halves.
     """
     lows, highs = [values], [values]
     while len(lows[-1]) > 1:
@@ -107,7 +108,7 @@ def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatA
         highs.append(np.maximum(highs[-1][:even:2], highs[-1][1:even:2]))
     shape, low, high = low.shape, low.ravel(), high.ravel()
     column = np.tile(np.arange(shape[1]), shape[0])
-    end = np.repeat(last + 1, shape[1])  # what comes before is still to be searched
+    end = np.repeat(last + 1, shape[1])  # not yet searched before this
     found, sizes = np.full(len(end), -1), np.zeros(len(end), dtype=np.intp)
 
     def outside(level: int, block: Index, here: Index) -> Flags:

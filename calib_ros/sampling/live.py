@@ -2,19 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The estimate during sampling: what is known so far, and how many more samples are needed.
 
-At a chain that is near enough, every sample adds its share J^T W J and J^T W r to the information
-matrix and vector, so the estimate and its covariance follow each sample at the cost of that sample
-alone (an information filter; Maybeck 1979). The point of linearisation moves to the estimate when
-that has gone further than the linear model holds. Wide priors stand for what no sample has told
-yet; at the end they weigh nothing, and the estimate is that of the batch.
+An information filter (Maybeck 1979; docs/model.md, Samples and time): each sample adds J^T W J and
+J^T W r, so estimate and covariance follow each sample at the cost of that sample alone. The point
+of linearisation moves to the estimate when that leaves the range of the linear model. Wide priors
+stand for what no sample has determined yet.
 
-A sample that lies too far from where the others predict it is left out as suspicious. The first
-ones cannot be judged so, because the estimate bends to them. So it starts again, from the nominal
-chain and by the robust fit of the identification (`robust.py`), each time the number of samples
-has grown by a quarter: an early gross error is found, and what was left out wrongly comes back.
-
-A sample costs 0.02 s in the mean, all beginnings included; the robust fit alone, after each one,
-takes 0.2 s with 100 samples and 4 s with thirty targets.
+A sample far from the prediction of the others is left out as suspicious. The first ones cannot be
+judged so, because the estimate follows them. So each time the number of samples has grown by a
+quarter it restarts with the robust fit (`robust.py`): an early gross error is found, and samples
+wrongly left out return. A sample costs 0.02 s on average, restarts included; the robust fit alone,
+after each one, takes 0.2 s with 100 samples and 4 s with thirty targets.
 """
 
 from __future__ import annotations
@@ -51,17 +48,16 @@ from calib_ros.sampling.sample import Frames, Sample, collect
 from calib_ros.settings import EXCEPTION, Settings
 
 WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)
-"""Standard deviations [m, rad] of arm parameters before anything is measured: five times as much
-is another robot."""
+"""Prior standard deviations [m, rad] of arm parameters: five times as much is another robot."""
 START = IN_A_FRAME
-"""Configurations with which two frames are found: of three coordinates each, for two unknowns."""
+"""Configurations needed to find two frames: three coordinates each for two unknowns."""
 MOST_THOROUGH = 60
-"""Parameters up to which it begins with the thorough fit: it takes 4 s instead of 1 s for 200."""
+"""Largest number of parameters for the thorough fit, which takes 4 s instead of 1 s for 200."""
 GROWN = (1.0 - EXCEPTION) ** -2
-"""Growth of the number of samples from which all of them are judged anew: by it standard
-deviations shrink by EXCEPTION."""
+"""Growth of the number of samples at which all are judged again: it shrinks standard deviations by
+EXCEPTION."""
 MOST_AT_ONCE = 4 * SOME
-"""Samples that one update adds at most; the rest waits for the next ones."""
+"""Samples per update at most."""
 LITTLE = 0.35
 """Range [rad] of a joint over all samples that is too little: 20 degrees; a tenth of it [m].
 A convention."""
@@ -69,53 +65,53 @@ A convention."""
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the samples so far tell.
+    """The estimate from the samples so far.
 
-    `excess` is how many times larger the residuals of positions are than what measurements scatter
-    by: the sigma given, or the spread at a stop where that is larger. It is None while too few
-    samples show it; priors, and nothing measured, make up much of the sigma then.
+    `excess` is the ratio of position residuals to the scatter of measurements: the given sigma, or
+    the spread at a stop if larger. None with too few samples, whose sigma is mostly that of
+    priors.
     """
 
     chain: Chain
     names: tuple[str, ...]
     covariance: FloatArray  # (P, P)
     samples: int
-    sigma: float  # RMS standard deviation [m] of positions predicted over the joint range
-    noise: float  # that the residuals show, and sigma goes by [sigma given]
+    sigma: float  # RMS standard deviation [m] of positions over the joint range
+    noise: float  # of the residuals, used for sigma [sigma given]
     excess: float | None
 
     def more_for(self, wanted: float) -> int:
-        """Return how many more samples are expected to bring the sigma to a wanted one [m]."""
+        """Return how many more samples are expected for a wanted sigma [m]."""
         return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))
 
 
 class LiveEstimate:
-    """An information filter over the parameters of the problem that samples make."""
+    """Information filter over the parameters of a growing problem."""
 
     def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
         self._problem_of = problem_of
         self.restart()
 
     def restart(self) -> None:
-        """Begin again with the next update."""
+        """Start again with the next update."""
         self._frames = Frames()
         self._names: tuple[str, ...] = ()
         self._chain: Chain | None = None
         self._added: list[Sample] = []
-        self._begun = 0  # how many samples there were then
+        self._begun = 0  # samples at the start
         self._seen: list[Sample] = []
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
-        """Samples too far from the prediction of the others; they are ignored here."""
+        """Samples too far from the prediction of the others, ignored here."""
         self.refused = ''
-        """Why the samples can be no problem, in words; empty if they can."""
+        """Why the samples make no valid problem; empty if they do."""
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
-        """Take what a list of samples has beyond that of the last call, or all if it is another.
+        """Add the samples that are new since the last call, or restart with another list.
 
-        Returns None while there are too few. An update is short, so that it may be called between
-        messages: of many samples it takes MOST_AT_ONCE.
+        Returns None while there are too few. Updates are short, to be called between messages: at
+        most MOST_AT_ONCE samples each.
         """
         known = len(self._seen)
         if self._seen != list(samples[:known]):
@@ -146,10 +142,9 @@ class LiveEstimate:
         return self._latest
 
     def _begin(self, fitted: Sequence[Sample]) -> bool:
-        """Choose the parameters, and fit them to the samples but those of gross error.
+        """Choose the parameters, and fit them robustly.
 
-        What the robust fit leaves out comes back where the others predict it within the sigmas
-        given.
+        Samples that the robust fit rejects are added if predicted within the given sigmas.
         """
         self.restart()
         try:
@@ -185,14 +180,14 @@ class LiveEstimate:
         return True
 
     def _settle(self) -> None:
-        """Move the point of linearisation to the estimate while that is far from it."""
+        """Relinearise at the estimate while it is far away."""
         for _ in range(ROUNDS):
             if np.abs(self._step()).max() < SMALL_STEP or len(self._added) > SOME:
                 break
             self._linearise(self._estimate())
 
     def _linearise(self, chain: Chain) -> None:
-        """Restart the information at a chain, with the samples taken so far."""
+        """Restart the information at a chain, with the samples so far."""
         inverse, residual = self._prior.rows(chain, self._names)
         self._chain = chain
         self._information = np.diag(inverse**2)
@@ -214,11 +209,11 @@ class LiveEstimate:
         self._added += samples
 
     def _enough(self, rows: int) -> bool:
-        """Tell whether there are equations enough to know a gross error by."""
+        """Tell whether there are enough equations to detect a gross error."""
         return rows > 2 * len(self._names)
 
     def _groups(self, samples: Sequence[Sample]) -> list[tuple[list[Sample], Observations]]:
-        """Return samples of one kind between the same frames, and the same as observations."""
+        """Return samples of one kind and pair of frames, with their observations."""
         groups: dict[tuple[Any, ...], list[Sample]] = {}
         for sample in samples:
             key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
@@ -235,10 +230,10 @@ class LiveEstimate:
         return System(tuple(Samples(each, *self._sigmas) for _, each in groups), prior)
 
     def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Return the samples that lie where the others predict them."""
+        """Return the samples close to the prediction of the others."""
         chain = self._estimate()
         covariance, noise = self._uncertainty()
-        # Samples of one place may agree better than the model does elsewhere.
+        # samples of one place may agree better than the model holds elsewhere
         covariance, noise = covariance * max(1.0 / noise, 1.0), max(noise, 1.0)
         good: list[Sample] = []
         for members, some in self._groups(samples):
@@ -257,7 +252,7 @@ class LiveEstimate:
         return good
 
     def _scaled(self) -> tuple[FloatArray, FloatArray]:
-        """Return scales (P,), and the information matrix with a diagonal of one by them."""
+        """Return scales (P,), and the information matrix scaled to unit diagonal."""
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
         matrix = self._information * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
         return scale, matrix
@@ -271,7 +266,7 @@ class LiveEstimate:
         return self._chain.with_offsets(dict(zip(self._names, self._step(), strict=True)))
 
     def _uncertainty(self) -> tuple[FloatArray, float]:
-        """Return the covariance by the noise that the residuals show, and its variance."""
+        """Return the covariance for the noise of the residuals, and its variance."""
         left = max(self._cost - float(self._step() @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
         noise = max(left / freedom, STEP_TOLERANCE**2) if freedom > 0 else 1.0
@@ -295,7 +290,7 @@ class LiveEstimate:
         )
 
     def _excess(self, chain: Chain) -> float:
-        """Return the RMS residual of positions in units of the measurement scatter."""
+        """Return the RMS position residual in units of the measurement scatter."""
         chosen = np.linspace(0, len(self._added) - 1, SOME).round().astype(int)
         some = [self._added[k] for k in np.unique(chosen)]
         total = 0.0
@@ -311,7 +306,7 @@ class LiveEstimate:
 
 
 def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
-    """Return the joints whose values (N, n) span too little to tell much about them."""
+    """Return the joints whose values (N, n) span too little to determine them."""
     span = np.ptp(joints, axis=0)
     least = [LITTLE if joint.type == 'revolute' else 0.1 * LITTLE for joint in chain.joints]
     return tuple(
@@ -322,7 +317,7 @@ def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
 
 
 def _spread(samples: Sequence[Sample]) -> list[Sample]:
-    """Return at most SOME samples or so, evenly from those between each pair of frames."""
+    """Return about SOME samples, evenly from those between each pair of frames."""
     frames = Frames()
     groups: dict[tuple[str, str], list[int]] = {}
     for k, sample in enumerate(samples):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples of measurements and of the motion of the joints at their time."""
+"""Samples from measurements and the joint motion at their time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ DISTANCE, POSITION = slice(0, 1), slice(0, 3)
 QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
 ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]
-"""A sample with the number of the round or the stop in which it was taken."""
+"""A sample with the number of its round or stop."""
 VIBRATING = 'measurements: still vibrating, or a spike'
 RESTLESS = 'measurements: a stop with more spread than noise'
 
@@ -36,11 +36,11 @@ class Maker:
         self._revolute, self._capacity = revolute, capacity
         self._taken: dict[StreamKey, set[int]] = {}
         self.fresh: list[Sample] = []
-        """Samples that nobody has taken yet."""
-        self._calm: int | None = None  # how many of them came before a stop that was not at rest
+        """Samples not taken yet."""
+        self._calm: int | None = None  # fresh samples before the first stop not at rest
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()
-        self.rested = self.restless = 0  # stops at which measurements were at rest, and were not
+        self.rested = self.restless = 0  # stops with measurements at rest, and not
 
     def samples(
         self,
@@ -51,11 +51,11 @@ class Maker:
         delay: float,
         sigma: float,
     ) -> Iterator[Numbered]:
-        """Yield a sample of the measurements of each stop, unless these spread too much.
+        """Yield a sample of the measurements of each stop, unless they spread too much.
 
-        Stops, or the measurements themselves while the arm moves, begin at `begins` (S,), to which
-        the joints `came` (S, n) in these senses. The places are their numbers. Measurements are
-        stamped late by a `delay` [s] and scatter by `sigma` [m].
+        Stops, or single measurements of a moving arm, begin at `begins` (S,), approached with the
+        signs `came` (S, n). Places hold their numbers. Measurements are late by `delay` [s] and
+        scatter by `sigma` [m].
         """
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
@@ -125,7 +125,7 @@ class Maker:
             )
 
     def _mean(self, joints: FloatArray, begins: Index, used: Flags) -> FloatArray:
-        """Return the mean joint values (S, n) of those in use (N, n) at each stop."""
+        """Return the mean joint values (S, n) of the used rows (N, n) of each stop."""
         first = joints[begins]
         counts = np.diff(begins, append=len(joints))
         steps = unwrapped(joints - np.repeat(first, counts, axis=0), self._revolute)
@@ -134,7 +134,7 @@ class Maker:
     def in_socket(self, place: str, stamp_ns: int, joints: FloatArray, came: FloatArray) -> None:
         """Make a sample of a ball in a socket, at joint values (N, n) while the arm stands.
 
-        The joints `came` (n,) there in these senses.
+        Approached with the signs `came` (n,).
         """
         sample = Sample(
             stamp_ns=stamp_ns,
@@ -155,7 +155,7 @@ class Maker:
         position: FloatArray,
         **more: Any,
     ) -> Iterator[Numbered]:
-        """Yield a sample of measurements (N, ROW_WIDTH), unless there is one or no room."""
+        """Yield a sample of measurements (N, ROW_WIDTH), unless one exists or memory is full."""
         known = self._taken.setdefault(key, set())
         if stamp_ns in known:
             self.dropped['measurements: a pose with this stamp already exists'] += len(rows)
@@ -183,7 +183,7 @@ class Maker:
         yield number, sample
 
     def add(self, found: list[Numbered]) -> None:
-        """Keep samples for who takes them, in the order of their rounds or stops."""
+        """Keep samples in the order of their rounds or stops."""
         found.sort(key=itemgetter(0))
         calm = sum(number < self._shaken for number, _ in found)
         if self._calm is None and calm < len(found):
@@ -192,32 +192,32 @@ class Maker:
         self.fresh += [sample for _, sample in found]
 
     def take(self) -> tuple[list[Sample], int]:
-        """Return the samples made since the last call, and how many since a stop was restless."""
+        """Return the samples since the last call, and their number since a restless stop."""
         fresh, calm = self.fresh, self._calm
         self.fresh, self._calm = [], None
         return fresh, 0 if calm is None else len(fresh) - calm
 
     @property
     def unrest(self) -> int:
-        """Return how many measurements at stops were not at rest."""
+        """Return the number of measurements at stops that were not at rest."""
         return self.dropped[VIBRATING] + self.dropped[RESTLESS]
 
     def has(self, key: StreamKey) -> bool:
-        """Tell whether there is a sample of a stream."""
+        """Tell whether a stream has a sample."""
         return bool(self._taken.get(key))
 
     def remember(self, samples: Sequence[Sample]) -> None:
-        """Make no other samples of the stamps of these."""
+        """Make no other samples with the stamps of these."""
         for sample in samples:
             self._taken.setdefault(_key(sample), set()).add(sample.stamp_ns)
 
     def forget(self, sample: Sample) -> None:
-        """Allow a sample of the same stamp again."""
+        """Allow another sample with the stamp of this one."""
         self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
 
 
 def _sigmas(values: FloatArray, begins: Index, sigma: float) -> FloatArray:
-    """Return those (S,) [m] of stops by the covariances; `sigma` where any has none."""
+    """Return the sigmas (S,) [m] of stops by their covariances, `sigma` if one is missing."""
     own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
     variances = np.add.reduceat(own, begins) / np.diff(begins, append=len(values))
     return np.where(np.isnan(variances), sigma, np.sqrt(variances))

@@ -2,9 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """ROS messages to numbers, and their sources.
 
-Messages are read by their attributes only: rclpy's and rosbags' messages alike. What cannot be
-used is told by its cause, under which it is counted. A source says what comes on a topic, and
-between which frames.
+Messages are read by their attributes only, so those of rclpy and rosbags are alike. Unusable ones
+are counted by cause. A source tells what a topic measures, and between which frames.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ BODIES = {
     'mocap4r2_msgs/msg/RigidBodies': ('rigidbodies', 'rigid_body_name'),
     'motion_capture_tracking_interfaces/msg/NamedPoseArray': ('poses', 'name'),
 }
-"""Types of poses by name in one frame, of motion capture: their fields of the poses and names."""
+"""Message types of named poses in one frame (motion capture): fields of poses and names."""
 LINKS = (TRANSFORMS, *BODIES)
-"""Types of messages that link several frames at once."""
+"""Message types that link several frames at once."""
 PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
@@ -46,12 +45,12 @@ class MessageError(InputError):
 
 
 class Readings(NamedTuple):
-    """What N messages say that name the same things; N may be one.
+    """Numbers of N messages with the same names.
 
-    `strings` are the frame and the child frame of a measurement if it has one, or the frame and
-    the names of the joints. `numbers` (N, w) are joint values [rad or m]; or a distance [m]
-    (w = 1), a position [m] (3), a pose with its quaternion x y z w (7), or that and a covariance
-    row by row (43); of an image its number among those that are kept (1).
+    `strings` are frame and child frame (if any) of a measurement, or the frame and the joint
+    names. `numbers` (N, w) are joint values [rad or m]; or a distance [m] (w = 1), a position [m]
+    (3), a pose with its quaternion x y z w (7), or a pose and a covariance row by row (43); of an
+    image its number (1).
     """
 
     stamps_ns: NDArray[np.int64]
@@ -60,11 +59,11 @@ class Readings(NamedTuple):
 
     @property
     def child(self) -> str:
-        """Return the child frame of a measurement; empty if it has none."""
+        """Return the child frame of a measurement, or empty text."""
         return self.strings[1] if len(self.strings) > 1 else ''
 
     def rows(self, which: slice | NDArray[np.generic]) -> Readings:
-        """Return some of them, by a slice, a mask (N,) or indices (K,)."""
+        """Return some readings, by a slice, a mask (N,) or indices (K,)."""
         return Readings(self.stamps_ns[which], self.strings, self.numbers[which])
 
 
@@ -85,11 +84,11 @@ DECODERS: dict[str, Callable[[Any], Sequence[float]]] = {
     'nav_msgs/msg/Odometry': _pose_with_covariance,
     'sensor_msgs/msg/Range': lambda m: (m.range,),
 }
-"""Types of measurements, and what finds the numbers in a message."""
+"""Measurement types, and functions from messages to numbers."""
 
 
 def reading(kind: str, message: Any) -> tuple[int, tuple[str, ...], Sequence[float]]:
-    """Return stamp [ns], strings and numbers of a message, as `Readings` hold them."""
+    """Return stamp [ns], strings and numbers of a message, as in `Readings`."""
     stamp_ns, frame_id = head_of(message)
     if kind == JOINT_STATE:
         if len(message.name) != len(message.position):
@@ -107,9 +106,9 @@ def head_of(message: Any) -> tuple[int, str]:
 
 
 def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
-    """Return which readings (N,) can be used, and the causes why others cannot.
+    """Return which readings (N,) can be used, and the causes of the others.
 
-    The values of joints are not looked at: some may be those of another robot.
+    Joint values are not checked: some may be those of another robot.
     """
     numbers, causes = found.numbers, Counter[str]()
     good = np.ones(len(numbers), dtype=bool)
@@ -133,10 +132,10 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
         refuse(~np.isfinite(at).all(axis=1), 'NaN or infinite position')
         refuse((np.abs(at) > LARGEST).any(axis=1), 'position beyond 1000 km')
     if width >= 7:
-        with np.errstate(over='ignore'):  # of numbers that are refused
+        with np.errstate(over='ignore'):  # refused anyway
             length = np.sqrt((numbers[:, 3:7] ** 2).sum(axis=1))
         refuse(~(np.abs(length - 1.0) <= ROUNDED), NOT_UNIT)
-    if width > 7:  # mostly all have the same
+    if width > 7:
         rows = numbers[:, 7:]
         changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
         for begin, end in itertools.pairwise((0, *changes.tolist(), len(rows))):
@@ -144,18 +143,18 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
                 here = np.zeros(len(rows), dtype=bool)
                 here[begin:end] = True
                 refuse(here, fault)
-    if not found.child.isprintable():  # it shall be a cell of a table
+    if not found.child.isprintable():  # it is written to tables
         refuse(good.copy(), 'child frame whose name cannot be printed')
     return good, causes
 
 
-@functools.lru_cache(maxsize=16)  # most devices send the same one for ever
+@functools.lru_cache(maxsize=16)  # most devices repeat one
 def _fault(covariance: bytes) -> str:
     return covariance_fault(np.frombuffer(covariance).reshape(6, 6))
 
 
 def transforms_in(message: Any, kind: str) -> Sequence[Any]:
-    """Return what a message that links several frames holds, each like a TransformStamped."""
+    """Return the links in a message, each like a TransformStamped."""
     if kind == TRANSFORMS:
         found: Sequence[Any] = message.transforms
         return found
@@ -173,41 +172,41 @@ def transforms_in(message: Any, kind: str) -> Sequence[Any]:
 
 
 def frame_name(name: str) -> str:
-    """Return the name of a frame without the slash that older programs write before it."""
+    """Return a frame name without the leading slash of older programs."""
     return name.removeprefix('/')
 
 
 VALIDATION = 'validation_'
-"""Topics whose last name starts so hold measurements that judge the result, never fitted."""
+"""Prefix of topics whose measurements judge the result and are never fitted."""
 MARKERS = {
     'status': 'std_msgs/msg/String',
     'calibration': 'std_msgs/msg/String',
     'dh_parameters': 'std_msgs/msg/Float64MultiArray',
 }
-"""Topics that together tell that what is above them is one of our nodes."""
+"""Topics that together identify a calibration node."""
 DISTANCE = 'distance'
-"""Device of distances that name none: their origin is not that of a tracker."""
+"""Default device of distances: their origin is not that of a tracker."""
 
 
 @dataclass(frozen=True)
 class Source:
     """One topic of measurements.
 
-    Each device has a base frame of its own, each target a tool frame; a message that names its
-    child frame names the target.
+    Each device has its own base frame, each target its own tool frame; a child frame in the
+    message names the target.
     """
 
     topic: str
-    type: str = ''  # such as geometry_msgs/msg/PoseStamped; empty when any will do
-    device: str = ''  # what measures
-    target: str = ''  # what is measured
-    eye_in_hand: bool = False  # the poses are those of a fixed target in a camera on the flange
-    validation: bool = False  # the measurements judge the result and are never fitted
-    parent: str = ''  # of many transforms or bodies, as on /tf: the frames between which it is
+    type: str = ''  # such as geometry_msgs/msg/PoseStamped; empty for any
+    device: str = ''
+    target: str = ''
+    eye_in_hand: bool = False  # a camera on the flange measures a fixed target
+    validation: bool = False  # judges the result, never fitted
+    parent: str = ''  # frames of the measurement, among many transforms or bodies, as on /tf
     child: str = ''
-    board: str = ''  # YAML of the board that images show, which has its type and sizes
-    info: str = ''  # topic of the CameraInfo of images, by default camera_info beside them
-    lens: str = 'given'  # by that topic, or `fitted` from there on
+    board: str = ''  # YAML of the board in images
+    info: str = ''  # CameraInfo topic of images, by default camera_info beside them
+    lens: str = 'given'  # by that topic, or `fitted` from there
 
     def __post_init__(self) -> None:
         """Refuse what neither bag nor node could use."""
@@ -232,14 +231,14 @@ class Source:
 
     @property
     def camera_info(self) -> str:
-        """Return the topic of the CameraInfo of images."""
+        """Return the CameraInfo topic of images."""
         beside = self.topic.removesuffix('/compressed').rpartition('/')
         return self.info or f'{beside[0]}{beside[1]}camera_info'
 
 
 LENSES = ('given', 'fitted')
 TYPES = (*DECODERS, *LINKS, *PICTURES)
-"""Types of messages that hold measurements."""
+"""Message types of measurements."""
 
 STANDARD = (
     Source('measured_pose', 'geometry_msgs/msg/PoseStamped'),
@@ -255,12 +254,12 @@ STANDARD = (
 
 
 def parse_source(text: str) -> Source:
-    """Read a source from "TOPIC key=value ...".
+    """Parse a source "TOPIC key=value ...".
 
     Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
-    child, and of images board, info and lens. A short type such as PoseStamped will do; a topic
-    named tf is of type TFMessage, and so is one with a parent or a child and no type; one with a
-    board is of images. What holds blanks stands in quotes.
+    child, and of images board, info and lens. Short types such as PoseStamped are accepted; the
+    type defaults to TFMessage for a topic named tf or with parent and child, and to images with a
+    board. Values with blanks need quotes.
     """
     try:
         topic, *pairs = shlex.split(text) or ('',)
@@ -296,7 +295,7 @@ KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
 
 
 def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
-    """Read several sources; a topic may be named once, or once for each pair of its frames."""
+    """Parse sources; a topic may be named once, or once for each pair of frames."""
     sources = tuple(parse_source(text) for text in texts)
     names = [' '.join((each.topic, each.parent, each.child)).strip() for each in sources]
     for source, name in zip(sources, names, strict=True):
@@ -308,7 +307,7 @@ def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
 
 
 def short_type(kind: str) -> str:
-    """Return the name of a message type without its package."""
+    """Return a message type without its package."""
     return kind.rpartition('/')[2]
 
 

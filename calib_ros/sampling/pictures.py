@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Images of a board on their way to samples.
 
-An image goes the way of all measurements by its stamp and a number, and is itself kept here, as it
-came, until its stop is known. Then the one in the middle of the stop is decoded and looked at, on
-a thread of its own: one for each stop, however many come. Samples leave in the order of their
-stops, those without an image as well, so that live and of a bag they are the same.
+An image is matched like any measurement, by its stamp and a number, and is kept here undecoded
+until its stop is known. Then the middle one of the stop is decoded and processed on a separate
+thread: one per stop, however many arrive. Samples leave in the order of their stops, with those
+without images, so that live and replayed results are the same.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from calib_ros.sampling.sample import Sample, View
 from calib_ros.texts import LARGEST_TABLE
 
 MOST_BYTES = 5 * LARGEST_TABLE
-"""Size of the images that are kept: six seconds of 30 Hz at 2 megapixels in grey."""
+"""Memory for images: six seconds of 30 Hz at 2 megapixels in grey."""
 MOST_WAITING = 4
-"""Images that may wait for processing; if more arrive, some are dropped."""
+"""Images that may wait for processing; further ones are dropped."""
 
 
 class Refusal(NamedTuple):
@@ -39,7 +39,7 @@ class Refusal(NamedTuple):
 
 
 class Camera(Protocol):
-    """What finds a board in images."""
+    """A board detector for images."""
 
     def learn(self, info: Any) -> None:
         """Take a CameraInfo."""
@@ -49,19 +49,18 @@ class Camera(Protocol):
 
 
 class Pictures:
-    """Keep images, and make samples of the processed ones.
-
-    `sigma` returns the standard deviation of a corner [px].
+    """Keeps images, and makes samples of the processed ones; `sigma` returns that of a corner
+    [px].
     """
 
     def __init__(self, sigma: Callable[[], float]) -> None:
         self._sigma = sigma
         self.cameras: Mapping[str, Camera] = {}
-        """What looks at images, by their topics."""
+        """Detectors by topic."""
         self._pool = ThreadPoolExecutor(1, 'images')
         self._last = 0
         self.patient = False
-        """True when images may be waited for rather than dropped, as those of a bag."""
+        """True to wait for images instead of dropping them, as from a bag."""
         self.clear()
 
     def clear(self) -> None:
@@ -69,26 +68,26 @@ class Pictures:
         self._kept: dict[int, tuple[str, int, Callable[[], Any]]] = {}
         self._queue: deque[tuple[Sample, Future[Sample | Refusal] | None]] = deque()
         self.dropped: Counter[str] = Counter()
-        """What became of images that are not used, by cause."""
+        """Unused images by cause."""
         self.refused = ''
-        """Why the last image that was looked at is not used; empty when it is."""
+        """Why the last image is not used; empty if it is."""
 
     def keep(self, topic: str, size: int, message: Callable[[], Any]) -> int:
         """Keep an image of some bytes; return its number. `message` decodes it."""
         self._last += 1
         self._kept[self._last] = topic, size, message
         while sum(size for _, size, _ in self._kept.values()) > MOST_BYTES and len(self._kept) > 1:
-            for number in [*self._kept][-2::-2]:  # the newest stays, and every stop has some
+            for number in [*self._kept][-2::-2]:  # keep the newest, and some of every stop
                 del self._kept[number]
         return self._last
 
     def keep_only(self, numbers: set[int]) -> None:
-        """Let go of images that no stop can need any more."""
+        """Drop images that no stop can need any more."""
         for number in self._kept.keys() - numbers:
             del self._kept[number]
 
     def through(self, made: Sequence[Sample]) -> None:
-        """Begin to process the images of samples; `ready` returns them."""
+        """Start to process the images of samples; `ready` returns them."""
         for sample in made:
             if not sample.images:
                 self._queue.append((sample, None))
@@ -96,7 +95,7 @@ class Pictures:
                 self._queue.append((sample, found))
 
     def ready(self, wait: bool = False) -> list[Sample]:
-        """Return the samples that are done, in their order; wait for all of them if asked."""
+        """Return finished samples in order; with `wait` all of them."""
         found: list[Sample] = []
         while self._queue:
             sample, looked = self._queue[0]
@@ -134,7 +133,7 @@ class Pictures:
     def _look(
         self, sample: Sample, topic: str, size: int, message: Callable[[], Any]
     ) -> Sample | Refusal:
-        """Return the sample of an image; on a thread of its own."""
+        """Return the sample of an image; runs on the thread."""
         try:
             view = self.cameras[topic].look(message())
             return view if isinstance(view, Refusal) else self._posed(sample, view)
@@ -142,7 +141,7 @@ class Pictures:
             return Refusal('that cannot be decoded', f'it cannot be decoded: {err!r}')
 
     def _posed(self, sample: Sample, view: View) -> Sample | Refusal:
-        """Return a sample with the corners, and the pose of the board that they tell."""
+        """Return a sample with the corners and the pose of the board."""
         index = np.zeros(len(view.pixels), dtype=np.intp)
         joints = np.repeat(sample.joints[np.newaxis], len(index), axis=0)
         seen = Observations.from_pixels(joints, view.pixels, view.points, index)

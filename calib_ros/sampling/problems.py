@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From samples and settings to a problem of the identification, or to judges of a calibration."""
+"""Samples and settings to a problem of the identification, or to sets that judge a calibration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calib_ros.shown import Shown
 
 
 def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
-    """Refuse names of joints in messages by a ConfigError unless there is one for each joint."""
+    """Refuse joint names with a ConfigError unless there is one for each joint."""
     count = len(chain.joints)
     if not len(names) == len(set(names)) == count:
         raise ConfigError(
@@ -33,7 +33,7 @@ def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
 
 
 def check_settings(chain: Chain, settings: Settings) -> None:
-    """Refuse settings by a ConfigError that no identification of a chain could use."""
+    """Refuse settings with a ConfigError that no identification of a chain could use."""
     if settings.mode == 'continuous' and any(
         each.board for each in parse_sources(settings.sources)
     ):
@@ -53,18 +53,18 @@ def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Measured(Shown):
-    """The sets to fit and held out, each with frames of its own."""
+    """The sets to fit and held out, each with its own frames."""
 
     fitted: Sequence[Observations]
     held_out: Sequence[Observations] = ()
-    pairs: Sequence[tuple[str, str]] = ()  # frames of the two sockets of each location
+    pairs: Sequence[tuple[str, str]] = ()  # frames of two sockets at one location
     world_frame: str = ''  # the first frame of the devices
     lenses: Mapping[str, Lens] = field(default_factory=dict)  # at the frames of cameras
 
     def problem(
         self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any
     ) -> Problem:
-        """Return what is to be fitted of a chain; `sockets` [m] of a location are apart."""
+        """Return the problem for a chain; two sockets of a location are `sockets` [m] apart."""
         return Problem(
             with_lenses(chain, self.lenses),
             self.fitted[0],
@@ -79,10 +79,7 @@ class Measured(Shown):
 def problem_of(
     chain: Chain, samples: Sequence[Sample], settings: Settings, posed: bool = False
 ) -> Problem | None:
-    """Return samples as a problem; None when there is none to fit.
-
-    With `posed` the poses of boards are taken instead of their corners.
-    """
+    """Return samples as a problem, or None; with `posed` boards as poses, not corners."""
     frames = Frames()
     sigmas = settings.sigma_position, settings.sigma_orientation
     fitted, held_out = collect(samples, sigmas, frames, posed)
@@ -98,12 +95,12 @@ def problem_of(
 def in_frames_of(
     calibration: Calibration, since: Sequence[Sample], usable: Sequence[Sample], settings: Settings
 ) -> list[Observations]:
-    """Return the poses measured since a calibration, those among all usable ones, in its frames.
+    """Return the poses measured since a calibration, among all usable ones, in its frames.
 
-    Without any, or where they are between frames that it does not have, that is an InputError.
+    Raises InputError if there are none, or if their frames are unknown to it.
     """
     sigmas = (settings.sigma_position, settings.sigma_orientation)
-    # the first device and target are those of a file that does not name any
+    # without owners, the first device and target have the frames
     frames = Frames(calibration.owners) if calibration.owners else named(usable)
     sets = [each for part in collect(since, sigmas, frames) for each in part]
     if not sets:
@@ -127,7 +124,7 @@ def problem_since(
 
 
 def refuse_other_joints(calibration: Calibration, chain: Chain) -> None:
-    """Refuse a calibration of other joints by an InputError."""
+    """Refuse a calibration of other joints with an InputError."""
     theirs = calibration.chain.joint_names
     if theirs != chain.joint_names:
         raise InputError(

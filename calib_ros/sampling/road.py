@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The road of messages: past stray stamps, by slices of time, into the buffers and to samples."""
+"""The path of messages: past stray stamps, in slices of time, into buffers and to samples."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ STRAY = 'stamp far from those before and after'
 
 
 class Gate:
-    """Tells stray stamps from a clock that was moved: two more than `far` [s] apart.
+    """Distinguishes stray stamps from a moved clock: more than `far` [s] away.
 
-    A message far from the last ones of all streams is held back. If its stream returns to where it
-    was, the stamp was a stray one, and it is dropped; if it stays away, the clock was moved, a bag
-    is played again or there was a pause, and all that was held back passes in its order.
+    A message far from the last ones of all streams is held. If its stream returns, the stamp was
+    stray and the message is dropped; if it stays away, the clock was moved, a bag is played again
+    or there was a pause, and all held messages pass in order.
     """
 
     def __init__(self, far: float) -> None:
@@ -36,13 +36,13 @@ class Gate:
         """Messages with stray stamps."""
 
     def held(self, kind: str) -> int:
-        """Return how many messages of a kind are held back."""
+        """Return the number of held messages of a kind."""
         return sum(each[0] == kind for each in self._held)
 
     def through(self, given: Slice) -> Iterator[tuple[Slice, bool]]:
-        """Yield what may pass now, and whether the clock of the joints was moved before it.
+        """Yield what may pass now, and whether the joints' clock was moved before it.
 
-        What is held back comes with a later message, in the order in which it came.
+        Held messages pass with a later message, in order of arrival.
         """
         begin, end = 0, len(given)
         while begin < end:
@@ -57,20 +57,20 @@ class Gate:
             begin += count
 
     def release(self) -> list[Slice]:
-        """Return what is held back: no later message can decide."""
+        """Return the held messages: no later one can decide."""
         found, self._held = self._held, []
         return [item for _, _, item in found]
 
     def _plain(self, given: Slice) -> int:
-        """Let the first messages pass up to one that is to be held back, or frees others."""
+        """Pass messages up to the first that must be held, or releases others."""
         times, numbers = given.times, np.arange(len(given))
         near = np.zeros(len(given), dtype=bool)  # to the last one of any kind
         for kind, which in ((JOINTS, given.joints), (POSES, ~given.joints)):
             before = np.maximum.accumulate(np.where(which, numbers, -1))
             before = np.concatenate([[-1], before[:-1]])
             known = np.where(before < 0, self._last.get(kind, 0), times[before])
-            told = (before >= 0) | (kind in self._last)
-            near |= told & (np.abs(times - known) <= self._far_ns)
+            seen = (before >= 0) | (kind in self._last)
+            near |= seen & (np.abs(times - known) <= self._far_ns)
         for kind, time_ns, _ in self._held:
             near &= given.joints != (kind == JOINTS)
             near &= np.abs(times - time_ns) > self._far_ns
@@ -83,7 +83,7 @@ class Gate:
         return count
 
     def _admitted(self, given: Slice) -> tuple[list[Slice], bool]:
-        """Take one message; return what passes, and whether the clock of the joints was moved."""
+        """Take one message; return what passes, and whether the joints' clock was moved."""
         kind, time_ns = JOINTS if given.joints[0] else POSES, int(given.times[0])
         if self._is_near(time_ns):
             self._last[kind] = time_ns
@@ -111,7 +111,6 @@ class Gate:
         return not lasts or any(abs(time_ns - last) <= self._far_ns for last in lasts)
 
     def _now_near(self) -> list[Slice]:
-        """Release held messages that are no longer far from others."""
         found = []
         for each in tuple(self._held):
             if self._is_near(each[1]):
@@ -122,9 +121,9 @@ class Gate:
 
 
 class Road:
-    """Keeps messages by slices up to a joint state after which there is something to do.
+    """Takes messages in slices up to joint states that require work.
 
-    `taken` is called with the samples made, and returns how many there are now.
+    `taken` is called with new samples, and returns their total number.
     """
 
     def __init__(
@@ -134,15 +133,15 @@ class Road:
         self.collector = Collector([j.type == 'revolute' for j in chain.joints], settings)
         self.collector.holding = settings.mode == 'continuous' and settings.delay == 0.0
         self.clocks = Clocks(chain, settings)
-        # A stamp ahead by more than `lateness` would settle what has not come yet; joint states
-        # up to `max_gap` apart belong together.
+        # a stamp ahead by more than `lateness` would settle what has not arrived; joint states up
+        # to `max_gap` apart belong together
         self.gate = Gate(max(settings.lateness + settings.max_gap, Settings.lateness))
         self.notes: Counter[str] = Counter()
         self._delay_ns = round(settings.delay * 1e9)
         self._newest = {JOINTS: 0, POSES: 0}
 
     def take(self, pieces: Sequence[Piece]) -> None:
-        """Take messages. An error costs the slice that makes it, and none after it."""
+        """Take messages; an error loses only the slice that causes it."""
         error: Exception | None = None
         come = self.gate.through(Slice.of(pieces, self._delay_ns)) if pieces else ()
         for passed, moved in come:
@@ -157,7 +156,7 @@ class Road:
             raise error
 
     def finish(self) -> None:
-        """Make samples of everything that still waits; nothing more will come."""
+        """Make samples of all waiting messages; no more will arrive."""
         for held in self.gate.release():
             for given in self._up_to_work(held):
                 self._keep(given)
@@ -166,7 +165,7 @@ class Road:
         self.hand_over()
 
     def flush(self) -> None:
-        """Make samples of everything that has come, as if nothing came late."""
+        """Make samples of everything that has arrived, as if nothing were late."""
         self.collector.flush()
         self.hand_over()
 
@@ -177,12 +176,12 @@ class Road:
         self.clocks.wake(self.collector.maker.unrest, count - shaken, count)
 
     def hints(self, measurements: int) -> list[Hint]:
-        """Return what looks wrong with the stamps, of so many measurements."""
+        """Return what looks wrong with the stamps, given the number of measurements."""
         found = self.collector.astray(measurements) + self.clocks.hints()
         return found + self.collector.hints(measurements)
 
     def unsettled(self) -> list[Hint]:
-        """Return what looks wrong with the measurements at stops, if no stamps explain it."""
+        """Return what looks wrong with measurements at stops, if no stamps explain it."""
         maker = self.collector.maker
         return unsettled(maker.restless, maker.restless + maker.rested)
 
@@ -195,7 +194,6 @@ class Road:
             begin += count
 
     def _keep(self, given: Slice) -> None:
-        """Keep messages, and do what the last one gives to do."""
         for kind in (JOINTS, POSES):
             times = given.times[given.where(kind)]
             if len(times):

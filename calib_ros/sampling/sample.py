@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Samples: what was measured at one stop of the arm, or at one moment of its motion.
+"""Samples: measurements at one stop of the arm, or at one moment of its motion.
 
-A sample is what the live node takes, what the journal keeps, and what a row of a table holds.
-`collect` turns many of them into sets of observations with frames of their own.
+Samples come from the live node, the journal, or the rows of a table. `collect` groups them into
+sets of observations with their frames.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from calib_ros.shown import Shown
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Corners of a board as a camera saw them: points (K, 3) [m] of its frame at pixels (K, 2)."""
+    """Corners of a board in an image: points (K, 3) [m] of its frame at pixels (K, 2)."""
 
     points: FloatArray
     pixels: FloatArray
@@ -32,9 +32,9 @@ class View:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sample(Shown):
-    """One measurement with the joint values (n,) [rad or m] that belong to it.
+    """One measurement with its joint values (n,) [rad or m].
 
-    Each session and device has a base frame of its own, each session and target a tool frame.
+    Each session and device has its own base frame, each session and target its own tool frame.
     """
 
     stamp_ns: int
@@ -44,28 +44,28 @@ class Sample(Shown):
     rotation: FloatArray | None = None  # (3, 3) of the target in the frame of the device
     distance: float | None = None  # from the origin of the device [m], without a position
     covariance: FloatArray | None = None  # (6, 6) of x, y, z [m] and about the device's axes [rad]
-    view: View | None = None  # corners of a board in an image, whose pose is that by itself
-    images: tuple[int, ...] = ()  # numbers of those of a stop of which one will be looked at
-    velocity: FloatArray | None = None  # (n,) of the joints, where the arm was moving
+    view: View | None = None  # corners of a board; the pose is that of this image alone
+    images: tuple[int, ...] = ()  # numbers of the images of a stop, one to be processed
+    velocity: FloatArray | None = None  # (n,) of the joints, if the arm was moving
     acceleration: FloatArray | None = None
     session: str = ''
     device: str = ''
     target: str = ''
-    frame_id: str = ''  # of the measurement, as its message named it
-    socket: bool = False  # a ball at the target sat in a socket, whose place is not known
-    plane: bool = False  # the target touched a plane, the device; the distance is its height
-    eye_in_hand: bool = False  # the pose is that of a fixed target in a camera on the flange
-    validation: bool = False  # it judges and is never fitted
-    delay: float = 0.0  # how much earlier than the stamp the joints had these values [s]
-    count: int = 1  # measurements that were averaged
-    spread: float = 0.0  # RMS of one coordinate of them about their mean [m]
+    frame_id: str = ''  # of the measurement, from its message
+    socket: bool = False  # a ball in a socket at an unknown place
+    plane: bool = False  # the target touched a plane, the device; the distance is the height
+    eye_in_hand: bool = False  # a camera on the flange measured a fixed target
+    validation: bool = False  # judges, never fitted
+    delay: float = 0.0  # time before the stamp at which the joints had these values [s]
+    count: int = 1  # measurements averaged
+    spread: float = 0.0  # RMS of one coordinate about the mean [m]
 
 
 class Frames:
-    """Names of the frames between which samples were measured.
+    """Names of the frames of samples.
 
-    The first session, device and target that is met has the frames `base` and `tool`; others add
-    their names. `owners` are those of frames that have names already.
+    The first session, device and target get the frames `base` and `tool`; others append their
+    names. `owners` are those of existing frames.
     """
 
     def __init__(self, owners: Mapping[str, Owner] | None = None) -> None:
@@ -80,13 +80,13 @@ class Frames:
 
     @property
     def owners(self) -> Mapping[str, Owner]:
-        """Return which session, device or target each frame is of."""
+        """Return session, device or target of each frame."""
         return self._owners
 
     def of(self, sample: Sample) -> tuple[str, str]:
         """Return the names of base and tool of a sample.
 
-        A camera on the flange is the tool's end, and its target stands for the world.
+        A camera on the flange is the tool, and its target the world.
         """
         eye = sample.eye_in_hand
         base, tool = (sample.target, sample.device) if eye else (sample.device, sample.target)
@@ -106,7 +106,6 @@ class Frames:
         )
 
     def _own(self, name: str, owner: Owner) -> str:
-        """Return a unique name: a device may have the name of a session."""
         while self._owners.setdefault(name, owner) != owner:
             name += '_'
         return name
@@ -120,7 +119,7 @@ class Frames:
 
 
 def named(samples: Iterable[Sample]) -> Frames:
-    """Return the names of the frames of samples, in the order in which these were taken."""
+    """Return the frame names of samples, in order."""
     frames = Frames()
     for sample in samples:
         frames.of(sample)
@@ -128,7 +127,7 @@ def named(samples: Iterable[Sample]) -> Frames:
 
 
 def socket_place(label: str) -> str:
-    """Return the place of a socket LOCATION/SOCKET, as the device of what is measured there."""
+    """Return the device name of a socket LOCATION/SOCKET."""
     location, slash, socket = label.rpartition('/')
     names = location, socket
     if not (slash and all(names)) or '_' in socket or '/' in location or not label.isprintable():
@@ -139,7 +138,7 @@ def socket_place(label: str) -> str:
 
 
 def socket_pairs(samples: Iterable[Sample], frames: Frames) -> list[tuple[str, str]]:
-    """Return the names of the base frames of the two sockets of each location."""
+    """Return the base frames of the two sockets of each location."""
     ends: dict[tuple[str, str], dict[str, None]] = {}
     for sample in samples:
         if sample.socket:
@@ -150,7 +149,7 @@ def socket_pairs(samples: Iterable[Sample], frames: Frames) -> list[tuple[str, s
 
 
 def plain(name: str) -> str:
-    """Return a name as part of a frame's, which holds no dots."""
+    """Return a name as part of a frame name, which has no dots."""
     return name.replace('.', '-')
 
 
@@ -180,9 +179,9 @@ def sets_of(
     frames: Frames,
     posed: bool = False,
 ) -> tuple[tuple[Observations, ...], tuple[Observations, ...]]:
-    """Return what `collect` does of samples, or of an example of each kind of them.
+    """Group samples, or an example of each kind, as `collect`.
 
-    `observed` returns those of one set, by their numbers, as observations.
+    `observed` returns the observations of one set by their indices.
     """
     groups: dict[tuple[str, str, str, bool, bool], list[int]] = {}
     for k, sample in enumerate(samples):
@@ -201,7 +200,7 @@ def sets_of(
 
 
 def lenses(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
-    """Return the lens at each frame of a camera, which must not change."""
+    """Return the lens at each camera frame, which must not change."""
     found: dict[str, Lens] = {}
     for sample in samples:
         if sample.view is not None:
@@ -231,7 +230,6 @@ def _seen(posed: Observations, samples: Sequence[Sample]) -> Observations:
 
 
 def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
-    """Return samples between the same frames and of the same kind as observations."""
     count = len(samples)
     oriented = np.array([sample.rotation is not None for sample in samples])
     rotations = np.tile(np.eye(3), (count, 1, 1))
@@ -252,7 +250,7 @@ def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
         rows = [getattr(sample, name) for sample in samples]
         if all(row is None for row in rows):
             return None
-        nothing = np.zeros(samples[0].joints.shape)  # it stood; how it came there is not known
+        nothing = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
         return np.array([nothing if row is None else row for row in rows], dtype=np.float64)
 
     found = Observations(

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The one path from messages to a calibration, for live topics and for recordings."""
+"""The path from messages to a calibration, for live topics and recordings."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ ONE_FRAME = (
 
 
 class CalibrationSession:
-    """Take messages, keep the samples, identify, and keep the last good result.
+    """Takes messages, keeps samples, identifies, and keeps the last good result.
 
-    `on_sample` is called with every sample as soon as it is taken, `on_removed` with every removed
-    one. Impossible requests raise InputError, impossible settings ConfigError.
+    `on_sample` is called with every new sample, `on_removed` with every removed one. Impossible
+    requests raise InputError, impossible settings ConfigError.
     """
 
     def __init__(
@@ -68,12 +68,12 @@ class CalibrationSession:
         check_settings(chain, self.settings)
         self.recording = True
         self.calibration: Calibration | None = None
-        """The last one that was accepted or loaded."""
-        self._known: frozenset[Sample] = frozenset()  # that were there by then
+        """The last one accepted or loaded."""
+        self._known: frozenset[Sample] = frozenset()  # fitted by it
         self.clear()
 
     def clear(self) -> None:
-        """Forget all samples and counts; the last good calibration stays."""
+        """Forget all samples and counts, not the last good calibration."""
         settings = self.settings
         self._road = Road(self.chain, settings, self._take)
         self._collector, self._clocks = self._road.collector, self._road.clocks
@@ -90,7 +90,7 @@ class CalibrationSession:
         )
 
     def change(self, settings: Settings) -> None:
-        """Continue with other settings; the buffers and samples stay.
+        """Continue with other settings; buffers and samples stay.
 
         Settings that no identification could use change nothing.
         """
@@ -123,20 +123,20 @@ class CalibrationSession:
 
     @property
     def received(self) -> Counter[str]:
-        """Return the number of messages received so far, by kind."""
+        """Return the number of messages received, by kind."""
         return self._entry.received
 
     @property
     def latest(self) -> tuple[int, Sequence[float]] | None:
-        """Return stamp [ns] and values of the last joint state that named all joints."""
+        """Return stamp [ns] and values of the last joint state with all joints."""
         return self._entry.latest
 
     # Samples
 
     def capture(self, socket: str = '') -> tuple[int, str]:
-        """Take one sample of each source now; return how many, and the reason if none.
+        """Take one sample of each source now; return their number, and the reason if none.
 
-        With a `socket` LOCATION/SOCKET the ball sits in it, and only that sample is taken.
+        With a `socket` LOCATION/SOCKET only the ball in it is sampled.
         """
         if not self.recording:
             return 0, NOT_RECORDING
@@ -180,13 +180,13 @@ class CalibrationSession:
 
     @property
     def usable(self) -> list[Sample]:
-        """Return the samples used for identification (`Kept.usable`)."""
+        """Return the samples for identification (`Kept.usable`)."""
         return self._kept.usable()
 
     @property
     def state(self) -> str:
-        """Return in words what the arm does, as far as samples are concerned."""
-        if not self.recording:  # what the arm does is not looked at
+        """Return the state of the arm as far as sampling is concerned."""
+        if not self.recording:
             return NOT_RECORDING
         track = self._collector.track
         silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
@@ -244,44 +244,43 @@ class CalibrationSession:
 
     @property
     def delay(self) -> Delay | None:
-        """Return the delay of the measurement stamps, as far as the motion shows it."""
+        """Return the delay of the measurement stamps, if the motion shows it."""
         return self._clocks.delay
 
     @property
     def came(self) -> str:
-        """Return in words the account of the messages, and what looks wrong."""
+        """Return the account of the messages and the warnings as text."""
         return '; '.join((str(self.account()), *self.warnings))
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return the estimate from the samples so far; None while they are too few."""
+        """Return the estimate from the samples so far; None if they are too few."""
         return self._live.update(self.usable)
 
     def status(self, work: str = '') -> str:
-        """Return in words the state of the arm, other activity, and the progress of sampling.
+        """Return arm state, other `work`, warnings and the progress of sampling as text.
 
-        What an operator must know or do comes first, so a truncated line keeps it. `work` is the
-        other activity.
+        What an operator must do comes first, so that a truncated line keeps it.
         """
-        told = [self.state, work]
+        parts = [self.state, work]
         if why := self._entry.refused.get(POSES):
-            told.append(f'measurements are refused, {why}')
-        told += [hint.status for hint in self.hints]
+            parts.append(f'measurements are refused, {why}')
+        parts += [hint.status for hint in self.hints]
         if self.pictures.refused:
-            told.append(f'the last image is not used: {self.pictures.refused}')
+            parts.append(f'the last image is not used: {self.pictures.refused}')
         estimate = self.estimate
-        told.append(self._live.refused)
+        parts.append(self._live.refused)
         for sample in self._live.suspicious[-1:]:
             number = self.samples.index(sample) + 1
-            told.append(f'pose {number} does not fit the others, was the target moved?')
+            parts.append(f'pose {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
-        told += progress(self.chain, fitted, estimate, self.settings)
-        return '; '.join(filter(None, told))
+        parts += progress(self.chain, fitted, estimate, self.settings)
+        return '; '.join(filter(None, parts))
 
     # Identification
 
     def problem(self) -> Problem:
-        """Return a snapshot of the samples as a problem; later messages do not change it."""
+        """Return a snapshot of the samples as a problem."""
         self._clocks.find(self._collector, None)
         self._flush()
         if self._kept.different:
@@ -290,14 +289,14 @@ class CalibrationSession:
         return self.problem_of(self.usable)
 
     def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
-        """Return samples as a problem; with `posed` boards by their poses, not their corners."""
+        """Return samples as a problem; with `posed` boards as poses, not corners."""
         found = problem_of(self.chain, samples, self.settings, posed)
         if found is None:
             raise InputError(f'no poses to fit: {self.came}')
         return found
 
     def identify(self) -> Identification:
-        """Identify from the samples so far and keep the result if it is accepted."""
+        """Identify from the samples so far, and keep the result if accepted."""
         problem = self.problem()
         try:
             result = identify_model(problem, self.settings.model)
@@ -311,33 +310,32 @@ class CalibrationSession:
     def adopt(self, calibration: Calibration, samples: Sequence[Sample] | None = None) -> None:
         """Use a calibration from now on.
 
-        `samples` must not be used to judge it; default: all current ones.
+        `samples` (default: all) must not be used to judge it.
         """
         refuse_other_joints(calibration, self.chain)
         self._known = frozenset(self.samples if samples is None else samples)
         self.calibration = calibration
 
     def validate(self) -> tuple[ErrorFigures, ErrorFigures]:
-        """Judge the calibration on the poses measured since; nothing is fitted.
+        """Judge the calibration on the poses measured since, without fitting.
 
-        Return the errors of the calibration, and those of the nominal chain in its frames.
+        Returns the errors of the calibration, and of the nominal chain in its frames.
         """
         calibration, sets = self._since()
         nominal, now = compare(calibration.before, calibration.chain, sets).figures
         return now, nominal
 
     def reused(self) -> float:
-        """Return the share of the later samples to which the calibration was fitted."""
+        """Return the share of later samples that the calibration was fitted to."""
         calibration, sets = self._since()
         return calibration.reused(sets)
 
     def recent(self) -> tuple[Calibration, Problem]:
-        """Return the calibration in use, and the last stops since then as a problem."""
+        """Return the calibration, and the last stops since then as a problem."""
         calibration, sets = self._since(NO_ACCIDENT)
         return calibration, problem_since(calibration, self.chain, sets, self.settings)
 
     def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
-        """Return the calibration, and the samples since, or the last of them, in its frames."""
         calibration = self.calibration
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
@@ -347,19 +345,17 @@ class CalibrationSession:
         return calibration, in_frames_of(calibration, since, self.usable, self.settings)
 
     def _flush(self) -> None:
-        """Make samples of everything that has come, as if nothing came late."""
         self._road.flush()
         self._settle(wait=True)
 
     def _settle(self, wait: bool = False) -> None:
-        """Take the samples of images that were looked at, of all of them if asked."""
         self._take((), wait)
         self.pictures.keep_only(self._collector.waiting.images)
 
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
-        """Keep the samples that were made; return how many there are now."""
+        """Keep new samples; return their total number."""
         self.pictures.through(made)
-        usual = self._frames.usual  # until it is known what came last may tell otherwise
+        usual = self._frames.usual  # before it is known, nothing is strange
         fresh = [
             each
             for each in self.pictures.ready(wait)
@@ -372,6 +368,6 @@ class CalibrationSession:
 
 
 def too_few(err: TooFewObservationsError, came: str) -> InputError:
-    """Return an error of too few samples that also says what `came` of the messages."""
+    """Return an error of too few samples with the account of messages `came`."""
     few, _, advice = str(err).rpartition('; ')
     return InputError(f'{few} ({came}); {advice}')

@@ -19,20 +19,19 @@ from calib_ros.values import MOST_NAMES
 
 Stamps: TypeAlias = NDArray[np.int64]
 Series: TypeAlias = tuple[Stamps, FloatArray]
-"""Stamps (N,), and rows (N, w) or values (N,) at them."""
+"""Stamps (N,), with rows (N, w) or values (N,)."""
 
 
 AS_FLOATS = 8.0 * float(np.finfo(np.float32).eps)
-"""Difference, relative as well, of values that are the same: they may have been floats, and have
-gone through some roundings."""
+"""Relative and absolute difference of equal values, which may have been rounded to float."""
 
 
 class Rows:
-    """Stamped rows of numbers in one growing block of memory, up to a capacity."""
+    """Stamped rows of numbers in one growing array, up to a capacity."""
 
     def __init__(self, width: int, capacity: int) -> None:
         self.width, self.capacity = width, capacity
-        self.count = self.contrary = 0  # rows held; rows let go for another with other values
+        self.count = self.contrary = 0  # rows held; rows dropped for others of the same stamp
         self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
         self._values = np.empty((len(self._stamps), width))
 
@@ -72,16 +71,16 @@ class Rows:
         self.count = len(stamps)
 
     def release(self, count: int) -> None:
-        """Let go the first rows."""
+        """Drop the first rows."""
         left = self.count - count
         self._values[:left] = self._values[count : self.count]
         self._stamps[:left] = self._stamps[count : self.count]
         self.count = left
 
     def sort(self) -> int:
-        """Put the rows in the order of their stamps, one row a stamp; return how many went.
+        """Sort the rows by stamp, one row each; return how many were dropped.
 
-        Of equal stamps the smallest values win, so that the order of arrival does not choose.
+        Of equal stamps the smallest values are kept, so that the order of arrival does not matter.
         """
         before = self.count
         if before > 1 and not (np.diff(self.stamps) > 0).all():
@@ -98,16 +97,13 @@ class Rows:
 
 JOINTS, POSES = 'joints', 'measurements'
 NO_ACCIDENT = round(1.0 / (1.0 - CONFIDENT))
-"""So many messages that differ from the others are no accident: one in so many may be."""
+"""Number of differing messages that cannot be chance."""
 SILENCE = 5.0 * Settings.lateness
-"""A joint or topic that was active and is silent for this long [s] is reported."""
+"""Silence [s] after which an active joint or topic is reported."""
 
 
 class StreamKey(NamedTuple):
-    """What one stream of measurements is of: device, target, and whether it only judges.
-
-    What is measured in another frame is another stream.
-    """
+    """One stream of measurements: device, target, purpose, kind and frame."""
 
     device: str
     target: str
@@ -119,16 +115,16 @@ class StreamKey(NamedTuple):
 
     @property
     def is_place(self) -> bool:
-        """Tell whether it says where the target is in the frame of its device."""
+        """Tell whether it measures the target in the frame of its device."""
         return not (self.distance or self.eye_in_hand or self.images)
 
 
 Columns: TypeAlias = tuple[int, ...]
-"""The numbers in the chain of the joints that a message names."""
+"""Indices of the chain's joints that a message names."""
 
 
 class Piece(NamedTuple):
-    """Messages of one stream: places (N,) in the order of arrival, stamps (N,), numbers (N, w)."""
+    """Messages of one stream: places (N,) in order of arrival, stamps (N,), numbers (N, w)."""
 
     key: Columns | StreamKey
     places: Index
@@ -137,27 +133,27 @@ class Piece(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Return what is said: where joints are, or what was measured."""
+        """Return JOINTS or POSES."""
         return POSES if isinstance(self.key, StreamKey) else JOINTS
 
     def cut(self, begin: int, end: int) -> Piece:
-        """Return what has its place from `begin` on and before `end`."""
+        """Return the messages with places from `begin` to before `end`."""
         part = slice(*np.searchsorted(self.places, (begin, end)).tolist())
         return Piece(self.key, self.places[part], self.stamps[part], self.numbers[part])
 
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """Messages in the order in which they came; places count from the first one of a batch."""
+    """Messages in order of arrival; places count from the first one of a batch."""
 
     pieces: tuple[Piece, ...]  # by stream, the first to come first
     begin: int  # the place of the first message here
-    joints: Flags  # (N,) messages that are joint states
-    times: Stamps  # (N,) all stamps on the clock of the joints [ns]
+    joints: Flags  # (N,) which are joint states
+    times: Stamps  # (N,) stamps on the joints' clock [ns]
 
     @classmethod
     def of(cls, pieces: Sequence[Piece], delay_ns: int = 0) -> Slice:
-        """Put pieces in order; measurements are stamped late by `delay_ns`."""
+        """Order pieces by arrival; measurements are stamped late by `delay_ns`."""
         lengths = [len(each.places) for each in pieces]
         order = np.argsort(np.concatenate([each.places for each in pieces]), kind='stable')
         joints = np.repeat([each.kind == JOINTS for each in pieces], lengths)
@@ -167,17 +163,16 @@ class Slice:
         return cls(_by_arrival(ranked), 0, joints[order], times[order])
 
     def __len__(self) -> int:
-        """Return how many messages there are."""
         return len(self.times)
 
     def between(self, begin: int, end: int) -> Slice:
-        """Return the messages from the one of a number on and before that of another."""
+        """Return the messages from index `begin` to before `end`."""
         pieces = [each.cut(self.begin + begin, self.begin + end) for each in self.pieces]
         part = slice(begin, end)
         return Slice(_by_arrival(pieces), self.begin + begin, self.joints[part], self.times[part])
 
     def where(self, kind: str) -> Index:
-        """Return the numbers (K,) of the messages of a kind."""
+        """Return the indices (K,) of the messages of a kind."""
         return np.flatnonzero(self.joints if kind == JOINTS else ~self.joints)
 
 
@@ -191,10 +186,10 @@ TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
 
 
 class Waiting(dict[StreamKey, Rows]):
-    """The buffers by stream, of rows (N, width) each.
+    """Buffers of rows (N, width) by stream.
 
-    A tracker may number markers without end: a stream without any use is forgotten, unless
-    samples of it are `kept`.
+    A tracker may number markers without end: unused streams are forgotten, unless samples of them
+    are `kept`.
     """
 
     def __init__(
@@ -204,23 +199,23 @@ class Waiting(dict[StreamKey, Rows]):
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
         self.last_ns: dict[StreamKey, int] = {}
-        """Stamps of the last measurements to come, by stream."""
+        """Stamps of the last measurements, by stream."""
         self.unmatched: Counter[StreamKey] = Counter()
-        """How many have found no joint states since the last that did, by stream."""
+        """Measurements without joint states since the last match, by stream."""
 
     @property
     def count(self) -> int:
-        """Return how many measurements wait."""
+        """Return the number of waiting measurements."""
         return sum(rows.count for rows in self.values())
 
     @property
     def images(self) -> set[int]:
-        """Return the numbers of the images that wait."""
+        """Return the numbers of waiting images."""
         found = [rows.values[:, 0] for key, rows in self.items() if key.images]
         return {int(number) for numbers in found for number in numbers.tolist()}
 
     def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray, after_ns: int) -> None:
-        """Take measurements: numbers (M, w) at stamps (M,), those after a stamp."""
+        """Take measurements: numbers (M, w) at stamps (M,), those after `after_ns`."""
         if key not in self and len(self) >= MOST_NAMES:  # forget those without any use
             for each in [each for each, rows in self.items() if not rows.count]:
                 if not self._kept(each):
@@ -242,7 +237,7 @@ class Waiting(dict[StreamKey, Rows]):
         rows.extend(stamps[taken], numbers[taken])
 
     def room(self, given: Slice) -> int | None:
-        """Return up to where there is room for messages; None where it must be made."""
+        """Return up to where messages fit; None if room must be made."""
         streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
         if len(self.keys() | {each.key for each in streams}) > MOST_NAMES:
             return None

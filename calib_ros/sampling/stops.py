@@ -1,13 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Stops of the arm: which become samples, which are ignored, and the means measured at them.
-
-An arm vibrates after its joints have stopped. So the mean begins where the measurements have come
-as close to the later ones as their noise allows, and a stop whose measurements still spread more
-than that is refused: something moved that no joint reports. The noise is the sigma given or the
-one that successive differences show (von Neumann 1941), whichever is larger: a slow motion is in
-the spread, but hardly in the differences.
-"""
+"""Stops of the arm: which become samples, and the means measured at them (docs/model.md)."""
 
 from __future__ import annotations
 
@@ -23,28 +16,27 @@ from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
 
 MOST_SPREAD = 2.0
-"""Largest spread [noise] of measurements and joints at a stop: a motion is in the spread alone.
-A convention."""
+"""Largest spread [noise] of measurements and joints at a stop. A convention."""
 NEAR = 2.0 * MOST_SPREAD
-"""Distance [noise] to the later half within which a measurement is taken to have settled."""
+"""Distance [noise] to the later half within which a measurement has settled."""
 SPIKE = 3.0 * MOST_SPREAD
-"""A single measurement further from the median [noise] is left out of the mean."""
+"""Distance [noise] from the median beyond which a single measurement is rejected."""
 
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """The means of what was measured at S stops."""
+    """Means of the measurements at S stops."""
 
-    used: Flags  # (N,) measurements in them
-    rests: Flags  # (S,) False where measurements spread more than their noise
+    used: Flags  # (N,) measurements used
+    rests: Flags  # (S,) False if measurements spread more than noise
     values: FloatArray  # (S, 3) or (S, 1) [m]
-    spreads: FloatArray  # (S,) RMS of one coordinate about them [m]
+    spreads: FloatArray  # (S,) RMS of one coordinate about the mean [m]
 
 
 def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
-    """Average positions (N, 3) or distances (N, 1) [m] stop by stop, in the order of their stamps.
+    """Average positions (N, 3) or distances (N, 1) [m] of each stop, in stamp order.
 
-    The stops begin at `begins` (S,); `sigmas` (S,) [m] are those of one coordinate expected.
+    Stops begin at `begins` (S,); `sigmas` (S,) [m] are the expected ones of a coordinate.
     """
     used, limits = np.ones(len(values), dtype=bool), np.full(len(begins), np.inf)
     rests = np.ones(len(begins), dtype=bool)
@@ -58,7 +50,7 @@ def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
         settled[: _settled(values[part], reach)] = False
         middle = np.median(values[part][settled], axis=0)
         spikes = np.linalg.norm(values[part] - middle, axis=1) > SPIKE * reach
-        rests[k] = (spikes & settled).sum() <= MOST_OUTLIERS * settled.sum()  # else two places
+        rests[k] = (spikes & settled).sum() <= MOST_OUTLIERS * settled.sum()  # else in two places
         settled &= ~spikes
     means = mean_of_each(values, begins, used)
     squares = (values - np.repeat(means, ends - begins, axis=0)) ** 2
@@ -67,7 +59,7 @@ def averages(values: FloatArray, begins: Index, sigmas: FloatArray) -> Means:
 
 
 def mean_of_each(rows: FloatArray, begins: Index, used: Flags) -> FloatArray:
-    """Return the means (S, ...) of the rows (N, ...) in use of each stop, zero where none is."""
+    """Return the means (S, ...) of the used rows (N, ...) of each stop, zero if none."""
     shape = (-1,) + (1,) * (rows.ndim - 1)
     counts = np.maximum(np.add.reduceat(used, begins, dtype=np.intp), 1)
     return np.asarray(np.add.reduceat(rows * used.reshape(shape), begins) / counts.reshape(shape))
@@ -76,14 +68,14 @@ def mean_of_each(rows: FloatArray, begins: Index, used: Flags) -> FloatArray:
 def _noise(values: FloatArray) -> float:
     """Return the standard deviation of one coordinate from successive differences."""
     steps = np.abs(np.diff(values, axis=0))
-    return float(1.4826 * np.median(steps) / np.sqrt(2.0))  # the median: spikes do not count
+    return float(1.4826 * np.median(steps) / np.sqrt(2.0))  # robust
 
 
 def _settled(values: FloatArray, reach: float) -> int:
-    """Return how many measurements come before all of them stay near the later half."""
+    """Return the number of measurements before all stay near the later half."""
     half = len(values) // 2
     far = np.linalg.norm(values[:half] - np.median(values[half:], axis=0), axis=1) > NEAR * reach
-    # A spike among settled ones is no vibration: two of three in a row must be far.
+    # vibration, not a spike: two of three in a row are far
     pairs = far & (np.append(far[1:], False) | np.append(far[2:], [False, False]))
     last = np.flatnonzero(pairs)
     return int(last[-1]) + 2 if last.size else 0
@@ -94,14 +86,14 @@ SAMPLED = 'of a stop that already has its pose'
 
 @dataclass
 class Plan:
-    """The fate of measurements up to stamps, each from the end of the one before.
+    """What to do with measurements up to successive stamps.
 
-    Those up to each of the `ends` are not used for a reason, or it is empty and they are, from
-    where their stop begins.
+    Those up to each of the `ends` are unused because of `why`; if that is empty they are used from
+    `begins`.
     """
 
-    done_ns: int  # up to which measurements have been dealt with
-    sampled_ns: int  # a stop that stands at this moment has been sampled
+    done_ns: int  # measurements before this are settled
+    sampled_ns: int  # a stop at this moment has been sampled
     ends: list[int] = field(default_factory=list)
     why: list[str] = field(default_factory=list)
     begins: list[int] = field(default_factory=list)
@@ -115,7 +107,7 @@ class Plan:
             self.begins.append(begin)
 
     def sampled(self, until: int) -> None:
-        """Drop the rest of a stop."""
+        """Skip the rest of a stop."""
         self.add(until, SAMPLED)
         self.sampled_ns = max(self.sampled_ns, self.done_ns)
 
@@ -126,7 +118,7 @@ class Plan:
 
     @property
     def stops(self) -> list[int]:
-        """Return the numbers of the stops that give samples."""
+        """Return the indices of the stops that give samples."""
         return [k for k, why in enumerate(self.why) if not why]
 
     def of_stands(
@@ -152,7 +144,7 @@ class Plan:
                 continue
             last = min(end, begin + longest)
             if last > until or (goes_on and last == end):
-                return self  # it is waited for
+                return self  # not over yet
             if last - begin < shortest:
                 self.add(last, 'the stop was too short')
                 continue
@@ -163,12 +155,12 @@ class Plan:
 
 
 class Known:
-    """Where and when stops were sampled: the clock may jump back, and they come again."""
+    """Sampled stops: after the clock jumped back, they are not sampled again."""
 
     def __init__(self, revolute: Flags, capacity: int) -> None:
         self._revolute = revolute
-        self._stops = Rows(1 + len(revolute), capacity)  # how long, and where
-        self._last_ns = 0  # none ends later
+        self._stops = Rows(1 + len(revolute), capacity)  # length and joint values
+        self._last_ns = 0  # latest end
 
     def meets(self, begin: int, end: int, where: FloatArray, near: float) -> bool:
         """Tell whether a stop at joint values (n,) was sampled before; remember it if not."""
@@ -184,15 +176,15 @@ class Known:
         return False
 
     def forget(self, stamp_ns: int) -> None:
-        """Forget the stop that stands at a stamp of the joints."""
+        """Forget the stop at a joint stamp."""
         since = stamp_ns - self._stops.stamps
         self._stops.keep((since < 0) | (since > self._stops.values[:, 0]))
 
 
 class Rests:
-    """How many stops were `sampled`, and the noise of the joints where they rested unseen.
+    """Number of stops `sampled`, and joint noise at rests that no stop shows.
 
-    They pass unseen where their values are noisier than `still`. Up to a `capacity` are counted.
+    They are missed if the joint values are noisier than `still`. At most `capacity` are counted.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -202,13 +194,13 @@ class Rests:
         self._resting = False
 
     def note(self, noise: float | None) -> None:
-        """Note the noise of joints that rest though no stop is found, None while they do not."""
+        """Note the noise of joints at an undetected rest, None while they move."""
         before, self._resting = self._resting, noise is not None
         if noise is not None and not before and len(self._unseen) < self._capacity:
             self._unseen.append(noise)
 
     def needed(self, still: float) -> float | None:
-        """Return what `still` must be at least where more rests passed unseen than not."""
+        """Return the least `still` that detects most rests; None if it does already."""
         if len(self._unseen) <= self.sampled:
             return None
         needed = SPIKE * float(np.median(self._unseen))
@@ -218,10 +210,9 @@ class Rests:
 def seen_stops(
     stands: Stamps, rounds: Sequence[int], settled_ns: int, late_ns: int, shortest_ns: int
 ) -> list[bool]:
-    """Tell of each round whether a stop shows in what the one before has not dealt with.
+    """Tell for each round whether it shows a stop that earlier ones have not settled.
 
-    Stands (K, 2) of the joints, and stamps of the rounds, of which each deals with what is older
-    than it by `late_ns`.
+    Stands are (K, 2); each round settles what is older than its stamp by `late_ns`.
     """
     times = np.array(rounds)[:, np.newaxis]
     settled = np.concatenate([[[settled_ns]], times[:-1] - late_ns])

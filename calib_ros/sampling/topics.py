@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of the topics of a recording to read."""
+"""Choice of the topics of a recording."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def choose(
     messages_on: Reading,
     deserialise: Deserialise,
 ) -> dict[str, Stream]:
-    """Choose topics by type from those available (topic to type), unless they are named.
+    """Choose topics by type from those available (topic to type), unless named in the settings.
 
-    Where there is none or more than one an InputError lists the candidates.
+    Raises InputError with the candidates if there is none, or more than one.
     """
     own = outputs(available)
     sources = parse_sources(settings.sources)
@@ -72,7 +72,7 @@ def choose(
     streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
     chosen = {stream.topic: stream for stream in streams if stream.topic in available}
     still = {topic: stream for topic, stream in chosen.items() if stream.still}
-    if still:  # whenever it was recorded: measurements must not wait for it
+    if still:  # read first: measurements must not wait for it
         _learn(messages_on(still), deserialise)
     return chosen
 
@@ -80,7 +80,6 @@ def choose(
 def _links(
     available: Mapping[str, str], messages_on: Reading, deserialise: Deserialise
 ) -> list[str]:
-    """Return in words which links between frames move, by topic."""
     found = []
     for topic, kind in available.items():
         if kind in LINKS and not topic.endswith(STATIC):
@@ -91,16 +90,13 @@ def _links(
 
 
 def _learn(messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise) -> None:
-    """Let the links of streams learn of all that comes on them.
-
-    What is wrong with a recording is told when it is replayed.
-    """
+    """Pass all messages to the links of their streams; errors are reported in the replay."""
     for batch, _ in batches(messages):
         Intake(batch, deserialise)
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
-    """Return the topics beneath calibration nodes, which are known by what only they publish."""
+    """Return the topics of calibration nodes, recognised by their MARKERS."""
     nodes = [
         topic.rpartition('/')[0]
         for topic in available
@@ -117,25 +113,25 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 def check_joints(
     messages: Iterator[tuple[Stream, bytes]], joint_names: Sequence[str], deserialise: Deserialise
 ) -> None:
-    """Refuse joint states of a recording in which several topics name the same joints.
+    """Refuse joint states if several topics name the same joints.
 
-    The InputError has the topics, and how far their values are apart.
+    The InputError names the topics, and how far their values differ.
     """
-    heard: dict[str, dict[str, Series]] = defaultdict(dict)
+    series: dict[str, dict[str, Series]] = defaultdict(dict)
     for (topic, name), parts in _joint_values(messages, deserialise).items():
         if name in joint_names:
             stamps = np.concatenate([each for each, _ in parts])
             values = np.concatenate([each for _, each in parts])
             order = np.argsort(stamps, kind='stable')
-            heard[topic][name] = stamps[order], values[order]
+            series[topic][name] = stamps[order], values[order]
     twice = [
         (a, b, shared)
-        for a, b in itertools.combinations(sorted(heard), 2)
-        if (shared := [name for name in joint_names if name in heard[a] and name in heard[b]])
+        for a, b in itertools.combinations(sorted(series), 2)
+        if (shared := [name for name in joint_names if name in series[a] and name in series[b]])
     ]
     if twice:
         names = [name for name in joint_names if any(name in shared for *_, shared in twice)]
-        apart = '; '.join(_apart(a, b, heard[a], heard[b], shared) for a, b, shared in twice)
+        apart = '; '.join(_apart(a, b, series[a], series[b], shared) for a, b, shared in twice)
         raise InputError(
             f'joints {", ".join(names)} come on several topics: {apart}. Choose the measured one '
             '(or several that name different joints) with --joint-topics'
@@ -158,7 +154,7 @@ def _joint_values(
 def _apart(
     a: str, b: str, first: Mapping[str, Series], second: Mapping[str, Series], names: Sequence[str]
 ) -> str:
-    """Return in words by how much the joint values on two topics differ at the same time."""
+    """Return by how much the joint values on two topics differ at the same time."""
     largest: tuple[float, str] | None = None
     for name in names:
         dense, sparse = sorted((first[name], second[name]), key=lambda each: -len(each[0]))
@@ -176,7 +172,6 @@ def _apart(
 
 
 def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
-    """Return the sources of a bag by their types; one at most is fitted."""
     own = outputs(available)
     sources = [
         parse_source(f'{topic} type={kind}')

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Recent joint samples: where the joints were at a stamp, and when they stood still.
+"""Recent joint samples: joint values at a stamp, and when the joints stood still.
 
-Everything is a function of the samples held, by their header stamps; the order of arrival does
-not matter. Several publishers may each name part of the joints: each part is a track of its own,
-interpolated on its own.
+Everything depends on header stamps only, not on the order of arrival. Each publisher may name some
+of the joints; each part is interpolated on its own.
 """
 
 from __future__ import annotations
@@ -21,20 +20,20 @@ from calib_ros.sampling.slices import Rows, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
 LOOKS_BACK = FEW
-"""Samples within the window with which the present one is compared."""
+"""Samples in the window that the present one is compared with."""
 
 
 def standing(
     stamps: Stamps, values: FloatArray, still: float, window_ns: int, max_gap_ns: int
 ) -> Stamps:
-    """Return (K, 2) from when to when the joints of one publisher stood."""
+    """Return the intervals (K, 2) in which the joints of one publisher stood."""
     if len(stamps) == 0:
         return np.zeros((0, 2), dtype=np.int64)
     index = np.arange(len(stamps))
     gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
-    begin = index[gap][np.cumsum(gap) - 1]  # where the samples without a gap begin
+    begin = index[gap][np.cumsum(gap) - 1]  # start of the run without gaps
     quiet = np.ones(len(stamps), dtype=bool)
-    joints = values.T.copy()  # numpy is slow over a short last axis
+    joints = values.T.copy()  # numpy is slow over a short axis
     back = begin
     for lag in range(1, LOOKS_BACK + 1):
         back = np.searchsorted(stamps, stamps - window_ns * lag // LOOKS_BACK)
@@ -44,12 +43,12 @@ def standing(
     ends = np.flatnonzero(quiet & ~(np.concatenate([quiet[1:], [False]])))
     ends = np.union1d(ends, np.flatnonzero(quiet & np.concatenate([gap[1:], [False]])))
     found = np.stack([stamps[back[starts]], stamps[ends]], axis=1)
-    found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch parts two stands
+    found[1:, 0] = np.maximum(found[1:, 0], found[:-1, 1])  # a twitch separates two stands
     return np.asarray(found[found[:, 0] < found[:, 1]], dtype=np.int64)
 
 
-def unheard(stamps: Stamps, max_gap_ns: int) -> Stamps:
-    """Return (K, 2) when a publisher was not heard; what it shows before and after overlaps."""
+def silences(stamps: Stamps, max_gap_ns: int) -> Stamps:
+    """Return the intervals (K, 2) without messages of a publisher, and a sample on either side."""
     limits = np.iinfo(np.int64)
     gaps = np.flatnonzero(np.diff(stamps) > max_gap_ns)
     begins = np.concatenate([[limits.min], stamps[gaps] - 1, stamps[-1:] - 1])
@@ -58,7 +57,7 @@ def unheard(stamps: Stamps, max_gap_ns: int) -> Stamps:
 
 
 def union(several: Sequence[Stamps]) -> Stamps:
-    """Return (K, 2) the intervals of sorted lists, those that overlap as one."""
+    """Return the union (K, 2) of sorted lists of intervals."""
     if len(several) == 1:
         return several[0]
     found = np.concatenate(several)
@@ -71,7 +70,7 @@ def union(several: Sequence[Stamps]) -> Stamps:
 
 
 def intersection(first: Stamps, second: Stamps) -> Stamps:
-    """Return (K, 2) what two sorted lists of intervals have in common."""
+    """Return the intersection (K, 2) of two sorted lists of intervals."""
     starts = np.maximum(first[:, np.newaxis, 0], second[np.newaxis, :, 0])
     ends = np.minimum(first[:, np.newaxis, 1], second[np.newaxis, :, 1])
     chosen = starts < ends
@@ -80,15 +79,13 @@ def intersection(first: Stamps, second: Stamps) -> Stamps:
 
 APART = 'joint states too far apart'
 CAUSES = ('', 'no joint state before', 'no joint state after', APART)
-"""Why there are no joint values at a stamp; the first entry stands for none."""
-
-
+"""Why there are no joint values at a stamp; the first entry means there are."""
 Brackets: TypeAlias = tuple[Index, Index, Index]
-"""Causes (N,), and the samples before and after each stamp."""
+"""Causes (N,), and the indices of samples before and after each stamp."""
 
 
 class Motion(NamedTuple):
-    """Joint values (N, n), their velocities and accelerations unless the arm stands."""
+    """Joint values (N, n), with velocities and accelerations unless at rest."""
 
     joints: FloatArray
     velocity: FloatArray | None = None
@@ -96,9 +93,9 @@ class Motion(NamedTuple):
 
 
 class Track:
-    """Recent samples of all joints; the `revolute` (n,) ones have angles as values.
+    """Recent samples of all joints; `revolute` (n,) ones have angles as values.
 
-    It interpolates over `max_gap` [s] at most, and keeps up to a capacity of one publisher.
+    It interpolates over at most `max_gap` [s], and keeps up to a capacity per publisher.
     """
 
     def __init__(self, revolute: Sequence[bool], max_gap: float, capacity: int) -> None:
@@ -106,20 +103,20 @@ class Track:
         self._max_gap_ns = round(max_gap * 1e9)
         self._capacity = capacity
         self._parts: dict[tuple[int, ...], Rows] = {}
-        self._came = np.zeros(len(revolute))  # signs of the last moves before the samples held
+        self._came = np.zeros(len(revolute))  # signs of last moves before the samples
         self.contrary = 0
-        """Samples dropped for another of the same stamp with different values."""
+        """Samples dropped for different values of the same stamp."""
         self.horizon_ns = 0
         """Samples before this stamp have been dropped."""
 
     @property
     def newest_ns(self) -> int:
-        """Return the stamp up to which every joint that anybody names has been heard."""
-        heard = self._heard()
+        """Return the stamp up to which all named joints have been received."""
+        heard = self._newest()
         return int(heard[heard > 0].min(initial=np.iinfo(np.int64).max)) if heard.any() else 0
 
-    def _heard(self) -> Stamps:
-        """Return (n,) the newest stamp of each joint, zero where nobody has named it."""
+    def _newest(self) -> Stamps:
+        """Return the newest stamp of each joint (n,), zero if never named."""
         heard = np.zeros(len(self._revolute), dtype=np.int64)
         for columns, rows in self._parts.items():
             if rows.count:
@@ -128,13 +125,13 @@ class Track:
         return heard
 
     def room(self, columns: tuple[int, ...]) -> int:
-        """Return the number of further samples of some joints that fit."""
+        """Return how many more samples of some joints fit."""
         rows = self._parts.get(columns)
         return self._capacity if rows is None else self._capacity - rows.count
 
     @property
     def full(self) -> bool:
-        """Tell whether there is no room for more of a publisher's samples."""
+        """Tell whether a publisher has no room for more samples."""
         return any(rows.full for rows in self._parts.values())
 
     @property
@@ -144,8 +141,8 @@ class Track:
         return tuple(k for k in range(len(self._revolute)) if k not in named)
 
     def silent(self, time_ns: int) -> tuple[int, ...]:
-        """Return the joints that were last heard so much earlier than others were."""
-        heard = self._heard()
+        """Return the joints last received so much earlier than others."""
+        heard = self._newest()
         return tuple(np.flatnonzero((heard > 0) & (heard < heard.max() - time_ns)).tolist())
 
     def extend(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
@@ -156,17 +153,17 @@ class Track:
         rows.extend(stamps, values)
 
     def sort(self) -> int:
-        """Put all samples in order; return how many had the stamp of another one."""
+        """Sort all samples; return how many had the stamp of another one."""
         before = sum(rows.contrary for rows in self._parts.values())
-        gone = sum(rows.sort() for rows in self._parts.values())
+        dropped = sum(rows.sort() for rows in self._parts.values())
         self.contrary += sum(rows.contrary for rows in self._parts.values()) - before
-        return gone
+        return dropped
 
     def at(self, stamps: Stamps, standing: bool = False) -> Motion:
-        """Return the motion at stamps (N,) at which it is known (`causes`), after `sort`.
+        """Return the motion at stamps (N,) where it is known (`causes`), after `sort`.
 
-        While the arm stands joint values are interpolated linearly: a cubic beside the end of a
-        stop would hold a part of the move.
+        At rest joint values are interpolated linearly: a cubic at the end of a stop would include
+        part of the move.
         """
         found = np.zeros((3, len(stamps), len(self._revolute)))
         for index, rows, (why, first, last) in self._around(stamps):
@@ -185,7 +182,7 @@ class Track:
         return found
 
     def causes(self, stamps: Stamps) -> Index:
-        """Return (N,) why there are no joint values at stamps, as indices of CAUSES."""
+        """Return why there are no joint values at stamps (N,), as indices of CAUSES."""
         cause = np.full((len(stamps), len(self._revolute)), 1, dtype=np.intp)
         for index, _, (why, *_) in self._around(stamps):
             worse = cause[:, index] != 0
@@ -193,9 +190,9 @@ class Track:
         return np.asarray(cause.max(axis=1, initial=0))
 
     def _around(self, stamps: Stamps) -> Iterator[tuple[list[int], Rows, Brackets]]:
-        """Yield the joints of each part, its samples, and those around stamps (N,).
+        """Yield the joints of each part, its samples, and brackets of stamps (N,).
 
-        A joint that several name is taken from the last that has it.
+        The last part with a joint takes precedence.
         """
         for columns, rows in sorted(self._parts.items(), key=lambda item: len(item[0])):
             yield list(columns), rows, self._brackets(rows.stamps, stamps)
@@ -216,10 +213,10 @@ class Track:
         return cause.astype(np.intp), first.astype(np.intp), last.astype(np.intp)
 
     def standing(self, still: float, window: float) -> Stamps:
-        """Return (K, 2) from when to when all joints stood, after `sort`.
+        """Return the intervals (K, 2) in which all joints stood, after `sort`.
 
-        A joint stands where its value [rad or m] has stayed within `still` during a window [s]. Of
-        several publishers that name it one must show that, and none that is heard the contrary.
+        A joint stands if its value [rad or m] stayed within `still` during a window [s]. Of
+        several publishers of a joint, one must show that, and none that was received the contrary.
         """
         stands = {
             columns: standing(
@@ -236,7 +233,7 @@ class Track:
         for several in dict.fromkeys(filter(None, named)):
             found = union([stands[columns] for columns in several])
             for columns in several if len(several) > 1 else ():
-                silence = unheard(self._parts[columns].stamps, self._max_gap_ns)
+                silence = silences(self._parts[columns].stamps, self._max_gap_ns)
                 found = intersection(found, union([stands[columns], silence]))
             common = found if common is None else intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
@@ -244,9 +241,8 @@ class Track:
     def noise_at_rest(self, time_ns: int, newest_ns: int) -> float | None:
         """Return the standard deviation [rad or m] of the noisiest joint, after `sort`.
 
-        Second differences of the samples of some time up to a stamp show it, with no motion in
-        them (von Neumann 1941). None where they are too few, or spread more than that: the arm
-        moves.
+        From second differences of the samples of some time before a stamp, free of motion (von
+        Neumann 1941). None with too few samples, or more spread than that: the arm moves.
         """
         largest = None
         for columns, rows in self._parts.items():
@@ -263,18 +259,18 @@ class Track:
         return largest
 
     def release(self, before_ns: int) -> int:
-        """Let go the samples before a stamp, after `sort`; return how many.
+        """Drop the samples before a stamp, after `sort`; return how many.
 
-        The last one is kept, unless others name the joints of a publisher that has fallen silent.
+        The last one is kept, unless others name the joints of a publisher that has become silent.
         """
-        gone = 0
-        heard = self._heard()
+        dropped = 0
+        heard = self._newest()
         for columns, rows in tuple(self._parts.items()):
             index = list(columns)
             cut = int(np.searchsorted(rows.stamps, before_ns))
             if 0 < cut == rows.count and (heard[index] > rows.stamps[-1]).all():
                 del self._parts[columns]
-                gone += cut
+                dropped += cut
                 continue
             cut = min(cut, rows.count - 1)
             if cut <= 0:
@@ -285,17 +281,17 @@ class Track:
             )
             self._came[index] = came[0]
             rows.release(cut)
-            gone += cut
+            dropped += cut
         self.horizon_ns = max(self.horizon_ns, before_ns)
-        return gone
+        return dropped
 
     def halve(self) -> int:
-        """Let go the older half of the samples, after `sort`; return how many."""
+        """Drop the older half of the samples, after `sort`; return how many."""
         middle = [int(rows.stamps[rows.count // 2]) for rows in self._parts.values() if rows.full]
         return self.release(max(middle, default=0))
 
     def samples(self) -> Series:
-        """Return stamps (M,) and joint values (M, n) where the main publisher was heard."""
+        """Return stamps (M,) and joint values (M, n) of the main publisher."""
         if self.missing:
             return np.zeros(0, dtype=np.int64), np.zeros((0, len(self._revolute)))
         main = max(self._parts.items(), key=lambda item: len(item[0]))[1]

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements from the transforms between frames on /tf and /tf_static.
+"""Measurements from the transforms on /tf and /tf_static.
 
-A source names two frames. Between them there must be one link that moves; what stands still
-before and after it, in either direction, is composed with it at its stamps. Several moving links
-are refused: at one moment only one of them is known, and mostly they are the robot's own joints,
-by which it would be measured with itself.
+A source names two frames. Exactly one link between them must move; static links before and after
+it, in either direction, are composed with it at its stamps. Several moving links are refused: at
+one moment only one of them is known, and mostly they are the robot's own joints, which would
+measure the robot with itself.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from calib_ros.shown import LISTED, some
 from calib_ros.values import SAME
 
 Pair: TypeAlias = tuple[str, str]
-"""Names of the parent and the child frame of a link."""
+"""Parent and child frame of a link."""
 
 STATIC = '_static'
-"""What the name of the topic of links that stand still ends with."""
+"""Suffix of the topic of static links."""
 
 
 class Linked(NamedTuple):
-    """Transforms between the same two frames, of messages at some `places` (N,) in the batch.
+    """Transforms between two frames, from messages at `places` (N,) in the batch.
 
-    Their numbers are read only where they are wanted; the first and the last stamp are known.
+    Numbers are read on demand; first and last stamp are known.
     """
 
     places: Index
@@ -49,7 +49,7 @@ class Linked(NamedTuple):
 
 
 class Route(NamedTuple):
-    """T_parent_child is `before` times the moving link, or its inverse, times `after`."""
+    """T_parent_child as `before` times the moving link, or its inverse, times `after`."""
 
     link: Pair
     inverse: bool
@@ -59,7 +59,7 @@ class Route(NamedTuple):
 
 @dataclass
 class Seen:
-    """Count of a moving link, and its first and last stamp."""
+    """Count of a moving link, with its first and last stamp."""
 
     count: int
     first_ns: int
@@ -67,7 +67,7 @@ class Seen:
 
     @property
     def rate(self) -> float:
-        """Return the mean rate [Hz], by the stamps; 0 when it is not known."""
+        """Return the mean rate [Hz] by the stamps; 0 if unknown."""
         span = 1e-9 * (self.last_ns - self.first_ns)
         return (self.count - 1) / span if span > 0.0 else 0.0
 
@@ -75,7 +75,7 @@ class Seen:
 class Links:
     """The links between frames, and the measurements of sources from them.
 
-    Those that stand still come on the topic of those that move with _static behind it.
+    Static links have the topic of moving ones with the suffix _static.
     """
 
     def __init__(self, topic: str, sources: Sequence[Source] = (), kind: str = TRANSFORMS) -> None:
@@ -86,20 +86,20 @@ class Links:
         self._moving: dict[Pair, Seen] = {}
         self._changed: set[Pair] = set()
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
-        self._parents = defaultdict[str, list[Pair]](list)  # links to frames, as the routes are
+        self._parents = defaultdict[str, list[Pair]](list)  # links by child frame
         self._known = False  # whether the routes are up to date
         self._wanted: set[Pair] = set()
-        self._open = True  # whether frames of a source are not linked yet
+        self._open = True  # whether a source's frames are not linked yet
         self.layouts: dict[int, list[Layout]] = {}
-        """How its messages are laid out, by their length."""
+        """Layouts by message length."""
         self._held: deque[tuple[Pair, Readings]] = deque()
         self._let_go: Counter[Pair] = Counter()
 
     def take(self, come: Sequence[Linked]) -> tuple[list[Part], Counter[str]]:
-        """Return what sources make of transforms, and why some cannot be used.
+        """Return the measurements of sources in transforms, and why some cannot be used.
 
-        Frames that are named anywhere among them are known for all of them. Where the frames
-        between are not known yet, measurements wait for them.
+        Frames named anywhere among them are known for all. Measurements wait while the links
+        between their frames are unknown.
         """
         for each in come:
             self._fix(each) if each.still else self._move(each)
@@ -123,8 +123,8 @@ class Links:
             places = each.places[good]
             found += [Part(places, s, self._reading(s, route, read)) for s, route in measured]
         if not self._open:
-            gone = sum(n * len(self._of(link)) for link, n in self._let_go.items())
-            faults += Counter({'buffer full before their frames were linked': gone})
+            lost_count = sum(n * len(self._of(link)) for link, n in self._let_go.items())
+            faults += Counter({'buffer full before their frames were linked': lost_count})
             self._let_go.clear()
             self._held.clear()
         while sum(len(waiting.stamps_ns) for _, waiting in self._held) > Settings.pose_buffer:
@@ -158,7 +158,7 @@ class Links:
         seen.first_ns, seen.last_ns = min(seen.first_ns, first_ns), max(seen.last_ns, last_ns)
 
     def problems(self) -> list[str]:
-        """Return in words why sources measure nothing, with what to use instead."""
+        """Return why sources measure nothing, with what to use instead."""
         if not (self._fixed or self._moving):
             return []
         self._update()
@@ -171,11 +171,10 @@ class Links:
         return found
 
     def __str__(self) -> str:
-        """Return in words the moving links and their rates, the most likely ones first."""
         if not self._moving:
             return f'nothing moves on {self.topic}'
         self._update()
-        # No other moving link is above or below one that stands alone, unlike those of an arm.
+        # links of an arm have moving ones above or below, others stand alone
         above = {parent: self._above(parent)[0] for parent, _ in self._moving}
         parents = {frame for frames in above.values() for frame in frames}
         alone = {
@@ -204,7 +203,7 @@ class Links:
     # Details
 
     def _of(self, link: Pair) -> list[tuple[Source, Route]]:
-        """Return the sources that a link measures."""
+        """Return the sources measured by a link."""
         routes = self._routes.items()
         return [(s, r) for s, r in routes if isinstance(r, Route) and r.link == link]
 
@@ -220,7 +219,7 @@ class Links:
             self._known = True
 
     def _route(self, source: Source) -> Route | str:
-        """Return how a source is measured; else why not in words, empty when it may come yet."""
+        """Return how a source is measured; else why not, empty if it may be later."""
         path = self._path(source.parent, source.child)
         if isinstance(path, str):
             return path
@@ -247,9 +246,9 @@ class Links:
         return Route(*path[k], self._composed(path[:k]), self._composed(path[k + 1 :]))
 
     def _path(self, parent: str, child: str) -> list[tuple[Pair, bool]] | str:
-        """Return the links from one frame to another, and which of them are to be inverted."""
+        """Return the links from one frame to another, and which of them to invert."""
         for link, inverse in (((parent, child), False), ((child, parent), True)):
-            if link in self._moving:  # measured directly, whatever else is known of the frames
+            if link in self._moving:  # a direct measurement takes precedence
                 return [(link, inverse)]
         first, ambiguous = self._above(child)
         second, also = self._above(parent)
@@ -261,7 +260,7 @@ class Links:
         return [*up, *reversed(down)]
 
     def _above(self, frame: str) -> tuple[list[str], str]:
-        """Return a frame and those above it; and what is wrong with the last one, if anything."""
+        """Return a frame and its ancestors, and what is wrong with the last one, if anything."""
         frames = [frame]
         while links := self._parents[frames[-1]]:
             if len(links) > 1:
