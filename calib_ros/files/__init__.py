@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags, tables, journals, programs, exports: everything that is read or written.
+"""Bags, tables, journals, programs, exports: all reading and writing.
 
-What cannot be read raises an InputError that names the file and the line, what cannot be written
-an OSError or, where something is in the way, an InputError.
+Unreadable files raise an InputError with file and line; failed writes raise an OSError or, if
+something is in the way, an InputError.
 """

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The folder in which a node keeps the journals and calibrations of one robot.
+"""The folder with the journals and calibrations of one robot.
 
 A journal receives every sample at once, as a table that `identify` reads. A row is written by one
-call, so that a process that is killed leaves whole rows; a row that a crash of the machine cut off
-is left out when the journal is read again. Rows that cannot be written, because the disk is full
-say, wait in memory until they can be. A sample that is taken back gets a second row, marked
-`removed`; nothing is ever deleted.
+call, so a killed process leaves whole rows; a row cut off by a crash of the machine is ignored on
+reading. Rows that cannot be written, as on a full disk, wait in memory. A removed sample gets a
+second row marked `removed`; nothing is ever deleted.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
 
 
 class Journal:
-    """An open journal, new or not, which only grows and which no other process can open."""
+    """An open journal, which only grows and which no other process can open."""
 
     def __init__(self, path: Path, joints: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -46,12 +45,12 @@ class Journal:
             stack.pop_all()
 
     def add(self, sample: Sample, removed: bool = False) -> None:
-        """Write a sample, or that it was taken back; what is there stays whole."""
+        """Append a sample, or its removal."""
         self._write(cells(sample, 'removed' if removed else None))
 
     @property
     def gone(self) -> bool:
-        """Tell whether the file was deleted, moved or replaced, so that nobody finds its rows."""
+        """Tell whether the file was deleted, moved or replaced."""
         try:
             return not os.path.samestat(os.stat(self.path), os.fstat(self._file))
         except FileNotFoundError:
@@ -67,18 +66,18 @@ class Journal:
         os.close(self._file)
 
     def _lock(self) -> None:
-        try:  # until the file is closed or the process has ended
+        try:  # held until the file is closed or the process ends
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
                 f'{self.path} is being written by another process: give each robot a serial or '
                 'a data_dir of its own'
             ) from None
-        except OSError:  # a file system without locks: a journal without one is better than none
+        except OSError:  # a file system without locks
             pass
 
     def _begin(self, header: Sequence[str]) -> None:
-        """Write the header into a new file; leave out what a crash cut off."""
+        """Write the header of a new file; remove a row cut off by a crash."""
         expected = ','.join(header).encode() + b'\n'
         found = os.pread(self._file, len(expected), 0)
         plain = found.removeprefix(codecs.BOM_UTF8).replace(b'\r', b'')
@@ -105,7 +104,7 @@ class Journal:
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()
-        csv.writer(text).writerow(row)  # by its own end of lines it quotes names with any
+        csv.writer(text).writerow(row)  # its line end makes it quote names with any
         data = text.getvalue().removesuffix('\r\n').encode() + b'\n'
         begin = os.fstat(self._file).st_size
         written = os.write(self._file, data)
@@ -115,10 +114,10 @@ class Journal:
 
 
 class Archive:
-    """Files ROBOT_TIME of one robot in a folder, which is made if there is none.
+    """Files ROBOT_TIME of one robot in a folder, created if missing.
 
-    The robot is CHAIN or CHAIN/NAME, which tells it from others of its kind. `configuration`
-    returns what to write beside a journal.
+    The robot is CHAIN or CHAIN/NAME, unique among its kind. `configuration` returns the text to
+    write beside a journal.
     """
 
     def __init__(
@@ -126,8 +125,10 @@ class Archive:
     ) -> None:
         self.folder = folder
         self.error = ''
-        """Why poses are in memory only; empty while all are in the journal."""
-        words = (re.sub(r'[^\w.-]', _quoted, each) for each in robot.split('/', 1))
+        """Why poses are in memory only; empty if all are in the journal."""
+        words = (
+            re.sub(r'[^\w.-]', lambda m: quote(m[0], safe=''), x) for x in robot.split('/', 1)
+        )
         self._robot = short_name('_'.join(words))  # no two robots alike
         self._joints = joints
         self._configuration = configuration
@@ -147,12 +148,12 @@ class Archive:
 
     @property
     def trouble(self) -> str:
-        """Return in words that samples would be lost by now; empty while all are on the disk."""
+        """Return that samples are in memory only; empty if all are on disk."""
         return f'poses are in memory only: {self.error}; ' if self.error else ''
 
     @property
     def journal(self) -> Path | None:
-        """Return the path of the journal, if there is one."""
+        """Return the path of the journal, if any."""
         return None if self._journal is None else self._journal.path
 
     def add(self, sample: Sample) -> None:
@@ -161,7 +162,7 @@ class Archive:
         self.write()
 
     def remove(self, sample: Sample) -> None:
-        """Keep that a sample was taken back."""
+        """Record the removal of a sample."""
         if (sample, False) in self._waiting:
             self._waiting.remove((sample, False))
         else:
@@ -169,7 +170,7 @@ class Archive:
         self.write()
 
     def write(self) -> None:
-        """Write what waits, if possible; a journal that is gone goes on in another file."""
+        """Write waiting rows if possible; a journal that is gone continues in another file."""
         try:
             if self._journal is not None and self._journal.gone:
                 if self._path == self._journal.path:
@@ -186,7 +187,6 @@ class Archive:
             self.error = ''
 
     def _begin(self, content: bytes = b'') -> None:
-        """Begin the journal, with what was in one before."""
         self._path.parent.mkdir(parents=True, exist_ok=True)
         write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
         if content:
@@ -196,8 +196,8 @@ class Archive:
             before.close()
         self._due = False
 
-    def begin_anew(self) -> Path | None:
-        """Begin another journal, on disk at once; return the path of the old one."""
+    def start_new(self) -> Path | None:
+        """Start another journal, on disk at once; return the path of the old one."""
         self.write()
         if self._waiting:
             raise InputError(
@@ -212,7 +212,7 @@ class Archive:
         return old
 
     def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-        """Go on with the newest journal, if there is one; return its samples, and warnings."""
+        """Continue the newest journal, if any; return its samples, and warnings."""
         found = self._files(JOURNAL)
         if not found:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
@@ -228,11 +228,11 @@ class Archive:
         return samples, warnings
 
     def newest_calibration(self) -> Path | None:
-        """Return the calibration that was saved last."""
+        """Return the calibration saved last."""
         return next(reversed(self._files(CALIBRATION)), None)
 
     def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
-        """Write a calibration, and how it was made if that is known; return its path."""
+        """Write a calibration with its configuration, if known; return its path."""
         path = path or self._new_path(CALIBRATION)
         beside = {path.with_suffix(SETTINGS): configuration} if configuration else {}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -247,7 +247,7 @@ class Archive:
         return folder
 
     def note(self, text: str, ending: str = '.txt') -> Path | None:
-        """Write what came of the last identification beside the journal; return its path."""
+        """Write the result of the last identification beside the journal; return its path."""
         path = self._path.with_suffix(f'.identified{ending}').absolute()
         try:
             write_file(path, text, overwrite=True)
@@ -256,7 +256,7 @@ class Archive:
         return path
 
     def close(self) -> str:
-        """Close the journal; return in words what could not be written to it, and where it is."""
+        """Close the journal; return what could not be written to it, and where it is."""
         self.write()
         words = ''
         if self._waiting:
@@ -273,7 +273,7 @@ class Archive:
         return words
 
     def _new_path(self, ending: str) -> Path:
-        """Return a path that sorts behind all others, also where the clock was set back since."""
+        """Return a path that sorts behind all others, even if the clock was set back."""
         now = f'{datetime.now(timezone.utc):%Y%m%d%H%M%S%f}'
         last = max((digits for digits, _, _ in self._dated()), default='0')
         digits = max(now, f'{int(last) + 1:020}')
@@ -285,10 +285,6 @@ class Archive:
         return [(match[1] + match[2], match[3], path) for match, path in found if match]
 
     def _files(self, ending: str) -> list[Path]:
-        """Return the files of this robot that hold anything, the oldest first."""
+        """Return the non-empty files of this robot, oldest first."""
         mine = (path for _, ends, path in sorted(self._dated()) if ends == ending)
         return [path for path in mine if path.stat().st_size]
-
-
-def _quoted(found: re.Match[str]) -> str:
-    return quote(found[0], safe='')

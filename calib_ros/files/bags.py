@@ -31,23 +31,22 @@ ALLOW = 'accept the rest with --largest-loss'
 
 @dataclass(frozen=True)
 class Replayed:
-    """What was read from a bag, and warnings about the rest."""
+    """Counts of messages read from a bag, and warnings."""
 
-    recorded: int | None  # messages that it should hold; None where that is not known
-    read: int  # of these; a message that cannot be decoded was not read
+    recorded: int | None  # messages in the bag; None if unknown
+    read: int  # messages decoded
     warnings: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        """Return in words what was read."""
         if self.recorded is None:
             return f'read {self.read} messages of the bag; how many are lost is not known'
         return f'read {self.read} of {self.recorded} messages of the bag'
 
     def refusals(self, account: Account, largest_loss: float) -> tuple[Reason, ...]:
-        """Return why a result must not be accepted: more was lost than a share allows.
+        """Return why a result must not be accepted: more was lost than `largest_loss`.
 
-        Lost is what could not be read and, of joint states and measurements each, what was
-        dropped for its stamp or for want of room. What the device did not see is not.
+        Lost are messages that could not be read and, for joint states and measurements each, those
+        dropped for their stamp or a full buffer; not what the device did not see.
         """
         if self.recorded is None and largest_loss < 1.0:
             text = f'how much of the bag is lost is not known, {ALLOW} 1'
@@ -74,8 +73,7 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
     session : CalibrationSession
         Receives the messages; its settings name topics if the types are ambiguous.
     told : Told
-        Of the share of the messages that are read.
-
+        Receives the share of messages read.
     """
     path = Path(path)
     if not (path.is_dir() or path.is_file()):
@@ -86,8 +84,8 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
 
 
 def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -> Replayed:
-    """Feed the files in a folder, which are those of a bag or were unpacked from it."""
-    rosbag2()  # damaged or not, nothing is read without
+    """Feed the files of a bag, or those unpacked from it, in a folder."""
+    rosbag2()  # required even for damaged files
     try:
         reader = _opened(path, folder)
     except InputError:
@@ -117,7 +115,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -
 
 
 def _opened(path: Path, folder: Path) -> Any:
-    """Return the library's reader of the files in a folder, those of the bag at a path."""
+    """Return the library's reader of a folder with the files of the bag at a path."""
     library = rosbag2()
     try:
         stored.check(folder)
@@ -151,7 +149,7 @@ def _salvaged(
 def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
     """Yield the images of a bag on one topic, with their stamps [ns].
 
-    sensor_msgs/Image and CompressedImage. One that cannot be decoded ends the bag.
+    sensor_msgs/Image and CompressedImage; one that cannot be decoded raises InputError.
     """
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
@@ -180,7 +178,7 @@ def _chosen(
     messages_on: Reading,
     definitions: Mapping[str, MessageDefinition],
 ) -> tuple[dict[str, Stream], Deserialise]:
-    """Return what is read of the topics available, and what makes messages of it."""
+    """Return the streams to read, and the deserialiser."""
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
     deserialise = _deserialiser(defined)
     streams = choose(available, session.settings, _decodable(messages_on), deserialise)
@@ -206,14 +204,14 @@ def _check_joints(
 
 
 def _check_links(streams: Mapping[str, Stream]) -> None:
-    """Refuse sources that could not be measured between their frames."""
+    """Refuse sources that were not measured between their frames."""
     problems = [words for links in links_of(streams.values()) for words in links.problems()]
     if problems:
         raise InputError('; '.join(problems))
 
 
 def rosbag2() -> Any:
-    """Return the library that reads and writes bags; nothing but bags needs it."""
+    """Return the rosbags library; only bags need it."""
     try:
         from rosbags import rosbag2
     except ImportError as err:
@@ -227,14 +225,14 @@ def rosbag2() -> Any:
 
 @cache
 def typestore() -> Any:
-    """Return the library's message types, which take a tenth of a second that few bags need."""
+    """Return the library's message types; loading takes a tenth of a second."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_JAZZY)
 
 
 def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
-    """Return what makes messages of bytes, also of types that a bag itself defines."""
+    """Return a function from bytes to messages, also for types defined in the bag."""
     if not defined:
         return lambda data, kind: _decoded(typestore(), data, kind)
     from rosbags.interfaces import MessageDefinitionFormat
@@ -256,7 +254,7 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
 def _decoded(store: Any, data: bytes, kind: str) -> Any:
     """Return a message; up to 12 bytes may follow it, of which the library accepts 3.
 
-    rclpy leaves as many behind lists that are empty where it serialises for a writer of bags.
+    rclpy writes them behind empty lists when it serialises for a bag writer.
     """
     try:
         return store.deserialize_cdr(data, kind)
@@ -273,7 +271,7 @@ def _is_message(stream: Stream, data: object) -> bool:
 
 
 def _decodable(messages_on: Reading) -> Reading:
-    """Leave out what cannot be a message; `_feed` tells of it."""
+    """Omit what cannot be a message; `_feed` reports it."""
     return lambda streams: (each for each in messages_on(streams) if _is_message(*each))
 
 
@@ -284,7 +282,7 @@ def _feed(
     told: Told = nobody,
     expected: int = 0,
 ) -> tuple[int, str | None]:
-    """Feed serialised messages, telling of their share; return how many, and what is wrong."""
+    """Feed serialised messages and report their share; return their number, and any problem."""
     count, problem = 0, None
     for batch, err in batches(messages):
         if err is not None:

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Boards that cameras see, where their corners are, and tables of corners found in images.
+"""Boards, the places of their corners, and tables of corners found in images.
 
 A board is YAML: `type, columns, rows, square, marker, dictionary`, lengths in metres.
 
 charuco   columns x rows squares, black at the upper left, markers in the white ones; its corners
-          are those inside, numbered row by row
-markers   columns x rows markers, `square` from one to the next; marker k has the corners
-          4 k ... 4 k + 3, clockwise from its upper left
+          are the inner ones, numbered row by row
+markers   columns x rows markers, `square` apart; marker k has the corners 4 k ... 4 k + 3,
+          clockwise from its upper left
 
 The frame of the board has x to the right, y down and z away from the viewer; its origin is the
 upper left corner of the first square or marker.
@@ -45,7 +45,7 @@ TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
 HEADER = ('image', 'corner', 'u', 'v')
 SIZE = ('width', 'height')
-"""Optional columns of corners: the size of the images [px]."""
+"""Optional columns: size of the images [px]."""
 DISTORTION = ('distortion_model', 'distortion_coefficients')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
 POSED = 'flange_pose'
@@ -65,7 +65,7 @@ class Board:
     legacy: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be printed."""
+        """Refuse boards that cannot be printed."""
         if self.type not in TYPES:
             raise UnknownNameError('type of board', self.type, TYPES)
         least = 2 if self.type == 'charuco' else 1
@@ -83,7 +83,7 @@ class Board:
 
     @property
     def corners(self) -> FloatArray:
-        """Return the corners (M, 3) [m] by their numbers."""
+        """Return the corners (M, 3) [m] by number."""
         if self.type == 'charuco':
             flat = self.square * (_grid(self.columns - 1, self.rows - 1) + 1)
         else:
@@ -92,7 +92,7 @@ class Board:
 
     @property
     def markers(self) -> FloatArray:
-        """Return the upper left corners (K, 2) [m] of the markers by their numbers."""
+        """Return the upper left corners (K, 2) [m] of the markers by number."""
         place = _grid(self.columns, self.rows)
         if self.type == 'markers':
             return np.asarray(self.square * place)
@@ -107,7 +107,7 @@ class Board:
 
     @property
     def legacy_pattern(self) -> bool:
-        """Tell whether the square at the upper left is white: a legacy board of even rows."""
+        """Tell whether the upper left square is white: a legacy board with even rows."""
         return self.legacy and self.rows % 2 == 0
 
     @property
@@ -122,7 +122,7 @@ def _grid(columns: int, rows: int) -> NDArray[np.intp]:
 
 
 def read_board(path: Path) -> Board:
-    """Read the YAML of a board."""
+    """Read a board from YAML."""
     text = read_text(path, what='board ')
     content = parse_mapping(parse_yaml(text, str(path)), KEYS, str(path), KEYS[:-1])
     for key in ('columns', 'rows'):
@@ -136,9 +136,9 @@ def read_board(path: Path) -> Board:
 
 
 def read_lens(path: Path, found: Detections | None = None) -> Lens:
-    """Read the intrinsics that camera_calibration writes, or OpenCV, or the same keys plainly.
+    """Read intrinsics as written by camera_calibration or OpenCV, or as plain keys.
 
-    Refuse them if they are of images of another size than those in which corners were `found`.
+    Refuses another image size than that of the corners `found`.
     """
     text = re.sub('^%YAML:1.0|!!opencv-matrix', '', read_text(path, what='intrinsics '))
     content = parse_yaml(text, str(path))
@@ -155,7 +155,6 @@ def read_lens(path: Path, found: Detections | None = None) -> Lens:
 
 
 def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> None:
-    """Refuse intrinsics of images of another size than those of the corners."""
     keys = [next((k for k in (f'image_{each}', each) if k in content), '') for each in SIZE]
     if not all(keys):
         return
@@ -173,7 +172,7 @@ def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> 
 
 
 def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
-    """Return the lens of a camera matrix (9) row by row, and its distortion k1 k2 p1 p2 k3."""
+    """Return the lens of a camera matrix (9), row by row, and its distortion k1 k2 p1 p2 k3."""
     if model not in DISTORTED:
         raise ConfigError(f'{where}: distortion_model must be plumb_bob, not {model!r}')
     if len(matrix) != 9:
@@ -203,9 +202,9 @@ def _numbers(
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Corners (N,) by the numbers of their images, which begin at `lines`, and `pixels` (N, 2).
+    """Corners (N,) with their image numbers and `pixels` (N, 2); images begin at `lines`.
 
-    All images have one `size`, width and height [px], if it is known.
+    All images have one `size`, width and height [px], if known.
     """
 
     names: tuple[str, ...]
@@ -216,7 +215,7 @@ class Detections:
     size: tuple[int, int] | None = None
 
     def as_csv(self) -> str:
-        """Return the table of a row per corner."""
+        """Return a table with a row per corner."""
         numbers = zip(self.image.tolist(), self.corner.tolist(), self.pixels.tolist(), strict=True)
         rows = ((to_cell(self.names[k]), n, f'{u:.4f}', f'{v:.4f}') for k, n, (u, v) in numbers)
         size = self.size or ()
@@ -249,7 +248,7 @@ def read_detections(path: Path, board: Board) -> Detections:
 
 
 def _size_of(found: Columns) -> tuple[int, int] | None:
-    """Return the size of all images; refuse those of several sizes."""
+    """Return the size of all images, which must be equal."""
     if not {*SIZE} <= {*found.header}:
         return None
     pairs = zip(*(found.integers(name).tolist() for name in SIZE), strict=True)
@@ -266,7 +265,7 @@ def _size_of(found: Columns) -> tuple[int, int] | None:
 def posed_arm() -> Chain:
     """Return a virtual arm whose joint values are a pose: x y z [m], then turns about x y z.
 
-    It takes the place of an arm of which only the flange's poses are known.
+    It replaces an arm of which only flange poses are known.
     """
     quarter = np.pi / 2
     joints = (
@@ -281,18 +280,17 @@ def posed_arm() -> Chain:
 
 
 def joints_of_poses(positions: FloatArray, rotations: FloatArray) -> FloatArray:
-    """Return the joint values (N, 6) with which the virtual arm is at poses of the flange."""
-    with warnings.catch_warnings():  # at a quarter about y any turn about x will do
+    """Return the joint values (N, 6) of the virtual arm at flange poses."""
+    with warnings.catch_warnings():  # any turn about x will do in gimbal lock
         warnings.simplefilter('ignore')
         turns = Rotation.from_matrix(rotations).as_euler('XYZ')
     return np.column_stack([positions[:, [2, 0, 1]], turns])
 
 
 def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, tuple[str, ...]]:
-    """Read where the arm was at each image; return joint values (n,) by name, and if by poses.
+    """Read joint values (n,) of each image by name; return them, whether from poses, and warnings.
 
-    Also warnings, of joints that the arm does not have. The table has `image` and q1 ... qn, or
-    the flange's pose x y z qx qy qz qw.
+    The table has `image` and q1 ... qn, or the flange's pose x y z qx qy qz qw.
     """
     found = read_columns(path, ('image',))
     image, names = found.labels('image')
@@ -319,7 +317,7 @@ def observed(
 ) -> tuple[Observations, tuple[str, ...]]:
     """Return the corners of images with known joint values, stamped by line, and warnings.
 
-    `places` are joint values (n,) by the names of images.
+    `places` are joint values (n,) by image name.
     """
     known = np.array([name in places for name in found.names], dtype=bool)
     if not known.any():
@@ -328,10 +326,10 @@ def observed(
             f'but {found.names[0]!r} and {next(iter(places))!r} do not'
         )
     lost = [name for name, yes in zip(found.names, known.tolist(), strict=True) if not yes]
-    told = (f'no joint values for {len(lost)} images: {", ".join(some(lost))}',) if lost else ()
+    notes = (f'no joint values for {len(lost)} images: {", ".join(some(lost))}',) if lost else ()
     kept = known[found.image]
     image = found.image[kept]
     joints = np.array([places[found.names[k]] for k in image.tolist()])
     points = board.corners[found.corner[kept]]
     seen = Observations.from_pixels(joints, found.pixels[kept], points, image, on_flange)
-    return seen.at(np.array(found.lines, dtype=np.int64)[image] * 10**9), told
+    return seen.at(np.array(found.lines, dtype=np.int64)[image] * 10**9), notes

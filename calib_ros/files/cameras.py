@@ -22,6 +22,7 @@ from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
 
 ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}
+"""Channels and OpenCV's names of encodings: a Bayer pattern by its second row."""
 ENCODINGS |= {'8UC3': (3, 'BGR'), 'rgba8': (4, 'RGBA'), 'bgra8': (4, 'BGRA')}
 ENCODINGS |= {'bayer_rggb8': (1, 'BayerBG'), 'bayer_bggr8': (1, 'BayerRG')}
 ENCODINGS |= {'bayer_gbrg8': (1, 'BayerGR'), 'bayer_grbg8': (1, 'BayerGB')}
@@ -29,7 +30,7 @@ ENCODINGS |= {'bayer_gbrg8': (1, 'BayerGR'), 'bayer_grbg8': (1, 'BayerGB')}
 
 
 class BoardCamera:
-    """Finds a board, which its source names, in the images of that source."""
+    """Finds the board of a source in its images."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -40,7 +41,7 @@ class BoardCamera:
         self._size = (0, 0)
 
     def learn(self, info: Any) -> None:
-        """Take a CameraInfo; one that cannot be used refuses the images after it."""
+        """Take a CameraInfo; an unusable one refuses the images after it."""
         self._size = (info.height, info.width)
         try:
             self._lens = replace(lens_in(info), fixed=self._source.lens == 'given')
@@ -67,7 +68,7 @@ class BoardCamera:
 
 
 def lens_in(info: Any) -> Lens:
-    """Return the lens that a CameraInfo tells; refuse that of an image cut out or binned."""
+    """Return the lens of a CameraInfo; refuse regions of interest and binning."""
     matrix, distortion = [[float(x) for x in values] for values in (info.k, info.d)]
     if not any(matrix):
         raise ConfigError('CameraInfo: the camera is not calibrated, k is zero')
@@ -78,7 +79,7 @@ def lens_in(info: Any) -> Lens:
 
 
 def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
-    """Return the cameras among sources, by the topics of their images."""
+    """Return the cameras among sources by image topic."""
     sources = [source for source in parse_sources(texts) if source.board]
     for source in sources:
         if 'image_rect' in source.topic.rpartition('/')[2]:
@@ -101,7 +102,7 @@ def image_of(message: Any) -> Image | Refusal:
 
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
-    """Return a sensor_msgs/Image of data (B,) in grey (H, W); refuse encodings and sizes."""
+    """Return the data (B,) of a sensor_msgs/Image in grey (H, W); refuse encodings and sizes."""
     if encoding not in ENCODINGS:
         raise UnknownNameError('encoding of images', encoding, ENCODINGS)
     channels, kind = ENCODINGS[encoding]

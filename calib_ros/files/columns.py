@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns: numbers of all rows at once. Errors name the line."""
+"""A table by columns; errors name the line."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from calib_ros.texts import from_cell
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 Row = tuple[int, Sequence[str]]
-"""A line of a file, and the cells in it."""
+"""Line number and cells."""
 Lines = NDArray[np.intp]
 Codes = tuple[NDArray[np.intp], list[str]]
-"""The number (N,) of each row's text, and the texts in order of appearance."""
+"""The code (N,) of each row's text, and the texts in order of appearance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The columns of a table: of the file at `path`, with the `lines` (N,) of the rows."""
+    """The columns of the file at `path`; `lines` (N,) are those of the rows."""
 
     path: Path
     header: tuple[str, ...]
     lines: Lines
 
     def where(self, row: int, name: str) -> str:
-        """Return the place of a cell in words."""
+        """Return the place of a cell for messages."""
         return f'{self.path}, line {self.lines[row]}: {name}'
 
     def _no_number(self, row: int, name: str, text: str = '') -> InputError:
@@ -60,9 +60,10 @@ class Columns:
         values: FloatArray | None = None,
         needed: NDArray[np.bool_] | bool = True,
     ) -> FloatArray:
-        """Return numbers (N, len(names)) of which each row has all or, if not `needed`, none.
+        """Return numbers (N, len(names)) that each row has completely or, if not `needed`, not at
+        all.
 
-        `values` are the numbers of the columns where they are known.
+        `values` are the numbers if already read.
         """
         found = self.numbers(names) if values is None else values
         highest = max(found.max(initial=0.0), -found.min(initial=0.0))
@@ -78,10 +79,10 @@ class Columns:
         return found
 
     def integers(self, name: str, blank: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """Return the integers (N,) of a column, for empty cells those given if any are."""
+        """Return the integers (N,) of a column; `blank` (N,) replaces empty cells."""
         texts = self.texts(name)
         if re.fullmatch('(-?[0-9]{1,19},)*', ','.join([*texts, ''])):
-            with suppress(ValueError, OverflowError):  # of which cell, is told below
+            with suppress(ValueError, OverflowError):  # found cell by cell below
                 return np.array(list(map(int, texts)), dtype=np.int64)
         numbers = [
             int(blank[row])
@@ -92,7 +93,7 @@ class Columns:
         return np.array(numbers, dtype=np.int64)
 
     def labels(self, name: str) -> Codes:
-        """Return the number of each row's name, and the names; empty ones without the column."""
+        """Return the code (N,) of each row's name, and the names; empty without the column."""
         if name not in self.header:
             return np.zeros(len(self.lines), dtype=np.intp), ['']
         numbers, found = self.codes(name)
@@ -108,15 +109,15 @@ class Columns:
         raise NotImplementedError
 
     def select(self, rows: NDArray[np.generic] | slice) -> Columns:
-        """Return some of the rows, by a mask (N,), by indices (K,) or by a slice."""
+        """Return some rows, by a mask (N,), indices (K,) or a slice."""
         raise NotImplementedError
 
     def codes(self, name: str) -> Codes:
-        """Return the number of each row's text, and the texts."""
+        """Return the code (N,) of each row's text, and the texts."""
         return numbered(self.texts(name))
 
     def _numbers(self, names: Sequence[str]) -> FloatArray:
-        """Return the numbers (N, len(names)), infinite for what is none."""
+        """Return numbers (N, len(names)), infinite for cells without one."""
         found = np.zeros((len(self.lines), len(names)))
         for k, name in enumerate(names):
             found[:, k] = list(map(_number, self.texts(name)))
@@ -125,7 +126,7 @@ class Columns:
 
 @dataclass(frozen=True, eq=False)
 class MadeColumns(Columns):
-    """Columns that were computed, `values` (N,) with NaN where there is none, or cut by csv."""
+    """Columns that were computed, `values` (N,) with NaN for empty cells, or read by csv."""
 
     values: Mapping[str, FloatArray]
     words: Mapping[str, Sequence[str]]
@@ -136,7 +137,7 @@ class MadeColumns(Columns):
         object.__setattr__(self, 'header', (*self.words, *self.values))
 
     def select(self, rows: NDArray[np.generic] | slice) -> MadeColumns:
-        """Return some of the rows, by a mask (N,), by indices (K,) or by a slice."""
+        """Return some rows, by a mask (N,), indices (K,) or a slice."""
         index = np.arange(len(self.lines))[rows].tolist()
         return replace(
             self,
@@ -169,7 +170,7 @@ def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColu
 
 
 def _number(text: str) -> float:
-    """Return the number in a cell, NaN for a blank one, infinity for anything else."""
+    """Return the number in a cell, NaN if blank, infinity if it has none."""
     try:
         number = float(text or 'nan')
     except ValueError:
@@ -178,14 +179,14 @@ def _number(text: str) -> float:
 
 
 def numbered(texts: Sequence[str]) -> Codes:
-    """Return the number of each text, and the different ones."""
+    """Return the code of each text, and the different texts."""
     known = {text: number for number, text in enumerate(dict.fromkeys(texts))}
     numbers = np.fromiter(map(known.__getitem__, texts), dtype=np.intp, count=len(texts))
     return numbers, list(known)
 
 
 def joints_left_out(columns: Columns, joints: int) -> tuple[str, ...]:
-    """Return a warning of joint values that an arm of so many joints does not have."""
+    """Return a warning about joint values that the arm does not have."""
     name = f'q{joints + 1}'
     if name not in columns.header:
         return ()
@@ -193,7 +194,7 @@ def joints_left_out(columns: Columns, joints: int) -> tuple[str, ...]:
 
 
 def check_quaternions(columns: Columns, quat: FloatArray) -> None:
-    """Refuse quaternions (N, 4) of rows that are not of length 1, but for NaN."""
+    """Refuse quaternions (N, 4) that are not of length 1, except NaN."""
     lengths = np.sqrt(np.einsum('ni,ni->n', quat, quat))
     for row in np.flatnonzero(np.abs(lengths - 1.0) > ROUNDED)[:1].tolist():
         raise InputError(
@@ -203,12 +204,12 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
 
 
 def lines_in_words(lines: Sequence[int]) -> str:
-    """Return which lines of a file, the first ones by their numbers."""
+    """Return the numbers of the first lines as text."""
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
 
 
 def distinct(codes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the different rows of (N, C) in order of appearance, and which (N,) each row is."""
+    """Return the different rows of (N, C) in order of appearance, and their indices (N,)."""
     if not codes.any():
         return codes[:1], np.zeros(len(codes), dtype=np.intp)
     sizes = [int(size) + 1 for size in codes.max(axis=0)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The columns of a CSV: a regular text is cut at separators, any other read by csv."""
+"""The columns of a CSV: regular text is split at separators, other text read by csv."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_b
 from calib_ros.values import MOST_NAMES
 
 IRREGULAR = (b'"', b'\r', b'\0')
-"""What cells are not cut at separators alone with."""
+"""Characters that need the csv module."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class TextColumns(Columns):
     _separator: str
     _data: bytes
     _ends: NDArray[np.int32]
-    """Where each cell ends (N, C) in the text; it begins one after the end of the one before."""
+    """Ends of the cells (N, C) in the text; each starts after the end of the one before."""
 
     def blank(self, name: str) -> NDArray[np.bool_]:
         """Return (N,) which cells of a column are empty."""
@@ -47,7 +47,7 @@ class TextColumns(Columns):
         return [data[begin:end].decode() for begin, end in places]
 
     def select(self, rows: NDArray[np.generic] | slice) -> TextColumns:
-        """Return some of the rows, by a mask (N,), by indices (K,) or by a slice."""
+        """Return some rows, by a mask (N,), indices (K,) or a slice."""
         index, width = np.arange(len(self.lines))[rows], len(self.header)
         begins, ends = self._ends[:-1:width][index] + 1, self._ends[width::width][index]
         places = zip(begins.tolist(), ends.tolist(), strict=True)
@@ -57,7 +57,7 @@ class TextColumns(Columns):
         return replace(found, lines=self.lines[index])
 
     def codes(self, name: str) -> Codes:
-        """Return the number of each row's text, and the texts."""
+        """Return the code (N,) of each row's text, and the texts."""
         starts, ends = self._places(name)
         longest = int((ends - starts).max(initial=0))
         if longest == 0:
@@ -85,7 +85,7 @@ class TextColumns(Columns):
         if not lacking[some].any():
             rows.seek(int(self._ends[0]) + 1)
         sep, use = self._separator, [columns[k] for k in some.tolist()]
-        try:  # latin1 knows every byte, whatever the other columns hold
+        try:  # latin1 decodes any byte in other columns
             read = np.loadtxt(rows, float, None, sep, usecols=use, ndmin=2, encoding='latin1')
         except (ValueError, OverflowError):
             return super()._numbers(names)
@@ -111,12 +111,12 @@ class TextColumns(Columns):
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
-    """Return the columns of a CSV with rows; some columns are required."""
+    """Return the columns of a CSV that has rows and the needed columns."""
     return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
 
 
 def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
-    """Return columns; refuse those without rows, and without any of those that are needed."""
+    """Return columns; refuse those without rows or needed columns."""
     missing = [name for name in needed if name not in found.header]
     if missing:
         raise InputError(
@@ -131,7 +131,7 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
 def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> Columns:
     """Return the columns of a CSV's content; refuse anything else, or too large.
 
-    `above` are lines of the file before it.
+    `above` is the number of lines of the file before it.
     """
     if (place := data.find(b'\0')) >= 0:
         line = above + 1 + data.count(b'\n', 0, place)
@@ -148,9 +148,9 @@ def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> 
 def regular(
     path: Path, data: bytes, separator: str = ',', header: Sequence[str] = (), above: int = 0
 ) -> TextColumns | None:
-    """Return the columns of a text, None where it is not regular.
+    """Return the columns of a text, None if irregular.
 
-    Its first line is the header unless one is given; `above` are lines of the file before it.
+    Its first line is the header unless one is given; `above` lines of the file precede it.
     """
     if b'\r' in data:
         data = data.replace(b'\r\n', b'\n')
@@ -178,7 +178,7 @@ def regular(
 
 
 def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int32] | None:
-    """Return where the cells of a text end, behind the end of what is before; None if ragged."""
+    """Return the ends of the cells of a text, after that of what is before; None if ragged."""
     flat = np.frombuffer(data, dtype=np.uint8)
     last = flat[begin:] == ord('\n')
     found = np.flatnonzero(last | (flat[begin:] == ord(separator))) + begin
@@ -219,7 +219,7 @@ def _irregular(path: Path, text: str, told: Told, above: int) -> MadeColumns:
 def csv_rows(
     path: Path, text: str, separator: str = ',', strict: bool = False
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield the lines at which rows of a text end, and their cells."""
+    """Yield the line at which each row of a text ends, and its cells."""
     reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
     line = 0
     try:
@@ -234,7 +234,7 @@ def csv_rows(
 
 
 def refuse_separator(path: Path, header: Sequence[str]) -> None:
-    """Say how to read a table whose cells are not separated by commas."""
+    """Raise with advice if cells are not separated by commas."""
     for name, mark in (('semicolon', ';'), ('tab', '\t')):
         if any(mark in cell for cell in header):
             raise ColumnsError(
@@ -245,7 +245,7 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
 
 
 def like_joints(header: Sequence[str], joints: int) -> str:
-    """Return how names that count the joints in a header are given, or an example."""
+    """Return the option for numbered joint names in a header, or an example."""
     for name in header:
         for one in re.finditer('1', name):
             before, after = name[: one.start()], name[one.end() :]

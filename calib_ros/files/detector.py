@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The corners of a board in photographs, by OpenCV (`pip install calib_ros[camera]`).
 
-An image is refused with the reason where its corners would harm: blurred, another board, or too
-little of this one.
+Images whose corners would harm are refused with the reason: blurred, another board, or too little
+of it.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ Markers = tuple[FloatArray, NDArray[np.intp]]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
 FEWEST = IN_A_FRAME
-"""Corners of an image that is used: half of their coordinates make its pose, half check it."""
+"""Corners of a usable image: half of their coordinates determine its pose, half check it."""
 WINDOW = 0.6
-"""Half the window that refines a corner, by the distance to the nearest marker; measured, as is
-WIDEST, by benchmarks/images.py."""
+"""Half window of corner refinement, relative to the nearest marker; measured, as WIDEST, by
+benchmarks/images.py."""
 WIDEST = 10
-"""Half of the widest such window [px]."""
+"""Largest half window [px]."""
 SMALLEST_SIDE = 700
-"""Longer side [px] of the smallest image in which markers are sought."""
+"""Longer side [px] of the smallest image searched for markers."""
 
 
 def dictionaries() -> tuple[str, ...]:
-    """Return the names of the dictionaries of markers."""
+    """Return the names of the marker dictionaries."""
     return tuple(sorted(name for name in dir(opencv().aruco) if name.startswith('DICT_')))
 
 
@@ -56,7 +56,7 @@ def _halvings(image: Image) -> int:
 
 
 def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
-    """Return which cells (B, B) of each marker are black, its border included."""
+    """Return which cells (B, B) of each marker are black, border included."""
     aruco, dictionary = opencv().aruco, _dictionary(board.dictionary)
     count = len(board.markers)
     if count > len(dictionary.bytesList):
@@ -69,7 +69,7 @@ def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
 
 
 def black_of(board: Board) -> FloatArray:
-    """Return what is printed black as rectangles (K, 4) [m]: left, top, width, height."""
+    """Return the black areas as rectangles (K, 4) [m]: left, top, width, height."""
     rows: list[tuple[float, float, float, float]] = []
     if board.type == 'charuco':
         x, y = np.meshgrid(np.arange(board.columns), np.arange(board.rows))
@@ -87,8 +87,8 @@ def black_of(board: Board) -> FloatArray:
 class Detector:
     """Finds the corners of one board.
 
-    Markers are sought in the image at half its size or less; those that must be in view and were
-    not found, at larger sizes. Corners are refined at full size; an image must show the `fewest`.
+    Markers are sought at half the image size or less; missing ones that must be in view, at larger
+    sizes. Corners are refined at full size; an image must show the `fewest`.
     """
 
     def __init__(self, board: Board, fewest: int = FEWEST) -> None:
@@ -129,7 +129,7 @@ class Detector:
         return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:
-        """Return the markers of the board, by as few pixels and candidates as it takes."""
+        """Return the markers of the board, with as few pixels and candidates as possible."""
         size = np.array(image.shape[1::-1])
         halvings = _halvings(image) if self._board.type == 'charuco' else 0
         steps = [(k, range(13, 14)) for k in range(halvings, -1, -1)]
@@ -157,7 +157,7 @@ class Detector:
     def _hidden(
         self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
     ) -> tuple[NDArray[np.intp], ...]:
-        """Return which other markers must be in an image, and the box (2,), (2,) around them."""
+        """Return missing markers that must be in an image, and the box (2,), (2,) around them."""
         points = self._board.around_markers
         others = np.setdiff1d(np.arange(self._count), ids)
         placed = None
@@ -188,7 +188,7 @@ class Detector:
         placed = self._placed(points, pixels, points)
         apart = np.inf if placed is None else np.linalg.norm(placed - pixels, axis=1).max()
         spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
-        # Lens and board may bend a board by half of what a corner is refined in, or 10 %.
+        # lens and board may bend it by half a refinement window, or 10 %
         if apart > max(0.5 * WIDEST, EXCEPTION * spacing):
             return Refusal(
                 'whose corners do not fit the board',
@@ -200,7 +200,7 @@ class Detector:
     def _placed(
         self, points: FloatArray, pixels: FloatArray, others: FloatArray
     ) -> FloatArray | None:
-        """Return where other points of the plane (..., 2) are by those at some pixels (..., 2)."""
+        """Return the pixels of points of the plane (..., 2), given those of others (..., 2)."""
         matrix, _ = self._cv2.findHomography(points.reshape(-1, 2), pixels.reshape(-1, 2))
         if matrix is None:
             return None
@@ -241,10 +241,10 @@ class Detector:
         return found
 
     def _refined(self, image: Image, pixels: FloatArray, markers: FloatArray) -> FloatArray:
-        """Return corners where the edges around them cross.
+        """Return corners at the crossing of the edges around them.
 
-        What OpenCV interpolates is refined by it with a window that reaches into the markers and
-        up to a tenth of a pixel, and is half a pixel off before version 5.
+        OpenCV refines interpolated corners with a window that reaches into the markers, which
+        costs up to a tenth of a pixel, and is half a pixel off before version 5.
         """
         cv2 = self._cv2
         apart = np.linalg.norm(pixels[:, np.newaxis] - markers.reshape(-1, 2), axis=2).min(axis=1)
@@ -260,7 +260,7 @@ class Detector:
     def _markers(
         self, image: Image, dictionary: Any, windows: range = range(3, 24, 10), share: float = 1.0
     ) -> Markers:
-        """Return markers by thresholds over windows [px]; `share` of an image is looked at."""
+        """Return markers by thresholds over windows [px]; `share` of an image is searched."""
         aruco, given = self._cv2.aruco, self._parameters
         given.minMarkerPerimeterRate = 0.03 / share
         given.adaptiveThreshWinSizeMin, given.adaptiveThreshWinSizeMax = windows[0], windows[-1]
@@ -273,9 +273,9 @@ class Detector:
         return np.array(corners, dtype=float).reshape(-1, 4, 2), numbers
 
     def _others(self, image: Image) -> str:
-        """Return in words which other dictionary's markers an image shows, or that it is mirrored.
+        """Return which other dictionary's markers an image shows, or that it is mirrored.
 
-        Boards number them from 0, and dictionaries of one kind have the first ones in common.
+        Boards number them from 0, and dictionaries of one kind share the first ones.
         """
         mirrored = self._markers(np.ascontiguousarray(image[:, ::-1]), self._dictionary)[1]
         if len(mirrored) >= FEWEST:
@@ -297,11 +297,11 @@ def detect(
     images: Iterable[tuple[str, Image | Refusal]],
     board: Board,
     fewest: int = FEWEST,
-    heard: Callable[[str], None] = lambda line: None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> tuple[Detections, int]:
-    """Return the corners of a board in named images, and how many of these are not used.
+    """Return the corners of a board in named images, and the number of unused images.
 
-    Images of another size than most are not: their lens would be another one.
+    Images of another size than most are not used: their lens would differ.
     """
     detector = Detector(board, fewest)
     used: list[tuple[str, tuple[int, int], Corners]] = []
@@ -309,7 +309,7 @@ def detect(
 
     def refuse(name: str, reason: str) -> None:
         refused.append(f'{name}: {reason}')
-        heard(f'{name}: not used, {reason}')
+        report(f'{name}: not used, {reason}')
 
     for name, picture in images:
         if isinstance(picture, Refusal):
@@ -319,7 +319,7 @@ def detect(
         if isinstance(found, Refusal):
             refuse(name, found.reason)
             continue
-        heard(f'{name}: {len(found[0])} corners')
+        report(f'{name}: {len(found[0])} corners')
         used.append((name, (picture.shape[1], picture.shape[0]), found))
     if not used:
         first = next(iter(refused), 'there is none')
@@ -341,7 +341,7 @@ def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Cor
 
 
 def _edge_width(cv2: Any, image: Image) -> float:
-    """Return how wide [px] the sharpest edges are: the contrast over the steepest gradient."""
+    """Return the width [px] of the sharpest edges: contrast over steepest gradient."""
     half = image[::2, ::2] if image.shape[0] > 2000 else image
     across, down = (np.abs(slope[::3, ::3]).ravel() for slope in cv2.spatialGradient(half))
     steepest = _nth(np.concatenate([across, down]), 99.9) / 8.0  # of a Sobel
@@ -350,7 +350,7 @@ def _edge_width(cv2: Any, image: Image) -> float:
 
 
 def _nth(values: NDArray[Any], percent: float) -> float:
-    """Return a percentile of whole numbers from 0 on."""
+    """Return a percentile of whole numbers from 0."""
     counts = np.cumsum(np.bincount(values))
     return float(np.searchsorted(counts, 0.01 * percent * counts[-1]))
 

@@ -5,13 +5,13 @@
     dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta; exact
     dh_standard.yaml, dh_modified.yaml the same as chain files, with base and tool; exact
     kinematics.yaml                    x y z roll pitch yaw from joint to joint; exact
-    dh_without_beta.csv                the best table for controllers that know no beta
+    dh_without_beta.csv                the best table for controllers without beta
     joint_offsets.csv                  the best correction by joint offsets alone
 
-Both conventions differ only in where a row is cut: Tx(a) Rx(alpha) Ry(beta) ends the row of a
-joint in the one and begins that of the next joint in the other. Every file is read back and held
-against the chain on random poses; an exact one that differs is refused, of the others the error
-that remains is written at their head.
+The conventions differ only in where a row is cut: Tx(a) Rx(alpha) Ry(beta) ends the row of a joint
+in the one and begins that of the next joint in the other. Every file is read back and compared
+with the chain on random poses; an exact one that differs is refused, others state their error in
+the first line.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ FILES = (
     *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
 )
 CORRECTED_URDF = '_corrected.urdf'
-"""End of the name of a corrected URDF beside these files."""
+"""Suffix of a corrected URDF beside these files."""
 TAIL = ('a', 'alpha', 'beta')
-"""What ends the row of a joint in the one convention, and begins that of the next in the other."""
+"""End of a joint's row in one convention, start of the next joint's in the other."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)
 
 
 class ExportError(CalibrationError):
-    """An export that does not say what the chain says."""
+    """An exported file that differs from the chain."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """A file of the arm."""
+    """An exported file."""
 
     name: str
     content: str
-    error: float  # the largest of positions, of the arm that it describes [m]
-    beyond: str = ''  # what its rows cannot hold of the way from base to flange, in words
+    error: float  # largest position error [m]
+    beyond: str = ''  # poses before and after the rows, as text
 
 
 def exports(
@@ -70,11 +70,10 @@ def exports(
     joints: FloatArray | None = None,
     origin: Mapping[str, Any] | None = None,
 ) -> tuple[Export, ...]:
-    """Return a corrected chain in all forms, for a controller that has the nominal one.
+    """Return a corrected chain in all formats, for a controller that has the nominal one.
 
-    Tables that cannot be exact are best at some `joints` (N, n) [rad or m], by default all over
-    the joint range. `origin` says where the numbers come from, for the record. A file that, read
-    back, differs from the chain is refused.
+    Tables that cannot be exact are fitted at `joints` (N, n) [rad or m], by default over the joint
+    range. `origin` is recorded. Raises ExportError if a file read back differs from the chain.
     """
     q = anywhere(chain)
     arm = replace(chain, effects=())
@@ -108,12 +107,12 @@ def exports(
 
 
 def anywhere(chain: Chain) -> FloatArray:
-    """Return the joint values (N, n) at which files are held against a chain."""
+    """Return the joint values (N, n) at which files are compared with a chain."""
     return chain.random_joints(1000, np.random.default_rng(0))
 
 
 def converted(chain: Chain, convention: Convention) -> Chain:
-    """Return the same arm by another convention; what is cut off goes into base and tool."""
+    """Return the same arm in another convention; poses cut off go into base and tool."""
     if chain.convention == convention:
         return chain
     tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
@@ -130,10 +129,9 @@ def converted(chain: Chain, convention: Convention) -> Chain:
 
 
 def cut_off(chain: Chain, convention: Convention) -> str:
-    """Return in words the poses before and after the rows of another convention, if any.
+    """Return the poses before and after the rows of another convention as text, if any.
 
-    A modified table has no a and alpha after the last joint, a standard one none before the
-    first.
+    A modified table has no a and alpha after the last joint, a standard one none before the first.
     """
     form = converted(replace(chain, base=Frame(), tool=Frame(), frames=()), convention)
     places = {'from the base to the first row': 'base', 'from the last row to the flange': 'tool'}
@@ -154,7 +152,7 @@ def _tail(a: float, alpha: float, beta: float) -> FloatArray:
 def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
     """Return the pose of each joint in the frame of the one before, as vendors write it.
 
-    The first is in the base, the last is the flange. Joints turn about, or slide along, their z.
+    The first is in the base, the last is the flange. Joints move about, or along, their z.
     """
     form = converted(replace(chain, base=Frame(), tool=Frame()), 'modified')
     names = (*chain.joint_names, 'flange')
@@ -192,7 +190,7 @@ def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
 def walked(
     places: Sequence[FloatArray], q: FloatArray, slides: Sequence[bool] | None = None
 ) -> FloatArray:
-    """Return the poses (N, 4, 4) behind frames that turn about their z, or slide along it."""
+    """Return the poses (N, 4, 4) after frames that turn about, or slide along, their z."""
     pose = np.eye(4)
     for k, place in enumerate(places):
         moved = np.tile(np.eye(4), (len(q), 1, 1))
@@ -215,20 +213,20 @@ def xyz_rpy(matrix: FloatArray) -> dict[str, float]:
 
 
 def pose_matrix(pose: Mapping[str, float]) -> FloatArray:
-    """Return the pose (4, 4) that x, y, z, roll, pitch, yaw say."""
+    """Return the pose (4, 4) of x, y, z, roll, pitch, yaw."""
     rotation = Rotation.from_euler('xyz', [pose[k] for k in ('roll', 'pitch', 'yaw')])
     return se3.transform(rotation.as_matrix(), np.array([pose[k] for k in 'xyz']))
 
 
 def head(chain: Chain, what: str, error: float, digest: str) -> str:
-    """Return the line with a file's kind, its error [m] against the arm, and its table."""
-    name = re.sub(r'[^\w .-]', '_', chain.name)  # no other line, and no other cell
+    """Return the first line: a file's kind, its error [m], and its table."""
+    name = re.sub(r'[^\w .-]', '_', chain.name)  # one line, one cell
     exact = 'exact' if error == 0.0 else f'up to {1e3 * error:.3f} mm off the calibrated arm'
     return f'# {name}: {what}; metres and radians; {exact}; calibrated table {digest}\n'
 
 
 def urdf_foot(chain: Chain) -> str:
-    """Return the comment at the end of a corrected URDF, by which it is known."""
+    """Return the comment at the end of a corrected URDF, which identifies it."""
     return f'<!-- calibrated table {table_hash(chain)} -->\n'
 
 
@@ -251,7 +249,7 @@ def _read_csv(text: str, form: Chain) -> Chain:
 
 
 def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: float) -> Export:
-    """Return a file that, read back, gives the poses (N, 4, 4) that are wanted."""
+    """Return a file that, read back, gives the wanted poses (N, 4, 4)."""
     difference = float(np.abs(again - wanted).max())
     if not difference <= SAME:
         raise ExportError(
@@ -268,9 +266,9 @@ def _distance(first: FloatArray, second: FloatArray) -> float:
 def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: FloatArray) -> Chain:
     """Return the nominal chain with some kinds of parameters fitted to another one.
 
-    `zero` stands for the joints' offsets. Base and tool are those of the other one, since no row
-    holds what they would take up, and d of nearly parallel axes stays: without beta it would
-    carry a tilt as a common normal metres away.
+    `zero` stands for the joints' offsets. Base and tool are those of the other chain, since no row
+    holds them, and d of nearly parallel axes stays: without beta it would carry a tilt as a common
+    normal metres away.
     """
     base, tool = chain.frame('base'), chain.frame('tool')
     start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
@@ -282,5 +280,5 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         names = {name for name in start.parameter_names if Parameter(name).kind in kinds}
         names -= {Parameter(joint, 'd') for joint in replace(start, parallel=None).parallel or ()}
     ordered = [name for name in start.parameter_names if name in names]
-    joints = joints[:: max(1, len(joints) // SOME_POSES)]  # to be fitted; it is judged on all
+    joints = joints[:: max(1, len(joints) // SOME_POSES)]  # fitted on some, judged on all
     return likened(start, ordered, chain, joints, 1e-3)[0]

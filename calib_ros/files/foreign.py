@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a table of another system to our columns, described in docs/tables.md."""
+"""Conversion of tables of other systems to our columns (docs/tables.md)."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ UNITS |= {'inches': 'in'} | {unit: unit for unit in LENGTHS}
 
 @dataclass(frozen=True, eq=False)
 class Foreign:
-    """How to read a table of others.
+    """How to read a table of another system.
 
-    `chain` gives the number of joints, their names, and which are prismatic. Without it, it is as
-    many as there are columns for them, all revolute.
+    `chain` gives the number of joints, their names, and which are prismatic. Without it there are
+    as many as columns for them, all revolute.
     """
 
     layout: Layout
     chain: Chain | None = None
-    log: Path | None = None  # of the joint values, if that is another table
+    log: Path | None = None  # separate table of the joint values
     log_layout: Layout = field(default_factory=Layout)
 
     def convert(self, path: Path) -> tuple[MadeColumns, tuple[str, ...]]:
-        """Return our columns of a table, and what was guessed and left out, in words."""
+        """Return our columns of a table, and notes about guesses and omissions."""
         table = _Table(path, self.layout, self.chain, self.log is None)
         values, notes, lines = table.values(), table.notes, table.lines
         if self.log is not None:
@@ -163,7 +163,7 @@ class _Table:
                 )
             else:
                 absent.append(f'{ours} ({", ".join(missing)})')
-        if 0 < len(absent) <= 5:  # `q*=A*` stands for as many as there are
+        if 0 < len(absent) <= 5:  # `q*=A*` names more than there are
             self.notes.append(f'it has no {", ".join(absent)}: left out')
         return kept
 
@@ -171,7 +171,7 @@ class _Table:
         return f'it has {", ".join(filter(None, self._sheet.header))}'
 
     def words(self) -> dict[str, list[str]]:
-        """Return the texts that are taken over."""
+        """Return the text columns."""
         found = {}
         for ours in WORDS:
             if ours in self._ours:
@@ -249,7 +249,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
 
 
 def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
-    """Return the columns with each measurement beside the joint values some rows below."""
+    """Return measurements with the joint values `shift` rows below."""
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')

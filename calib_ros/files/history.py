@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results over time: an append-only Parquet dataset.
 
-A row is a file `robot=SERIAL/KEY.parquet`. KEY is a hash of all that the result depends on: it is
-there once however often and by however many processes it is filed, as a whole or not at all.
-Nothing is changed or removed. `.cache` holds what was read before, a file for each robot; it can
-be removed at any time.
+A row is a file `robot=SERIAL/KEY.parquet`. KEY is a hash of everything the result depends on, so
+filing it again, even by several processes, changes nothing. Files appear whole and are never
+changed or removed. `.cache` holds rows read before, a file for each robot; it can be removed at
+any time.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ AWAY = 'move it away, and its work is repeated'
 
 @dataclass(frozen=True)
 class Filing:
-    """What is filed with a result: its robot, time and source."""
+    """Robot, time and source of a filed result."""
 
     serial: str
     time: datetime
     inputs: str  # a hash
     settings: str  # a hash
     source: str = ''
-    fingerprint: str = ''  # tells cheaply that the source is unchanged
+    fingerprint: str = ''  # cheap test that the source is unchanged
 
     def __post_init__(self) -> None:
         """Refuse a serial number that cannot name a folder."""
@@ -63,7 +63,7 @@ class Filing:
 
 
 def parse_serial(value: object, where: str) -> str:
-    """Return a serial number that can name a folder; `where` names it in the error."""
+    """Return a serial number that can name a folder; errors name it `where`."""
     if not isinstance(value, str) or value in ('', '.', '..'):
         raise ConfigError(f'{where} must be text ("0042" in quotes), not {value!r}')
     if len(quote(parse_name(value, where), safe='')) > LONGEST_NAME:
@@ -73,10 +73,10 @@ def parse_serial(value: object, where: str) -> str:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Row(Shown):
-    """A result as it is filed; docs/fleet.md describes the columns.
+    """A filed result; docs/fleet.md describes the columns.
 
-    Lengths of figures are in mm, angles in mrad; offsets and their covariance (P, P) in m and rad,
-    of the parameters `names`.
+    Figures are in mm and mrad; offsets and covariance (P, P) of the parameters `names` in m and
+    rad.
     """
 
     serial: str
@@ -114,7 +114,7 @@ class Row(Shown):
 
     @property
     def accepted(self) -> bool:
-        """Tell whether it is an identification that was accepted."""
+        """Tell whether it is an accepted identification."""
         return self.verdict == 'accepted'
 
     def corrected(self) -> Chain:
@@ -128,17 +128,17 @@ def digest(content: object) -> str:
 
 
 def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
-    """Return the hash of everything but the measurements that a result depends on."""
+    """Return the hash of what a result depends on besides the measurements."""
     return digest([chain_document(nominal), asdict(settings), *more])
 
 
 def content_hash(files: Sequence[str], session: str = '') -> str:
-    """Return the hash of the content of files, by their own hashes, or of a session in them."""
+    """Return the hash of files, by their own hashes, or of a session in them."""
     return digest([session, *sorted(files)])
 
 
 def samples_hash(sets: Sequence[Observations]) -> str:
-    """Return the hash of samples that are in no file."""
+    """Return the hash of samples without a file."""
     found = hashlib.sha256()
     for each in sets:
         for array in (each.stamps_ns, each.joints, each.positions, each.rotations):
@@ -147,12 +147,12 @@ def samples_hash(sets: Sequence[Observations]) -> str:
 
 
 def is_time(stamp_ns: int) -> bool:
-    """Tell whether a stamp is a time: of 1973 or later, not since a start or from lines."""
+    """Tell whether a stamp is a time (from 1973), not since a start or from lines."""
     return stamp_ns >= 10**17
 
 
 def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
-    """Return when the last pose was measured; another time if stamps are not times."""
+    """Return the time of the last pose, or `otherwise` if stamps are no times."""
     last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
     if not is_time(last):
         return otherwise or datetime.now(timezone.utc)
@@ -184,7 +184,7 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
 def judged(
     chain: Chain, before: ErrorFigures | None, after: ErrorFigures, verdict: str, about: Filing
 ) -> Row:
-    """Return the row of a validation: a calibration on poses that were measured since."""
+    """Return the row of a validation: a calibration on later poses."""
     return _row(about, 'validate', chain, verdict, (before, after))
 
 
@@ -237,7 +237,7 @@ class History:
             raise ConfigError(f'a history cannot be at {place}: that is no folder')
 
     def file(self, row: Row) -> bool:
-        """Add a row; return False where it was there already."""
+        """Add a row; return False if it exists."""
         import pyarrow as pa
         import pyarrow.parquet as parquet
 
@@ -254,17 +254,17 @@ class History:
         return True
 
     def serials(self) -> tuple[str, ...]:
-        """Return the robots that have rows."""
+        """Return the robots with rows."""
         names = self._names(self._root)
         return tuple(sorted(unquote(n[len(FOLDER) :]) for n in names if n.startswith(FOLDER)))
 
     def keys(self, serial: str) -> frozenset[str]:
-        """Return the keys of the rows of a robot."""
+        """Return the keys of a robot's rows."""
         names = self._names(self._folder(serial))
         return frozenset(n[: -len(ENDING)] for n in names if n.endswith(ENDING) and n[0] != '.')
 
     def rows(self, serial: str) -> tuple[Row, ...]:
-        """Return the rows of a robot in the order of their times."""
+        """Return the rows of a robot, ordered by time."""
         import pyarrow as pa
 
         keys = self.keys(serial)
@@ -272,7 +272,7 @@ class History:
         held = known.column('key').to_pylist()
         new = sorted(keys.difference(held))
         table = pa.concat_tables([known, *(self._read(serial, key) for key in new)])
-        if len(new) >= 8:  # fewer are read one by one every time
+        if len(new) >= 8:  # fewer are quick to read again
             self._cache(serial, table)
         rows = [row for row in _rows_of(table) if row.key in keys]
         return tuple(sorted(rows, key=lambda row: (row.time, row.source, row.key)))
@@ -302,7 +302,7 @@ class History:
             raise InputError(f'{path} is not a row of a history ({err}): {AWAY}') from err
 
     def _write(self, path: str, content: bytes) -> None:
-        """Write a file that others see as a whole or not at all."""
+        """Write a file that others see whole or not at all."""
         if self._local:
             place = Path(path)
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -315,7 +315,7 @@ class History:
         self._files.mv(partial, path)
 
     def _cached(self, serial: str) -> Any:
-        """Return the rows of a robot that were read before, as far as they can be used."""
+        """Return the cached rows of a robot, if usable."""
         import pyarrow as pa
 
         with suppress(OSError, pa.ArrowException):
@@ -326,7 +326,7 @@ class History:
         return _schema().empty_table()
 
     def _cache(self, serial: str, table: Any) -> None:
-        """Keep what was read; a history that cannot be written is read without."""
+        """Cache the rows, if the history can be written."""
         import pyarrow as pa
 
         buffer = io.BytesIO()
@@ -337,7 +337,7 @@ class History:
 
 
 def is_local(files: Any) -> bool:
-    """Tell whether a file system of fsspec is that of this machine."""
+    """Tell whether an fsspec file system is that of this machine."""
     return 'file' in ((files.protocol,) if isinstance(files.protocol, str) else files.protocol)
 
 
@@ -354,7 +354,7 @@ def _schema() -> Any:
 
 
 def _conformed(table: Any, key: str) -> Any:
-    """Return a table of the file of a key with the columns of today: empty where it has none."""
+    """Return the table of a key's file with the current columns, empty if missing."""
     import pyarrow as pa
 
     if table.column('key').to_pylist() != [key]:

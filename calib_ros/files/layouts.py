@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Layouts of tables from other systems, described in docs/tables.md.
+"""Layouts of tables from other systems (docs/tables.md).
 
-A layout says which of their columns make ours (q1, x, qw ...), as expressions, in which units, and
-how rotations are written. Presets are layouts in YAML files; a user's own goes by its path.
+A layout gives expressions of their columns for ours (q1, x, qw ...), units, and the form of
+rotations. Presets are layouts in YAML files; a user's own is named by its path.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ IN_TURN = ('r1', 'r2', 'r3')
 SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 """Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
 WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')
-"""Texts that are taken over."""
+"""Text columns."""
 NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
 UNREADABLE = (
     '"{}" is not an expression of columns: give names, {{names with blanks}} or column '
@@ -48,16 +48,16 @@ TOKEN = re.compile(
     r'\s*(?:\{([^{}]+)\}|#([0-9]+)|((?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)'
     r'|([^\W\d]\w*(?:\.\w+)*)|([-+*/()]))\s*'
 )
-"""{any name}, #7 (a column by its number), a number, a plain name, or a sign."""
+"""{any name}, #7 (a column number), a number, a plain name, or an operator."""
 SIGNS: dict[type[ast.AST], Callable[..., Any]]
 SIGNS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.true_divide}
 SIGNS |= {ast.UAdd: np.positive, ast.USub: np.negative}
 JOINT = re.compile('[qsva][0-9]+')
-"""Columns of ours with a number of each joint: values, signs of last moves, and rates."""
+"""Columns with a number of each joint: values, signs of last moves, and rates."""
 
 
 def joint_columns(joints: int, letter: str = 'q') -> tuple[str, ...]:
-    """Return the names of the columns with a number of each joint."""
+    """Return the columns with a number of each joint."""
     return tuple(f'{letter}{k + 1}' for k in range(joints))
 
 
@@ -67,11 +67,11 @@ class Expression:
 
     text: str
     terms: tuple[str | float, ...]  # columns by their names (`#7` is the seventh) and numbers
-    tree: ast.expr  # that has the terms in their order as `_0`, `_1` and so on
+    tree: ast.expr  # with the terms as `_0`, `_1` and so on
 
     @classmethod
     def parse(cls, text: str) -> Expression:
-        """Read an expression."""
+        """Parse an expression."""
         terms: list[str | float] = []
         code, at = '', 0
         while at < len(text):
@@ -93,7 +93,7 @@ class Expression:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Return the columns by their names."""
+        """Return the names of the columns."""
         return tuple(dict.fromkeys(each for each in self.terms if isinstance(each, str)))
 
     def of(self, columns: Mapping[str, FloatArray]) -> FloatArray:
@@ -104,7 +104,7 @@ class Expression:
 
 
 def _value(tree: ast.expr, terms: Sequence[FloatArray | float]) -> Any:
-    """Return the value of a tree that holds nothing but terms and signs."""
+    """Evaluate a tree of terms and operators only."""
     if isinstance(tree, ast.BinOp):
         return SIGNS[type(tree.op)](_value(tree.left, terms), _value(tree.right, terms))
     if isinstance(tree, ast.UnaryOp):
@@ -116,26 +116,26 @@ def _value(tree: ast.expr, terms: Sequence[FloatArray | float]) -> Any:
 
 @dataclass(frozen=True)
 class Layout:
-    """How a table is laid out; what is empty is guessed, or not there."""
+    """The layout of a table; empty fields are guessed or absent."""
 
     description: str = ''
-    source: str = ''  # where the form is documented
+    source: str = ''  # documentation of the format
     separator: str = ''  # between cells: comma, semicolon, tab or space
     decimal: str = ''  # '.' or ','
     columns: Mapping[str, str] = field(default_factory=dict)  # ours as expressions of theirs
     length: str = ''
     angle: str = ''  # unit of Euler angles and rotation vectors
     joint_angle: str = ''
-    euler: str = ''  # axes: XYZ turned about in turn (intrinsic), xyz fixed ones (extrinsic)
+    euler: str = ''  # axes: XYZ intrinsic, xyz extrinsic
     quaternion: str = ''  # order of the four columns qx qy qz qw, xyzw or wxyz
     rotation_vector: bool = False  # rx ry rz are one
-    inverse: bool = False  # the poses are those of the device in the target's frame
-    shift: int = 0  # joint values stand so many rows below the measurement they belong to
-    comment: str = ''  # how lines begin that say nothing
+    inverse: bool = False  # poses of the device in the target's frame
+    shift: int = 0  # rows by which joint values are below their measurement
+    comment: str = ''  # start of lines to ignore
     sheet: str = ''  # of a workbook
 
     def __post_init__(self) -> None:
-        """Refuse what no table is like."""
+        """Refuse invalid values."""
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name != 'columns' and type(value) is not type(item.default):
@@ -169,17 +169,17 @@ class Layout:
 
     @property
     def cut(self) -> str:
-        """Return the character between cells, empty where it is to be guessed."""
+        """Return the character between cells, empty to guess it."""
         return SEPARATORS.get(self.separator, self.separator)
 
 
 def presets() -> dict[str, Path]:
-    """Return the layouts that come with calib_ros, by name."""
+    """Return the supplied layouts by name."""
     return shared_files('tables')
 
 
 def load_layout(name_or_path: str) -> Layout:
-    """Return a preset, or the layout in a YAML file of the user's."""
+    """Return a preset, or the layout in a YAML file."""
     path = Path(name_or_path)
     if path.suffix not in ('.yaml', '.yml'):
         shipped = presets()
@@ -197,7 +197,7 @@ def load_layout(name_or_path: str) -> Layout:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Return the columns of `q1=A1,x={Pos X},...`; `q*=A*` stands for all joints up to 50."""
+    """Return the columns of `q1=A1,x={Pos X},...`; `q*=A*` stands for up to 50 joints."""
     found: dict[str, str] = {}
     for part in re.split(r',(?![^{]*\})', text):
         ours, equals, theirs = part.partition('=')
@@ -213,7 +213,7 @@ def parse_columns(text: str) -> dict[str, str]:
 
 
 def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> Layout:
-    """Return the layout of a preset, if any, with what was given on top."""
+    """Return the layout of a preset, if any, with the given values on top."""
     layout = load_layout(preset) if preset else Layout()
     changes = {name: value for name, value in given.items() if value}
     for name in ('euler', 'quaternion', 'rotation_vector'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""From a bag or a table to what is identified, and its result."""
+"""Loading of bags and tables as problems."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
 TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')
-"""Endings of tables, in small letters."""
+"""Suffixes of tables, lower case."""
 
 
 @dataclass(frozen=True, eq=False)
 class Loaded:
-    """A problem, and what became of the input."""
+    """A problem, with counts and warnings of its input."""
 
     problem: Problem
     samples: dict[str, Any]  # counts of the input
     warnings: tuple[str, ...] = ()
-    read: str = ''  # these counts in words
+    read: str = ''  # these counts as text
     lines: bool = False  # stamps are the lines of a table
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
-    refusals: tuple[Reason, ...] = ()  # why a result must not be accepted, whatever it is
-    instead: bool = False  # the refusals stand instead of those of the result
-    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is, of a bag
+    refusals: tuple[Reason, ...] = ()  # reasons not to accept any result
+    instead: bool = False  # the refusals replace those of the result
+    owners: Mapping[str, Owner] = field(default_factory=dict)  # of the frames, from a bag
 
     def identified(self, model: str, told: Told = nobody) -> Identification:
-        """Identify, and refuse the result where too much of the input is lost."""
+        """Identify, and refuse the result if too much of the input is lost."""
         try:
             result = identify_model(self.problem, model, told)
         except TooFewObservationsError as err:
@@ -59,13 +59,13 @@ class Loaded:
 def replayed(
     path: Path, chain: Chain, settings: Settings, told: Told = nobody
 ) -> tuple[CalibrationSession, Replayed]:
-    """Return a session that has taken a bag."""
+    """Return a session that has replayed a bag."""
     session = CalibrationSession(chain, settings)
     return session, replay(path, session, told)
 
 
 def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
-    """Return what to fit from a bag, of which only a share may be lost."""
+    """Return the problem of a bag, of which only a share may be lost."""
     problem, account = session.problem(), session.account()
     samples = {'recorded': read.recorded, 'read': read.read, **asdict(account)}
     refusals = read.refusals(account, largest_loss)
@@ -84,8 +84,8 @@ def table(
 ) -> Table:
     """Return a table of measurements of a chain.
 
-    If nothing is said about its layout and its columns are not ours, their names may be those of
-    the joints, and its separator another: what is guessed is among the warnings.
+    Without a given layout, a table with other columns is tried with the joints' names and another
+    separator; guesses are among the warnings.
     """
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     given = path, len(chain.joints), sessions, sigmas, eye_in_hand
@@ -93,13 +93,13 @@ def table(
         return read_table(*given, foreign, told)
     except ColumnsError:
         if foreign is None:
-            with suppress(CalibrationError):  # the first error tells what was expected
+            with suppress(CalibrationError):  # keep the first error
                 return read_table(*given, Foreign(Layout(), chain), told)
         raise
 
 
 def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:
-    """Return what is to be fitted of a table; what is `given` goes to the problem."""
+    """Return the problem of a table, with `given` arguments."""
     problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))
     samples = {'samples': fitted, 'held_out': held_out, 'sets': len(found.fitted)}

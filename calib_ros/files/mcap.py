@@ -21,18 +21,18 @@ from calib_ros.texts import LARGEST_TABLE
 
 MAGIC = b'\x89MCAP0\r\n'
 _HEAD = struct.Struct('<BQ')  # kind and size
-_LOGGED = struct.Struct('<HIQQ')  # channel, sequence, and when it was logged and published
+_LOGGED = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
 MESSAGE_HEAD = _LOGGED.size
 _CHUNK = struct.Struct('<QQQI')  # first and last log time, uncompressed size and checksum
 FOOTER = _HEAD.size + struct.calcsize('<QQI') + len(MAGIC)
-"""Bytes of the last record, with the place of the index, and of the magic after it."""
+"""Bytes of the last record, with the place of the index, and of the magic."""
 MODULES = {'lz4': ('lz4.frame',), 'zstd': ('compression.zstd', 'backports.zstd', 'zstandard')}
 Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
 
 
 class Kind(IntEnum):
-    """Kinds of records, by their opcodes."""
+    """Opcodes of records."""
 
     SCHEMA = 0x03
     CHANNEL = 0x04
@@ -44,23 +44,23 @@ class Kind(IntEnum):
 
 
 class Room:
-    """What may still be unpacked of a recording of some bytes: a chunk and 1,000 times its size.
+    """Bytes that may still be unpacked of a recording: a chunk and 1,000 times its size.
 
-    No recorder packs tighter; beyond it is an InputError.
+    No recorder compresses more; beyond it raises InputError.
     """
 
     def __init__(self, packed: int) -> None:
         self._left = LARGEST_TABLE + 1000 * packed
 
     def take(self, size: int) -> None:
-        """Allow so many bytes to be unpacked."""
+        """Count bytes to unpack."""
         self._left -= size
         if self._left < 0:
             raise InputError('it unpacks to 1000 times its size')
 
 
 def is_indexed(file: Path) -> bool:
-    """Tell whether a file ends with an index of its chunks, or says all about its topics."""
+    """Tell whether a file ends with an index of its chunks, or a summary of its topics."""
     size = file.stat().st_size
     with file.open('rb') as content:
         content.seek(max(0, size - FOOTER))
@@ -78,10 +78,10 @@ def is_indexed(file: Path) -> bool:
 
 
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
-    """Yield (kind, content) of the records, those in chunks included.
+    """Yield (kind, content) of the records, including those in chunks.
 
-    One that is cut off is an EOFError after what it holds, a chunk in another one a ValueError,
-    more in them than any recording holds an InputError.
+    Raises EOFError at a cut-off record, ValueError for a nested chunk, InputError for too much
+    data.
     """
     room, chunk = Room(len(content)), int(Kind.CHUNK)
     while start < len(content):
@@ -104,10 +104,10 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
 def logged(
     chunk: bytes, channels: Mapping[int, Channel]
 ) -> tuple[list[tuple[int, Channel, bytes]], Exception | None]:
-    """Return the messages on some channels, by number, of a chunk, in the order of log times.
+    """Return the messages of a chunk on some channels (by number), in order of log time.
 
-    The chunk is a record with kind and size. Log time, channel and data of each message are
-    returned, and what is wrong with a record before which these stand, if anything.
+    Each is log time, channel and data; an error in a record ends them and is returned too. The
+    chunk is a record with kind and size.
     """
     chunk = chunk[_HEAD.size :]
     begin, end, size, checksum = _CHUNK.unpack_from(chunk)
@@ -128,18 +128,18 @@ def logged(
 
 
 def unpacked_size(chunk: bytes) -> int:
-    """Return how large the content of a chunk is said to be; the record is with kind and size."""
+    """Return the stated size of a chunk's content; the record has kind and size."""
     return int(_CHUNK.unpack_from(chunk, _HEAD.size)[2])
 
 
 def string(record: bytes, start: int) -> str:
-    """Return the text at a place of a record."""
+    """Return the text at an offset of a record."""
     (size,) = struct.unpack_from('<I', record, start)
     return record[start + 4 : start + 4 + size].decode()
 
 
 def unpacked(data: bytes, compression: str, largest: int) -> bytes:
-    """Return what is packed in some bytes; of one that is cut off what there is."""
+    """Return decompressed data, as much as there is."""
     module: Any = _module(compression) if compression else None
     found = data
     if compression == 'lz4':
@@ -162,13 +162,13 @@ def _unpacked(chunk: bytes) -> bytes:
 
 
 def open_zstd(file: Path) -> Any:
-    """Return a packed file, to read what is in it."""
+    """Open a compressed file for reading."""
     return _module('zstd').open(file, 'rb')
 
 
-@cache  # looking for a module that is not there takes ten times as long as a message
+@cache  # searching a missing module takes ten times as long as a message
 def _module(compression: str) -> Any:
-    """Return what unpacks a compression: one of the modules that rosbags brings."""
+    """Return the decompression module: one of those that rosbags requires."""
     for name in MODULES.get(compression, ()):
         with suppress(ImportError):
             return importlib.import_module(name)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The meaning of the rows of a measurement table, all at once, and their rules."""
+"""The rows of a measurement table as arrays, and their rules."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults
 SPLITS = {name: name for name in ('', 'train', 'test', 'removed')}
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
 KINDS = ('x', 'distance', 'socket', 'plane')
-"""Cells that say what was measured in a row: a pose or position, a distance, ..."""
+"""Columns whose cells determine what a row measured."""
 POSE, DISTANCE, SOCKET, PLANE = range(4)
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
-    """N rows with what was measured, NaN where nothing was; columns are those of a `Sample`.
+    """N rows of measurements, NaN where missing; columns as in `Sample`.
 
-    `lines` (N,) are those of the file at `path`. `kind` (N,) is POSE, DISTANCE, SOCKET or PLANE,
-    which has the distance 0. Poses whose rotation was not measured, by `oriented` (N,), have no
-    turn. What no row has may be None.
+    `lines` (N,) are those of the file at `path`. `kind` (N,) is POSE, DISTANCE, SOCKET or PLANE
+    (with distance 0). Poses without a measured rotation, by `oriented` (N,), have the identity.
+    Columns without values may be None.
     """
 
     path: Path
@@ -73,7 +73,7 @@ class Measurements:
     spread: FloatArray
 
     def select(self, rows: NDArray[np.generic]) -> Measurements:
-        """Return some of the rows, by a mask (N,) or by indices (K,)."""
+        """Return some rows, by a mask (N,) or indices (K,)."""
         found: dict[str, object] = {}
         for item in fields(self):
             value = getattr(self, item.name)
@@ -84,7 +84,7 @@ class Measurements:
         return replace(self, **found)  # type: ignore[arg-type]
 
     def observations(self) -> Observations:
-        """Return rows of one kind and between the same frames as observations."""
+        """Return rows of one kind and pair of frames as observations."""
 
         def optional(values: FloatArray | None, nothing: float) -> FloatArray | None:
             if values is None or np.isnan(values).all():
@@ -110,12 +110,12 @@ class Measurements:
 
     @cached_property
     def codes(self) -> NDArray[np.intp]:
-        """Return what frames and sets depend on (N, 6), session, device and target first."""
+        """Return the codes (N, 6) of frames and sets; session, device, target first."""
         words = (self.session[0], self.device[0], self.target[0])
         return np.column_stack([*words, self.eye_in_hand, self.kind, self.test])
 
     def kept(self) -> Measurements:
-        """Return the rows that were not taken back; refuse two that are alike."""
+        """Return the rows that were not removed; refuse duplicates."""
         found = self
         if self.removed.any():
             open_rows: dict[tuple[int, ...], list[int]] = {}
@@ -141,7 +141,7 @@ class Measurements:
         return found
 
     def check_frames(self) -> None:
-        """Refuse too many frames, and several of a device; a row that names none may be of any."""
+        """Refuse too many frames, and several of a device; rows without one may have any."""
         kinds, number = distinct(self.codes[:, :3])
         most = 100
         for line in self.lines[number == most][:1].tolist():
@@ -167,7 +167,7 @@ class Measurements:
 
 
 def joined(parts: Sequence[Measurements]) -> Measurements:
-    """Return the rows of parts of one file, one part after the other."""
+    """Return the rows of successive parts of one file."""
     found: dict[str, object] = {}
     sizes = [len(each.lines) for each in parts]
     for item in fields(Measurements):
@@ -189,7 +189,7 @@ def joined(parts: Sequence[Measurements]) -> Measurements:
 
 
 def measurements(columns: Columns, joints: int) -> Measurements:
-    """Return what the rows of a table say; whatever makes no sense is refused."""
+    """Return the measurements in a table; refuse invalid rows."""
     header = columns.header
     _check_header(columns, joints)
     has = [~columns.blank(n) if n in header else np.zeros(len(columns.lines), bool) for n in KINDS]
@@ -257,7 +257,7 @@ class _Blocks:
     def of(
         self, names: tuple[str, ...], needed: NDArray[np.bool_] | bool, largest: float = LARGEST
     ) -> FloatArray | None:
-        """Return the numbers (N, len(names)) of a block, None where all are blank."""
+        """Return the numbers (N, len(names)) of a block, None if all are blank."""
         if names not in self._at:
             return None
         found = self._numbers[:, self._at[names]]
@@ -267,13 +267,13 @@ class _Blocks:
     def one(
         self, name: str, largest: float = LARGEST, needed: NDArray[np.bool_] | bool = False
     ) -> FloatArray:
-        """Return the numbers (N,) of a column, 0 where it is blank."""
+        """Return the numbers (N,) of a column, 0 if blank."""
         found = self.of((name,), needed, largest)
         return np.zeros(len(self._columns.lines)) if found is None else np.nan_to_num(found[:, 0])
 
 
 def _check_header(columns: Columns, joints: int) -> None:
-    """Refuse a table without columns that it needs, or with a part of a block."""
+    """Refuse a table without needed columns, or with an incomplete block."""
     header = set(columns.header)
     needed = [*joint_columns(joints)]
     if not set(KINDS[1:]) & header:
@@ -297,7 +297,7 @@ def _check_header(columns: Columns, joints: int) -> None:
 def choices(
     columns: Columns, name: str, known: Mapping[str, object], what: str
 ) -> NDArray[np.generic]:
-    """Return the meaning of the cells (N,) of a column; only some values are valid."""
+    """Return the meaning of the cells (N,) of a column with known values."""
     numbers, found = columns.labels(name)
     for k, word in enumerate(found):
         if word not in known:
@@ -314,15 +314,15 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
 
 
 def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
-    """Return the devices; a socket and a plane stand for one, as does what measures distances."""
+    """Return the devices, including sockets, planes and sources of distances."""
     if not kind.any():
         return columns.labels('device')
     labels = [columns.labels(name) for name in ('device', 'plane', 'location', 'socket')]
     kinds, number = distinct(np.column_stack([kind, *(codes for codes, _ in labels)]))
     names = []
     for k, (what, *codes) in enumerate(kinds.tolist()):
-        told = zip(labels, codes, strict=True)
-        name, plane, place, socket = (texts[code] for (_, texts), code in told)
+        pairs = zip(labels, codes, strict=True)
+        name, plane, place, socket = (texts[code] for (_, texts), code in pairs)
         if what == PLANE:
             name = plane
         elif what == SOCKET:
@@ -331,7 +331,7 @@ def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
             except ConfigError as err:
                 row = int(np.argmax(number == k))
                 raise InputError(f'{columns.path}, line {columns.lines[row]}: {err}') from err
-        elif what == DISTANCE and 'x' in columns.header:  # the origin of a tracker is another one
+        elif what == DISTANCE and 'x' in columns.header:  # not the tracker's origin
             name = name or 'distance'
         names.append(name)
     found, different = numbered(names)
@@ -341,7 +341,7 @@ def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
 def _turned(
     columns: Columns, quat: FloatArray | None, placed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], FloatArray]:
-    """Return which of the poses are oriented (N,), and the rotations (N, 3, 3)."""
+    """Return which poses (N,) are oriented, and the rotations (N, 3, 3)."""
     if quat is None:
         return np.zeros(len(placed), bool), np.tile(np.eye(3), (len(placed), 1, 1))
     check_quaternions(columns, quat)
@@ -357,7 +357,7 @@ def _covariance(
     placed: NDArray[np.bool_],
     oriented: NDArray[np.bool_],
 ) -> FloatArray | None:
-    """Return the covariances (N, 6, 6), NaN where none was given; None where none was."""
+    """Return the covariances (N, 6, 6), NaN where missing, None if all are."""
     if upper is None:
         return None
     given = placed & ~np.isnan(upper[:, 0])

@@ -16,8 +16,7 @@ from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.sampling.pictures import Refusal
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
-Image = NDArray[np.uint8]
-"""In grey."""
+Image = NDArray[np.uint8]  # grey
 
 
 def opencv() -> Any:
@@ -35,7 +34,7 @@ def opencv() -> Any:
 
 
 def files_of(folder: Path) -> list[Path]:
-    """Return the images of a folder by name, shorter ones first."""
+    """Return the images of a folder by name, shorter names first."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
     for path in paths:
         if not path.name.isprintable():
@@ -44,9 +43,9 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def read_image(path: Path) -> Image | Refusal:
-    """Return an image in grey, without pixels if it is none, or why it cannot be read."""
+    """Return an image in grey, empty if it is none, or why it cannot be read."""
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # to read from a pipe would never end
+        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
             return Refusal('that cannot be read', 'it is not a file')
         if path.stat().st_size > LARGEST_IMAGE:
             return Refusal('that cannot be read', f'it has more than {LARGEST_IMAGE / 1e6:.0f} MB')
@@ -58,8 +57,8 @@ def read_image(path: Path) -> Image | Refusal:
 def decoded(data: NDArray[np.uint8]) -> Image:
     """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) if it is none.
 
-    As the sensor saw it: turned as its EXIF asks, it would not be the image that the lens made.
-    Of 10 to 16 bits, the eight highest that are used.
+    EXIF rotation is ignored, because the lens is that of the sensor image. Of 10 to 16 bits the
+    eight highest used ones are kept.
     """
     cv2 = opencv()
     kind = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION

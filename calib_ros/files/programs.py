@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses to go to: tables of joint values or poses (CSV), and JointTrajectory messages (YAML).
+"""Programs: tables of joint values or poses (CSV), and JointTrajectory messages (YAML).
 
 Joint values are in q1 ... qn, or in columns with the joints' names [rad or m], poses in x y z [m]
-and qx qy qz qw. What of a program is no joint value, velocity or acceleration of the arm is
-written as it was read.
+and qx qy qz qw. Everything else in a program is written back unchanged.
 """
 
 from __future__ import annotations
@@ -33,11 +32,11 @@ from calib_ros.values import parse_numbers
 
 POSE = (*POSITION, *QUATERNION)
 RATES = ('positions', 'velocities', 'accelerations')
-"""What a point of a JointTrajectory holds that a correction changes."""
+"""Fields of a JointTrajectory point that a correction changes."""
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
-    """Read joint values (N, n) [rad or m] from a CSV; refuse any over 1e-3 beyond its limits."""
+    """Read joint values (N, n) [rad or m] from a CSV; refuse any 1e-3 beyond its limits."""
     found = read_columns(path, ())
     names = _header_of(found, chain.joint_names)
     values = found.block(names)
@@ -55,7 +54,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:
     """Refuse joint values (N, n) that may be degrees, of revolute joints without limits.
 
-    Those of joints with limits are held against these. `where` names a row and a joint.
+    `where` names a row and a joint.
     """
     free = [j.type == 'revolute' and None in (j.lower, j.upper) for j in chain.joints]
     for k, i in np.argwhere((np.abs(values) > TWO_TURNS) & free)[:1].tolist():
@@ -67,7 +66,7 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
 
 
 def _header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns that hold the joint values: q1 ... qn, or the names of the joints."""
+    """Return the columns of the joint values: q1 ... qn, or the joint names."""
     names = joint_columns(len(joints))
     if set(joints) <= set(found.header) and not set(names) <= set(found.header):
         names = tuple(joints)
@@ -100,7 +99,7 @@ def csv_of(columns: Sequence[str], values: FloatArray) -> str:
 
 @dataclass(frozen=True, eq=False)
 class ProgramFile:
-    """A program, where each of its samples stands in the file, and how to write it again."""
+    """A program, the places of its samples in the file, and how to write it back."""
 
     program: Program
     places: tuple[str, ...]
@@ -108,11 +107,11 @@ class ProgramFile:
 
 
 def program_of(path: Path, chain: Chain) -> ProgramFile:
-    """Read a program for an arm, as `read_program`; refuse joint values that may be degrees."""
+    """Read a program for an arm (`read_program`); refuse joint values that may be degrees."""
     found = read_program(path, chain.joint_names)
     known = found.program.names
     columns = [known.index(name) for name in chain.joint_names if name in known]
-    if len(columns) == len(chain.joints):  # else it is refused where it is corrected
+    if len(columns) == len(chain.joints):  # otherwise refused later
         values = found.program.positions[:, columns]
         check_turns(values, chain, lambda k, _: f'{path}, {found.places[k]}: ')
     return found
@@ -121,9 +120,9 @@ def program_of(path: Path, chain: Chain) -> ProgramFile:
 def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
     """Read a program for an arm with the named joints: CSV, or YAML by the file's suffix.
 
-    CSV: joint values in q1 ... qn, or in columns with the joints' names; s1 ... sn, if present,
-    are the signs of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as `ros2 topic
-    echo` prints it.
+    CSV: joint values in q1 ... qn, or in columns with the joints' names; optional s1 ... sn are
+    the signs of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as printed by
+    `ros2 topic echo`.
     """
     suffix = path.suffix.lower()
     if suffix == '.csv':
@@ -183,7 +182,7 @@ def _read_yaml(text: str, where: str) -> ProgramFile:
 def trajectory_program(
     names: Sequence[object], points: Sequence[Mapping[str, Any]], where: str
 ) -> Program:
-    """Return the program of a JointTrajectory: names and points, rates at all or none."""
+    """Return the program of a JointTrajectory; rates at all points or none."""
 
     def values(key: str) -> FloatArray | None:
         given = [point.get(key) or [] for point in points]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Synthetic or tabulated measurements to bag."""
+"""Synthetic or tabulated measurements to a bag."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from calib_ros.sampling.messages import JOINT_STATE, VALIDATION
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """What to write into a bag: joint samples (M, n), poses (N) and which of those judge only."""
+    """Content of a bag: joint samples (M, n), poses (N), and which of these are held out."""
 
     joint_names: tuple[str, ...]
     joint_stamps_ns: NDArray[np.int64]
@@ -36,9 +36,9 @@ class Recording:
     def of_dwells(
         cls, joint_names: tuple[str, ...], observations: Observations, held_out: NDArray[np.bool_]
     ) -> Recording:
-        """Turn a table into a recording: the arm stands for 0.4 s at every row, once a second.
+        """Return a table as a recording: the arm stands for 0.4 s at every row, once a second.
 
-        `held_out` (N,) tells which rows are for the topic that is not fitted.
+        `held_out` (N,) rows go to the validation topic.
         """
         begin = (1 + np.arange(len(observations))[:, np.newaxis]) * 1_000_000_000
         stamps = begin + np.arange(5) * 100_000_000
@@ -54,10 +54,10 @@ def write_bag(
     beside: Mapping[Path, str] | None = None,
     told: Told = nobody,
 ) -> None:
-    """Write a recording as a rosbag2 folder, in the order of the stamps, as a whole or not at all.
+    """Write a recording as a rosbag2 folder, ordered by stamp, whole or not at all.
 
     Topics: /joint_states, and /measured_pose or /measured_point; /validation_pose or
-    /validation_point for held-out poses. Files `beside` the bag are there before it is.
+    /validation_point for held-out poses. Files `beside` the bag are written before it.
     """
     with whole_folder(path) as folder:
         try:

@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other systems as text in columns: files and workbooks, with any head.
+"""Tables of other systems as text columns: files and workbooks with any head.
 
-What is guessed (the coding, the separator, the decimal sign, the line of the header) is said.
+Guesses (encoding, separator, decimal sign, header line) are reported.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD_LINES = MOST_ENTRIES // 10
-"""Lines that the header and the first row of numbers are looked for in."""
+"""Lines searched for the header and the first row of numbers."""
 LARGEST_SHEET = 3 * LARGEST_TABLE
-"""Bytes of a workbook unpacked."""
+"""Bytes of an unpacked workbook."""
 SHEETS = ('.xlsx', '.xlsm')
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 
@@ -40,7 +40,7 @@ class Sheet:
     notes: tuple[str, ...]
 
     def number(self, name: str) -> str | None:
-        """Return `#k` of a column by its name, None where there is none of that name."""
+        """Return `#k` of a column by its name, None if unknown."""
         if name.startswith('#'):
             return name if 0 < int(name[1:]) <= len(self.header) else None
         count = self.header.count(name)
@@ -55,8 +55,8 @@ class Sheet:
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
     """Read a table with a known layout.
 
-    The header is the first line that has all columns of some `names`; where these are numbers of
-    columns only, the first with some of the names `known`.
+    The header is the first line with all column `names`; if these are only numbers, the first with
+    some of the `known` names.
     """
     notes: list[str] = []
     text, separator = '', ''
@@ -116,7 +116,7 @@ def _after(text: str, lines: int) -> int:
 
 
 def _text(path: Path) -> tuple[str, str]:
-    """Return the text of a file, and what coding it was taken for if that was a guess."""
+    """Return the text of a file, and its encoding if guessed."""
     data = read_bytes(path, LARGEST_TABLE, InputError)
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         try:
@@ -133,7 +133,7 @@ def _text(path: Path) -> tuple[str, str]:
 
 
 def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
-    """Return the rows of a sheet with their numbers, by default of the first not hidden."""
+    """Return the numbered rows of a sheet, by default the first visible one."""
     try:
         import openpyxl
     except ImportError as err:
@@ -153,7 +153,7 @@ def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
         sheet = book[name] if name else seen[0]
         if len(seen) > 1 and not name:
             notes.append(f'sheet "{sheet.title}" is read, the first of {len(seen)} (--sheet)')
-        sheet.reset_dimensions()  # programs write smaller ones than there are rows
+        sheet.reset_dimensions()  # stated ones may be too small
         rows: list[Row] = []
         for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
             if len(row) > MOST_ENTRIES:
@@ -182,7 +182,7 @@ def _cell(value: object) -> str:
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
     lines = [line for line in text[: _after(text, HEAD_LINES)].split('\n') if line.strip()]
-    lines = lines[-30:]  # under most of what stands above the header
+    lines = lines[-30:]  # mostly below the header
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most = 'comma', 0
@@ -207,7 +207,7 @@ def _decimal(rows: Sequence[Row], separator: str, notes: list[str]) -> str:
 
 
 def _cells(path: Path, text: str, separator: str) -> list[Row]:
-    """Return the cells of all lines that hold any, with the numbers of the lines."""
+    """Return the cells of all non-empty lines, with line numbers."""
     found: list[Row] = [
         (line, [' '.join(cell.split()) for cell in row])
         for line, row in csv_rows(path, text, separator)
@@ -221,7 +221,7 @@ def _cells(path: Path, text: str, separator: str) -> list[Row]:
 def _header(
     path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]
 ) -> tuple[int, tuple[str, ...]]:
-    """Return where the header is among the rows, and its names; -1 where there is none."""
+    """Return the row index of the header, and its names; -1 if there is none."""
     wanted = {name for name in names if not name.startswith('#')}
     low = {name.lower() for name in known}
     best: tuple[int, set[str]] = (0, wanted)

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 STORAGE = ('chunks', 'connections', 'path')
 TIMES = ('message_start_time', 'message_end_time')
 CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompressed_size')
-"""What the library does not promise: without them, it is asked for the messages itself."""
+"""Attributes that rosbags does not promise: without them, its own reading is used."""
 LARGEST_MESSAGE = 64 * MOST_ENTRIES
-"""Bytes of a message: those of a joint in a joint state, its name and three numbers, for each."""
+"""Bytes of a message: a joint state with a name and three numbers per joint."""
 LARGEST_IMAGE = 2 * LARGEST_TABLE
 """Bytes of an image, as a message or a file."""
 NOT_CLOSED = 'the recording was not closed'
@@ -48,13 +48,13 @@ GROWING = {
     'message_definitions': 'SELECT id FROM message_definitions NOT INDEXED',
     'timestamp_idx': 'SELECT timestamp, id FROM messages INDEXED BY timestamp_idx ORDER BY 1, 2',
 }
-"""What must grow from row to row; in a file that was made to be endless it comes again."""
+"""Queries whose rows must increase; in a malicious file they repeat for ever."""
 _PLAIN = re.compile(r'CREATE (TABLE|INDEX) (?!.*\b(AS|GENERATED)\b)', re.IGNORECASE | re.DOTALL)
 _NUMBERED = re.compile(r'[^(]*\(\s*id INTEGER PRIMARY KEY', re.IGNORECASE)
 
 
 def recorded(path: Path) -> int | None:
-    """Return how many messages the recorder says it has written; None when it does not."""
+    """Return the number of messages stated by the recorder, or None."""
     try:
         text = read_text(path / 'metadata.yaml')
     except ConfigError:
@@ -65,7 +65,7 @@ def recorded(path: Path) -> int | None:
 
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
-    """Give a bag whose files are whole, neither compressed nor partly in a write-ahead log."""
+    """Provide a bag whose files are neither compressed nor partly in a write-ahead log."""
     files = _files(path, '.mcap', '.db3', '.zstd')
     if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
         yield path
@@ -85,12 +85,12 @@ def unpacked_files(path: Path) -> Iterator[Path]:
 
 
 def _log(file: Path) -> Path:
-    """Return where a database has its write-ahead log while it is written, or was when killed."""
+    """Return the path of a database's write-ahead log."""
     return file.with_name(f'{file.name}-wal')
 
 
 def _with_log(file: Path, target: Path) -> None:
-    """Copy a file that has a log, with what is in it; link to one that has none."""
+    """Copy a file with its log applied; link to one without."""
     if not _log(file).is_file():
         target.symlink_to(file.resolve())
         return
@@ -99,11 +99,11 @@ def _with_log(file: Path, target: Path) -> None:
     try:
         with closing(sqlite3.connect(target)) as connection:
             _, pages, _ = connection.execute('PRAGMA wal_checkpoint').fetchone()
-    except sqlite3.OperationalError as err:  # of a full disk
+    except sqlite3.OperationalError as err:  # full disk
         raise InputError(f'{_log(file)} cannot be applied to a copy of {file}: {err}') from err
-    except sqlite3.DatabaseError:  # no database; what is missing will be told
+    except sqlite3.DatabaseError:  # no database; reported later
         return
-    if pages == 0 and _log(file).stat().st_size > 32:  # its head, before any page
+    if pages == 0 and _log(file).stat().st_size > 32:  # more than its header
         raise InputError(
             f'{_log(file)} is damaged, what was recorded last cannot be read: copy it again, or '
             'move it away to use the rest'
@@ -119,19 +119,19 @@ def _unpack_file(file: Path, target: Path) -> None:
                 out.write(part)
     except InputError as err:
         raise InputError(f'{file} is too large: {err}') from err
-    except OSError:  # of a full disk
+    except OSError:  # full disk
         raise
-    except Exception:  # decompressors have errors of their own; what is missing will be told
+    except Exception:  # decompressors have their own errors; losses are reported later
         return
 
 
 def named(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
-    """Return the types of topics; a database may hold something else than text for both."""
+    """Return the types of topics; a database may hold something other than text."""
     return {name: kind for name, kind in topics if isinstance(name, str) and isinstance(kind, str)}
 
 
 def check(path: Path) -> None:
-    """Refuse a bag folder or file that the library must not open, though messages may be in it."""
+    """Refuse a bag folder or file that the library must not open."""
     metadata = path / 'metadata.yaml'
     if metadata.exists():
         parse_yaml(read_text(metadata), str(metadata))
@@ -148,7 +148,7 @@ def check(path: Path) -> None:
 
 @dataclass
 class Salvage:
-    """Topics with their types, how many messages, what is wrong, and if files are `whole`."""
+    """Topics with types, number of messages, problem, and whether files are `whole`."""
 
     files: tuple[Path, ...]
     topics: dict[str, str] = field(default_factory=dict)
@@ -166,12 +166,12 @@ class Salvage:
         self.problem, self.whole = problem, False
 
     def on(self, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-        """Yield the messages on some topics, as what these carry."""
+        """Yield the messages of some streams."""
         return ((streams[topic], data) for topic, data in self.messages() if topic in streams)
 
 
 def salvage(path: Path) -> Salvage | None:
-    """Return what can be read of a bag folder or file; None when nothing can."""
+    """Return what can be read of a bag folder or file, or None."""
     found = Salvage(_files(path))
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         found.problem = NOT_CLOSED
@@ -189,9 +189,9 @@ def _open(file: Path) -> sqlite3.Connection:
 
 
 def _check_layout(connection: sqlite3.Connection) -> None:
-    """Refuse a database that computes what it holds: views, virtual tables and columns."""
+    """Refuse a database with computed content: views, virtual tables and columns."""
     for name, statement in connection.execute('SELECT name, sql FROM sqlite_master'):
-        if statement is None:  # an index that comes with a table
+        if statement is None:  # implicit index of a table
             continue
         plain = isinstance(statement, str) and _PLAIN.match(statement)
         if not plain or (name in ('topics', 'messages') and not _NUMBERED.match(statement)):
@@ -199,7 +199,7 @@ def _check_layout(connection: sqlite3.Connection) -> None:
 
 
 def _growing(rows: Iterable[tuple[Any, ...]], name: str) -> Iterator[tuple[Any, ...]]:
-    """Yield rows whose first cell grows, or the first two together."""
+    """Yield rows whose first two cells increase."""
     before: tuple[Any, ...] | None = None
     for row in rows:
         if before is not None and row[:2] <= before:
@@ -223,7 +223,7 @@ def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
             (size,) = connection.execute('PRAGMA page_size').fetchone()
             if pages * size > file.stat().st_size:
                 found.note('the file is cut off')
-        except Exception as err:  # numbers, texts and names may be anything
+        except Exception as err:  # cells may hold anything
             found.note(str(err) or type(err).__name__)
 
 
@@ -251,20 +251,20 @@ def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
                 elif kind == mcap.Kind.DATA_END:
                     return
         found.problem = NOT_CLOSED
-    except Exception as err:  # decompressors have errors of their own
+    except Exception as err:  # decompressors have their own errors
         found.note(f'cut off or damaged: {err}')
 
 
 def largest(stream: Stream) -> int:
-    """Return how many bytes a message of a stream may have."""
+    """Return the largest size of a message of a stream."""
     return LARGEST_IMAGE if stream.type in PICTURES else LARGEST_MESSAGE
 
 
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-    """Return the messages of an open bag on some topics, in the order in which they were logged.
+    """Return the messages of an open bag on some topics, in order of log time.
 
-    Those of mcap files come chunk by chunk, merged where chunks overlap in time, and as they
-    stand in the file where it has none. All others come as the library reads them.
+    mcap files are read chunk by chunk, merged where chunks overlap in time, and in file order
+    without chunks; all others by the library.
     """
     storage = getattr(reader, 'storage', None)
     storages = getattr(storage, 'storages', [storage])
@@ -278,12 +278,12 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
 
 
 def _unpacked(data: bytes, most: int) -> bytes:
-    """Return a message, without any bytes where it cannot be unpacked: the next one may be."""
+    """Return an unpacked message, empty if damaged: the next one may be readable."""
     try:
         return mcap.unpacked(data, 'zstd', most)
-    except OSError:  # nothing to unpack with
+    except OSError:  # no decompression module
         raise
-    except Exception:  # decompressors have errors of their own
+    except Exception:  # decompressors have their own errors
         return b''
 
 
@@ -293,7 +293,7 @@ def _wanted(storage: Any, streams: Mapping[str, Stream]) -> list[Any]:
 
 
 def _is_known(storage: Any) -> bool:
-    """Return whether it is a database, or an mcap file with what is needed of its index."""
+    """Tell whether it is a database, or an mcap file with the needed index."""
     if hasattr(storage, 'dbconn'):
         return True
     if not all(hasattr(storage, name) for name in STORAGE):
@@ -302,7 +302,7 @@ def _is_known(storage: Any) -> bool:
 
 
 def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
-    """Yield the messages of a file; what is wrong with a chunk is raised at the end."""
+    """Yield the messages of a file; an error in a chunk is raised at the end."""
     wanted = _wanted(storage, streams)
     channels = {each.id: streams[each.topic] for each in wanted}
     if hasattr(storage, 'dbconn'):
@@ -338,11 +338,11 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
 
 
 def _together(chunks: Sequence[Any], channels: Mapping[int, Stream]) -> Iterator[list[Any]]:
-    """Yield chunks with messages on some channels, together what overlaps and fits into memory."""
+    """Yield chunks with messages on some channels, overlapping ones together if they fit."""
     together: list[Any] = []
     end = size = 0
     for chunk in sorted(chunks, key=attrgetter('message_start_time', 'chunk_start_offset')):
-        counts = chunk.channel_count  # empty where the recorder wrote no index of messages
+        counts = chunk.channel_count  # empty without a message index
         if counts and not any(counts.get(key) for key in channels):
             continue
         size += chunk.uncompressed_size

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of samples (CSV), described in docs/formats.md: measured elsewhere, or a journal.
+"""Tables of samples (CSV): measurements or a journal (docs/formats.md).
 
-Joint values are in q1 ... qn. What was measured shows in the cells of the row that are filled: a
-pose (x y z and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), that a
-ball sat in a socket (location, socket) or that a plane was touched (plane), whose places are not
-known. A pose may be that of a board whose corners are in the row (view): the lens, fx fy cx cy k1
-k2 p1 p2 k3 and whether it is fixed (1 or 0), then x y z u v of each corner, joined by semicolons.
-Rows of all kinds may stand in one table.
+Joint values are in q1 ... qn. The filled cells of a row determine what was measured: a pose (x y z
+and qx qy qz qw), a position (x y z), a distance to a fixed point (distance), a ball in a socket
+(location, socket) or a touched plane (plane). The pose of a board may include its corners (view):
+the lens, fx fy cx cy k1 k2 p1 p2 k3 and whether it is fixed (1 or 0), then x y z u v of each
+corner, joined by semicolons.
 """
 
 from __future__ import annotations
@@ -48,12 +47,12 @@ from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, t
 from calib_ros.values import parse_number
 
 USUAL_SIGMAS = (Settings.sigma_position, Settings.sigma_orientation)
-"""Standard deviations [m, rad] if nothing else is said."""
+"""Default standard deviations [m, rad]."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Table(Measured):
-    """What a table holds; with `by_line` a sample's stamp is its line, in seconds."""
+    """Content of a table; with `by_line` stamps are lines, in seconds."""
 
     warnings: tuple[str, ...] = ()
     by_line: bool = False
@@ -85,14 +84,13 @@ def read_table(
     foreign : Foreign, optional
         How to read a table from another system.
     told : Told
-        Of the share that is read.
+        Receives the share read.
 
     Raises
     ------
     InputError
         For a missing column, a value that is not a number, an ambiguous session, or measurements
         of one device in different frames. The message names the line.
-
     """
     path = Path(path)
     if foreign is not None:
@@ -124,9 +122,9 @@ def table_of(
     eye_in_hand: bool = False,
     warnings: tuple[str, ...] = (),
 ) -> Table:
-    """Return the table of columns; the arguments are those of `read_table`."""
+    """Return the table of columns; arguments as in `read_table`."""
     if not len(found.lines):
-        measurements(found, joints)  # a column that is missing says more
+        measurements(found, joints)  # names missing columns first
         raise InputError(f'{found.path} has no rows')
     if 'session' not in found.header and sessions:
         names = ', '.join(sessions)
@@ -154,7 +152,7 @@ def _table(
     if made.view[1] != ['']:
         samples = [*_samples(made)]
         fitted, held_out = collect(samples, sigmas, frames)
-    else:  # arrays, of which one of each kind is an example
+    else:  # arrays, with one example of each kind
         _, number = distinct(made.codes)
         samples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
 
@@ -170,7 +168,7 @@ def _table(
 
 
 def check_table(made: MadeColumns) -> None:
-    """Refuse columns that no table may hold: of any sessions, for as many joints as there are."""
+    """Refuse columns that no table may have: any sessions, with as many joints as there are."""
     joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.header)
     if not joints:
         raise InputError(
@@ -193,10 +191,10 @@ def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str
 def _of_journal(
     path: Path, joints: int, told: Told = nobody
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
-    """Return the rows of a journal, None without any, and warnings; None for other files.
+    """Return the rows of a journal, None if empty, and warnings; None for other files.
 
-    A node's journal may be of any length, since its samples were in memory before: it is read in
-    parts, and any other file is refused at its first part.
+    A node's journal may have any length, since its samples were in memory: it is read in parts,
+    and other files are refused at the first part.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
     parts: list[Measurements] = []
@@ -254,7 +252,7 @@ def _samples(made: Measurements) -> Iterator[Sample]:
 
 
 def columns(joints: int) -> list[str]:
-    """Return the columns of a table that can hold every kind of sample."""
+    """Return the columns of a table for every kind of sample."""
     names = ['stamp_ns', *(name for letter in 'qsva' for name in joint_columns(joints, letter))]
     names += [*POSITION, *QUATERNION, 'distance', *COVARIANCE, 'device', 'target', 'frame_id']
     names += ['eye_in_hand', 'delay', 'count', 'spread', 'session', 'split']
@@ -262,7 +260,7 @@ def columns(joints: int) -> list[str]:
 
 
 def cells(sample: Sample, split: str | None = None) -> list[str]:
-    """Return the cells of a sample in the order of `columns`; numbers are exact."""
+    """Return the exact cells of a sample in the order of `columns`."""
 
     def numbers(values: FloatArray | None, count: int) -> list[str]:
         return [''] * count if values is None else [repr(float(value)) for value in values]
@@ -306,7 +304,7 @@ def _view_of(text: str, where: str) -> View:
 
 
 def table_text(samples: Sequence[Sample], joints: int) -> str:
-    """Return samples as a table, with the columns that any of them fills."""
+    """Return samples as a table with the columns that are used."""
     names = columns(joints)
     rows = [cells(sample) for sample in samples]
     used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
@@ -314,7 +312,7 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
 
 
 def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
-    """Return the content of a table, and warnings; `journal` is the header of one."""
+    """Return the content of a table, and warnings; `journal` is the header of a journal."""
     data = read_bytes(path, LARGEST_TABLE, InputError)
     header = ','.join(journal).encode() + b'\n'
     if data and header.startswith(data):
@@ -329,7 +327,7 @@ def _cut_off(path: Path, line: int) -> str:
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:
-    """Return the rows of the sessions that are asked for, session by session."""
+    """Return the rows of the chosen sessions, session by session."""
     numbers, known = labels
     if not sessions and len(known) > 1:
         raise InputError(

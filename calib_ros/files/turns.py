@@ -58,8 +58,9 @@ def finished(made: MadeColumns, layout: layouts.Layout) -> MadeColumns:
 def _rotations(
     values: dict[str, FloatArray], layout: layouts.Layout, made: MadeColumns
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns that standard deviations are
-    about; None where there are none.
+    """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns of their standard deviations.
+
+    None if there are none.
     """
     if set(layouts.QUATERNION) & set(values):
         return _from_quaternions(values, layout, made)
@@ -100,7 +101,7 @@ def _rotations(
 def _from_euler(
     angles: FloatArray, letters: str, names: Sequence[str]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rotations, and the axes of angles (N, 3) about axes named by letters."""
+    """Return rotations, and the axes of angles (N, 3) about the axes named by letters."""
     if names == layouts.TURNS:
         if len(set(letters.upper())) < 3:
             raise ConfigError(
@@ -113,7 +114,7 @@ def _from_euler(
         unit = 'XYZ'.index(letters[k].upper())
         axes[:, :, k] = turned[:, :, unit]
         turned = turned @ se3.exp_rotation(np.eye(3)[unit] * angles[:, k, np.newaxis])
-    if names == layouts.TURNS:  # columns in the order of rx, ry, rz
+    if names == layouts.TURNS:  # order rx, ry, rz
         axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
     return turned, axes
 
@@ -142,7 +143,7 @@ def _require_whole(values: FloatArray, made: MadeColumns, names: str) -> None:
 def _covariance(
     sigmas: Sequence[FloatArray | None], axes: FloatArray | None, path: Path
 ) -> FloatArray | None:
-    """Return covariances (N, 6, 6) of standard deviations (N,); None where there are none."""
+    """Return covariances (N, 6, 6) of standard deviations (N,), or None."""
     place, turn = ([x for x in each if x is not None] for each in (sigmas[:3], sigmas[3:]))
     if not place and not turn:
         return None

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Kinematics files with which vendors' own descriptions give the corrected arm.
+"""Kinematics files for vendors' own descriptions of the arm.
 
     ur_kinematics.yaml      kinematics_params_file of ur_description and the UR driver
     franka_kinematics.yaml  kinematics.yaml of a robot of franka_description
 
 Both hold x y z roll pitch yaw for each joint: the origin of a frame that turns about its z, in the
-frame of the joint before. Where such a frame lies along its axis and how it is turned about it
-does not matter to the arm, but to all that is drawn in it. The frames are those of the URDF if
-there is one, else those that the nominal table has by the modified convention, which are the
-vendors'. What an arm has that is not laid out like this gets no file.
+frame of the joint before. The position of a frame along its axis and its rotation about it do not
+matter to the arm, but to everything drawn in it. The frames are those of the URDF if given, else
+those of the nominal table in the modified convention, which are the vendors'. Arms with another
+layout get no file.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from calib_ros.values import SAME
 
 @dataclass(frozen=True)
 class Vendor:
-    """How a vendor's description names the joints and lays out their frames."""
+    """How a vendor's description names the joints and places their frames."""
 
     file: str
-    joints: tuple[str, ...]  # ends of their names in a chain or URDF
+    joints: tuple[str, ...]  # suffixes of joint names in a chain or URDF
     keys: tuple[str, ...]  # their names in the file
-    rolls: tuple[int, ...]  # of each frame about x of the one before, in quarters of a turn
-    end: str | None = None  # the fixed joint behind the last, if the file has one
-    height: float = 0.0  # where that ends along the last axis [m]
-    families: tuple[str, ...] = ('',)  # what names must contain, where their ends are common ones
+    rolls: tuple[int, ...]  # of each frame about x of the one before, in quarter turns
+    end: str | None = None  # fixed joint after the last, if in the file
+    height: float = 0.0  # its end along the last axis [m]
+    families: tuple[str, ...] = ('',)  # required in names, if the suffixes are common
 
     @property
     def all_keys(self) -> tuple[str, ...]:
-        """Return the keys in the file, that of the end last."""
+        """Return the keys in the file, the end last."""
         return self.keys if self.end is None else (*self.keys, self.end)
 
     def describes(self, chain: Chain) -> bool:
@@ -63,10 +63,10 @@ class Vendor:
         )
 
     def has_layout(self, places: FloatArray) -> bool:
-        """Tell whether nominal origins (N, 4, 4) are those of this vendor, but for lengths.
+        """Tell whether nominal origins (N, 4, 4) have this vendor's layout, except lengths.
 
-        To 0.1 rad, since layouts differ by quarters of a turn, and to 0.01 m of the flange behind
-        the last axis: elsewhere a tool is part of the table.
+        To 0.1 rad, since layouts differ by quarter turns, and to 0.01 m of the flange after the
+        last axis: otherwise the table includes a tool.
         """
         rolls = np.zeros((len(self.rolls), 3))
         rolls[:, 0] = 0.5 * np.pi * np.array(self.rolls)
@@ -104,12 +104,12 @@ def vendor_files(
     links: Mapping[str, str | None] | None = None,
     checksum: str = '',
 ) -> tuple[export.Export, ...]:
-    """Return a corrected chain as the files of the vendor that its joints are named by, if any.
+    """Return a corrected chain as files of the vendor with its joint names, if any.
 
-    `origin` is for the record. Frames are those of the nominal `urdf`, if given, which has the
-    chain between `links` (`base_link`, `tip_link`). `checksum` is that of the factory calibration
-    of a robot of Universal Robots, by which its driver tells whether a file belongs to the robot:
-    a hash of the numbers by default, which the driver reports as a mismatch, and goes on.
+    `origin` is recorded. Frames are those of the nominal `urdf`, if given, which has the chain
+    between `links` (`base_link`, `tip_link`). `checksum` is that of the factory calibration of a
+    Universal Robots arm, which identifies the robot to its driver: by default a hash of the
+    numbers, which the driver reports as a mismatch and accepts.
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(
@@ -122,7 +122,7 @@ def vendor_files(
             continue
         arm = replace(chain, effects=(), frames=())
         if vendor.end is None and arm.convention == 'standard':
-            # The last frame of the file is on the last axis: what follows belongs to the tool.
+            # the last frame is on the last axis, the rest belongs to the tool
             before, last = nominal.joints[-1], arm.joints[-1]
             last = replace(last, **{name: getattr(before, name) for name in export.TAIL})
             arm = replace(arm, joints=(*arm.joints[:-1], last))
@@ -141,7 +141,7 @@ def vendor_files(
 
 
 def forward_of(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
-    """Return the poses (N, 4, 4) of the last frame of a file in the frame of its first joint."""
+    """Return the poses (N, 4, 4) of a file's last frame in the frame of its first joint."""
     import yaml
 
     document = yaml.safe_load(text)
@@ -173,9 +173,9 @@ def _layout(
     arm = replace(arm, base=Frame(), tool=Frame())
     form = export.converted(arm, 'modified')
     places = export.origins(form)
-    if vendor.end is None:  # the flange of the table is the last frame
+    if vendor.end is None:  # the table's flange is the last frame
         return (places[:-1], arm) if np.allclose(places[-1], np.eye(4), atol=SAME) else None
-    # The vendor has what the table calls d of the last joint behind it.
+    # the vendor has d of the last joint after it
     last = form.joints[-1]
     shift = np.eye(4)
     shift[2, 3] = last.d

@@ -304,7 +304,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)
-        old = self._archive.begin_anew()
+        old = self._archive.start_new()
         self.session.clear()
         kept = f'; they remain in {old}' if old else ''
         return True, f'{count} poses cleared{kept}; the calibration stays'

@@ -85,7 +85,7 @@ def test_the_newest_journal_is_resumed_when_the_clock_was_set_back(tmp_path):
     archive = open_archive(tmp_path)
     archive.add(sample(2))
     archive.save('of the second night', 'settings: 2')
-    archive.begin_anew()
+    archive.start_new()
     archive.add(sample(3))
     archive.close()
     assert stamps(tmp_path) == [3]
@@ -207,10 +207,10 @@ def test_what_waits_for_room_is_not_lost_by_a_clear(tmp_path):
     with full_disk(archive.journal.stat().st_size):
         archive.add(sample(2))
         with pytest.raises(InputError, match='in memory only and would be lost'):
-            archive.begin_anew()
+            archive.start_new()
     archive.add(sample(3))
     assert stamps(tmp_path) == [1, 2, 3]
-    assert archive.begin_anew() is not None
+    assert archive.start_new() is not None
     assert stamps(tmp_path) == []
 
 
@@ -246,7 +246,7 @@ def test_the_folder_is_made_at_the_start(tmp_path):
     assert not archive.trouble
     assert stamps(folder) == [1]
     shutil.rmtree(folder)  # by mistake, before a new journal begins
-    archive.begin_anew()
+    archive.start_new()
     archive.add(sample(2))
     archive.close()
     assert not archive.error
@@ -282,7 +282,7 @@ def test_a_journal_that_is_not_there_any_more_goes_on_in_another_file(tmp_path, 
     archive.add(sample(3))
     assert not archive.error
     assert stamps(folder) == [1, 2, 3]
-    assert archive.begin_anew().exists()
+    assert archive.start_new().exists()
     archive.close()
     if how == 'replaced':
         assert first.read_text() == 'by an editor'

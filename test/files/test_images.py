@@ -102,7 +102,7 @@ def test_images_of_another_size_than_most_are_refused():
     image, _ = photograph(CHARUCO)
     half = cv2.resize(image, (640, 480), interpolation=cv2.INTER_AREA)
     said = []
-    found, unused = detect([('a', half), ('b', image), ('c', image)], CHARUCO, heard=said.append)
+    found, unused = detect([('a', half), ('b', image), ('c', image)], CHARUCO, report=said.append)
     assert (found.names, found.size, unused) == (('b', 'c'), (1280, 960), 1)
     assert said[-1] == 'a: not used, it is of 640 x 480 px, and most are of 1280 x 960'
     np.testing.assert_array_equal(found.image, np.repeat([0, 1], 24))
