@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files and folders written as a whole or not at all, and names that may lead to files.
+"""Files and folders written whole or not at all, and names from outside that may lead to files.
 
 A folder NAME is made as `.NAME.partial/NAME` beside its place. At the end an earlier NAME becomes
-`.NAME.partial/NAME.old`, and the new one takes its place: two renames. A process that is killed
-leaves `.NAME.partial` behind, with the earlier folder in it if it was killed between the two; the
-next one that writes NAME puts it back and removes the rest. `.NAME.partial` is locked by the
-process that writes into it, so leftovers of dead processes are told from the work of others.
+`.NAME.partial/NAME.old`, and the new one takes its place: two renames. A killed process leaves
+`.NAME.partial` behind, with the earlier folder in it if killed between the two; the next process
+that writes NAME restores it and removes the rest. `.NAME.partial` is locked by the process that
+writes into it, which distinguishes leftovers from work in progress.
 """
 
 from __future__ import annotations
@@ -24,16 +24,15 @@ from calib_ros.errors import LONGEST_NAME, InputError
 
 
 def write_file(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
-    """Write a file under a temporary name, then put it in place, if need be to `overwrite` one."""
+    """Write a file under a temporary name, then move it into place; may `overwrite` one."""
     write_together({path: content}, overwrite=overwrite)
 
 
 def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = False) -> None:
-    """Write files that belong together as `write_file` does, all of them or none.
+    """Write files as `write_file` does, all of them or none.
 
-    None is put in place before all are on the disk. Where one cannot be, the others are put back.
-    A process that is killed meanwhile leaves the first, new or old, and none that does not belong
-    to it.
+    All are on disk before the first is moved into place. If one cannot be moved, the others are
+    restored. A process killed meanwhile leaves the first, old or new, and no mismatched others.
     """
     mark = secrets.token_hex(8)
     partials, earlier = (
@@ -63,13 +62,13 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
         raise OSError(err.errno, err.strerror, str(path)) from err
     finally:
         _put_back({path: earlier[path] for path in placed})
-        with suppress(OSError):  # a disk that cannot be written
+        with suppress(OSError):  # the disk may be read-only
             for left in (*partials.values(), *earlier.values()):
                 left.unlink(missing_ok=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
-    """Write new files by name into a folder, which is made if there is none."""
+    """Write new files by name into a folder, created if missing."""
     folder.mkdir(exist_ok=True)
     write_together({folder / name: content for name, content in contents.items()})
 
@@ -78,12 +77,12 @@ def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
 def whole_folder(
     path: Path, own: Sequence[str] | None = None, *, overwrite: bool = False
 ) -> Iterator[Path]:
-    """Yield a path at which to make a folder; it is put in place when the block has ended.
+    """Yield a path for a new folder, which is moved into place when the block ends.
 
     If the block fails, or the process is killed, there is no folder, or the earlier one. Missing
-    parents are made. `own` are glob patterns of what belongs to the folder, which is only replaced
-    if `overwrite` is True; what an earlier folder holds besides is kept. By default there must be
-    no earlier one, and never another process that writes the same folder.
+    parents are created. `own` are glob patterns of the folder's content, which is replaced only if
+    `overwrite`; other content of an earlier folder is kept. By default an earlier folder is an
+    error; so is another process writing the same folder.
     """
     place = Path(os.path.realpath(path))
     if not place.name:
@@ -103,22 +102,22 @@ def whole_folder(
                 place.rename(old)
             new.rename(place)
             _sync(place.parent)
-        except OSError as err:  # which names the folder to work in
+        except OSError as err:  # names the working folder
             name = str(err.filename or path).replace(str(new), str(path))
             raise OSError(err.errno, err.strerror or str(err), name) from err
         finally:
             _clean_up(place, new, old)
     finally:
-        with suppress(OSError):  # it holds what could neither be put back nor removed
+        with suppress(OSError):  # not empty after a failed clean-up
             work.rmdir()
         os.close(claim)
 
 
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
-    """Return the real path of a file that somebody else names, if it is in one of some folders.
+    """Return the real path of a file named from outside, if it is in one of some folders.
 
-    Relative names are in the first folder. `allowed_by` says what to set otherwise. Whether there
-    is a file elsewhere, by `..` or by a symbolic link say, is not told.
+    Relative names are in the first folder. `allowed_by` names the setting for others. Whether a
+    file exists elsewhere, as by `..` or a symbolic link, is not disclosed.
     """
     places = [Path(os.path.realpath(folder)) for folder in folders]
     try:
@@ -131,7 +130,7 @@ def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
 
 
 def short_name(name: str) -> str:
-    """Return a name with room for an ending [bytes]; the end of a long one becomes its hash."""
+    """Return a name with room for a suffix [bytes]; a long one ends with its hash."""
     data = name.encode()
     if len(data) <= LONGEST_NAME:
         return name
@@ -166,7 +165,7 @@ def _rename_new(partial: Path, path: Path) -> None:
 
 
 def _claim(work: Path, path: Path) -> int:
-    """Claim a folder to work in, new or left by a dead process, until its handle is closed."""
+    """Claim a working folder, new or left by a dead process, until its handle is closed."""
     while True:
         try:
             work.mkdir(mode=0o700)
@@ -181,7 +180,7 @@ def _claim(work: Path, path: Path) -> int:
             _lock(handle, work, path, made)
             if os.path.samestat(os.fstat(handle), os.lstat(work)):
                 stack.pop_all()
-                return handle  # else its owner has just ended: once more
+                return handle  # else its owner has just ended: try again
 
 
 def _lock(handle: int, work: Path, path: Path, made: bool) -> None:
@@ -192,13 +191,13 @@ def _lock(handle: int, work: Path, path: Path, made: bool) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise InputError(f'{other}: wait for it, or choose another name') from None
-    except OSError:  # a file system without locks: whoever made the folder has it
+    except OSError:  # a file system without locks: owned by its creator
         if not made:
             raise InputError(f'{other}, or was killed: remove {work} if none runs') from None
 
 
 def _clean_up(place: Path, new: Path, old: Path) -> None:
-    """Put an earlier folder back that was not replaced, and remove what is left over."""
+    """Restore an earlier folder that was not replaced, and remove leftovers."""
     if old.exists() and new.exists():
         try:
             old.rename(place)
@@ -225,14 +224,14 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
         )
     there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
     if there and not overwrite:
-        from calib_ros.shown import some  # loads numpy, no `--help` needs it
+        from calib_ros.shown import some  # loads numpy, not needed by --help
 
         held = ', '.join(some(there))
         raise InputError(f'{path} already holds {held}: choose another folder or --force')
 
 
 def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
-    """Give a folder what is in another one, `own` left out and nothing replaced."""
+    """Copy the content of an earlier folder, without `own` and replacing nothing."""
     owned = _matching(source, own)
 
     def left_out(folder: str, names: list[str]) -> list[str]:
@@ -242,7 +241,7 @@ def _carry_over(source: Path, target: Path, own: Sequence[str]) -> None:
 
 
 def _link(first: str | Path, second: str | Path) -> None:
-    """Give a file another name, or copy it, unless there is one of that name."""
+    """Hard-link a file to another name, or copy it, unless that exists."""
     try:
         os.link(first, second, follow_symlinks=False)
     except FileExistsError:
@@ -256,7 +255,7 @@ def _matching(folder: Path, patterns: Sequence[str]) -> set[Path]:
 
 
 def _sync(*paths: Path) -> None:
-    """Wait until files and folders are on the disk."""
+    """Flush files and folders to disk."""
     for path in paths:
         if not (path.is_file() or path.is_dir()):
             continue
@@ -264,7 +263,7 @@ def _sync(*paths: Path) -> None:
         try:
             os.fsync(handle)
         except OSError:
-            if path.is_file():  # not every file system does that for folders
+            if path.is_file():  # some file systems cannot sync folders
                 raise
         finally:
             os.close(handle)

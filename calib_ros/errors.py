@@ -12,16 +12,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 LONGEST = 400
-"""Characters of a message; what is quoted from a file may be of any length. A convention."""
+"""Characters of a message; quotes from files may have any length. A convention."""
 LONGEST_NAME = LONGEST // 2
-"""Characters of a name, a number or an expression: a message has room for it and more."""
+"""Characters of a name, number or expression, to fit a message."""
 MOST_ENTRIES = 1000
-"""Of a list, of columns, and characters of an entry, that somebody may have written:
-a convention, of which other limits are parts and multiples."""
+"""Entries of a list, columns, and characters of an entry in input: a convention; other limits are
+multiples."""
 
 
 def shortened(text: str, longest: int = LONGEST) -> str:
-    """Return a text without its middle where it is too long: the fault is first, the cure last."""
+    """Return a text without its middle if too long: the fault is first, the remedy last."""
     if len(text) <= longest:
         return text
     gap = f' ... ({len(text)} characters) ... '
@@ -40,7 +40,7 @@ _ADVICE = {
 
 
 class CalibrationError(Exception):
-    """Base of every error that calib_ros raises on purpose."""
+    """Base of all intentional errors."""
 
     def __init__(self, message: str = '') -> None:
         super().__init__(shortened(message))
@@ -55,7 +55,7 @@ class InputError(CalibrationError):
 
 
 class UnknownNameError(ConfigError):
-    """A name that does not exist; keeps the name and the valid alternatives."""
+    """A name that does not exist, with the valid alternatives."""
 
     def __init__(self, what: str, name: str, alternatives: Iterable[str]) -> None:
         self.what = what
@@ -66,7 +66,7 @@ class UnknownNameError(ConfigError):
 
 
 class ColumnsError(InputError):
-    """A table whose columns are not ours; it may be in another layout."""
+    """A table without our columns; it may have another layout."""
 
 
 class TooFewObservationsError(InputError):
@@ -82,7 +82,7 @@ class TooFewObservationsError(InputError):
 
 
 def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
-    """Return 'did you mean "...?"' with the one that is most like a name, if any is."""
+    """Return 'did you mean "...?"' with the most similar alternative, if any."""
     import difflib  # slow to load
 
     likely = list(alternatives)[:MOST_ENTRIES] if len(name) <= MOST_ENTRIES else []
@@ -91,7 +91,7 @@ def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
 
 
 def unreadable(path: Path, err: OSError, what: str = '') -> str:
-    """Return in words why a file, which `what` describes, is not read, and which one is near."""
+    """Return why a file, described by `what`, is not read, and a similar name."""
     said = f'cannot read {what}{path}: {err.strerror or err}'
     if not isinstance(err, FileNotFoundError) or not path.parent.is_dir():
         return said
@@ -100,6 +100,6 @@ def unreadable(path: Path, err: OSError, what: str = '') -> str:
 
 
 def trouble(err: OSError) -> str:
-    """Return in words which file the system refused, why, and what to do where that is known."""
+    """Return the file the system refused, why, and what to do if known."""
     why = _ADVICE.get(err.errno or 0) or err.strerror or str(err)
     return f'{err.filename}: {why}' if err.filename else why

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of long work: reported by stages and shares, and cancelled between two stages."""
+"""Progress of long work: stages and shares, and cancellation between stages."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from typing import TypeAlias
 from calib_ros.errors import CalibrationError
 
 Told: TypeAlias = Callable[[str | float], None]
-"""Called with each stage that begins, in words, and with the share of all that is done."""
+"""Called with each stage that begins (text), and with the share done."""
 
 
 def nobody(at: str | float) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
 def share_of(told: Told, begin: float, end: float) -> Told:
@@ -26,11 +26,11 @@ def share_of(told: Told, begin: float, end: float) -> Told:
 
 
 class CancelledError(CalibrationError):
-    """A piece of work that was ended on request."""
+    """Work cancelled on request."""
 
 
 class Progress:
-    """Progress of work on another thread: a `Told`; `what` names the work."""
+    """Progress of work on another thread; `what` names the work."""
 
     def __init__(self, what: str) -> None:
         self._what = what
@@ -41,7 +41,7 @@ class Progress:
         self.share = 0.0
 
     def __call__(self, at: str | float) -> None:
-        """Note the stage that begins, or the share that is done, which never falls."""
+        """Note the stage that begins, or the share done, which never decreases."""
         with self._lock:
             self._refuse_cancelled()
             if isinstance(at, str):
@@ -51,7 +51,7 @@ class Progress:
                 self._ends = now + (now - self._began) * (1.0 / self.share - 1.0)
 
     def __str__(self) -> str:
-        """Return in words the work in progress and its duration; empty if idle."""
+        """Return the work in progress and its times; empty if idle."""
         return '' if self._began is None else f'{self.words}, {self.times}'
 
     @property
@@ -88,7 +88,7 @@ class Progress:
                 self._began = None
 
     def cancel(self) -> tuple[bool, str]:
-        """End the work after the stage that it is in; return whether it runs, and words."""
+        """End the work after its present stage; return whether it runs, and a text."""
         with self._lock:
             if self._began is None:
                 return False, f'nothing to cancel: not {self._what}'

@@ -12,30 +12,24 @@ from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
 CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
-"""For choosing poses."""
 Aim: TypeAlias = Literal['mean', 'worst']
 AIMS: tuple[Aim, ...] = get_args(Aim)
-"""What a placement minimises."""
 Model: TypeAlias = Literal['corrected', 'nominal']
 MODELS: tuple[Model, ...] = get_args(Model)
-"""Chain that commands the arm."""
 STORAGES = ('mcap', 'sqlite3')
-"""Of bags."""
 EXCEPTION = 0.1
-"""Share of a whole up to which it is the exception. So many samples fewer, at random, make
-standard deviations 5 % larger, less than their own uncertainty; more may be a part of the
-workspace."""
+"""Share of a whole that is an exception. So many samples fewer, at random, make standard
+deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
 LEVER = 0.3
 """Length [m] at which a turn counts as much as a shift; a convention."""
 LEVER_IN_PART, TURN_IN_PART = 1e-3, 0.02
 """The same of arms that cannot reach every orientation, and the error [rad] that may remain of
 theirs; conventions."""
 EXACT = 1e-6
-"""Error [m or rad] that may remain of what is reached exactly: no device sees it."""
+"""Negligible error [m or rad], invisible to any device."""
 GROWTH = 2e-5
-"""Growth of a length [m] per root of a year, if nothing else is said."""
+"""Default growth of a length [m] per root of a year."""
 MODES = ('dwell', 'continuous', 'triggered')
-"""How samples are taken."""
 STARTUP = (
     *('max_gap', 'joint_buffer', 'pose_buffer', 'mode', 'lateness', 'delay', 'sources'),
     *('joint_topics', 'joint_names'),
@@ -162,7 +156,7 @@ class Settings:
 
     def for_problem(self) -> dict[str, Any]:
         """Return the settings of an identification, by the names of `Problem`."""
-        from calib_ros.values import parse_number  # loads numpy, which no `--help` needs
+        from calib_ros.values import parse_number  # loads numpy, not needed by --help
 
         priors = {}
         for text in self.priors:
@@ -181,7 +175,7 @@ class Settings:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):
             value, lower = getattr(self, item.name), item.metadata['lower']
-            if isinstance(item.default, tuple):  # what is done with longer lists takes for ever
+            if isinstance(item.default, tuple):  # longer lists would take very long
                 longest = max(map(len, value), default=0)
                 for count, what in ((len(value), 'entries'), (longest, 'characters in an entry')):
                     if count > MOST_ENTRIES:

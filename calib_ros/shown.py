@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Values on a screen: their content in a few lines."""
+"""Short representations of values."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import numpy as np
 from calib_ros.errors import ConfigError
 
 NAMED = 5
-"""Things of a kind that a sentence names; a convention."""
+"""Items named in a sentence; a convention."""
 LISTED = 4 * NAMED
-"""Things of a kind that a table or a longer text lists, as four sentences."""
+"""Items listed in a table or longer text."""
 
 
 def some(words: Sequence[str], most: int = NAMED) -> list[str]:
-    """Return the first of some words, and the number of the others."""
+    """Return the first words, and the number of the others."""
     more = len(words) - most
     return [*words[:most], f'and {more} more'] if more > 0 else list(words)
 
@@ -44,7 +44,7 @@ class Shown:
 
 
 def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return paragraphs and a table, whose first row is its head, for notebooks."""
+    """Return paragraphs and a table, whose first row is the header, for notebooks."""
     lines = [f'<p><strong>{html.escape(caption)}</strong></p>']
     lines += [f'<p>{html.escape(each)}</p>' for each in text]
     lines.append('<table>')
@@ -56,7 +56,7 @@ def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def as_frame(columns: Mapping[str, Any]) -> Any:
-    """Return columns by their names as a pandas.DataFrame, where pandas is installed."""
+    """Return columns as a pandas.DataFrame, if pandas is installed."""
     try:
         import pandas
     except ImportError as err:
@@ -68,8 +68,8 @@ def _briefly(value: Any) -> list[tuple[str, str]]:
     return [(each.name, _brief(getattr(value, each.name))) for each in fields(value)]
 
 
-def _brief(value: object, longest: int = 60) -> str:
-    """Return a value in so many characters, a longer one by its kind and size."""
+def _brief(value: object) -> str:
+    """Return a value as short text, a longer one by its kind and size."""
     if isinstance(value, np.ndarray):
         return f'{value.dtype}{list(value.shape)}'
     if isinstance(value, Shown):
@@ -80,6 +80,6 @@ def _brief(value: object, longest: int = 60) -> str:
     if isinstance(value, tuple | list | Mapping):
         plain = not any(isinstance(each, np.ndarray | Shown) for each in value)
         text = repr(value) if plain else ''
-        return text if 0 < len(text) <= longest else f'<{len(value)} in a {type(value).__name__}>'
+        return text if 0 < len(text) <= 60 else f'<{len(value)} in a {type(value).__name__}>'
     text = repr(value)
-    return text if len(text) <= longest else text[: longest - 3] + '...'
+    return text if len(text) <= 60 else text[:57] + '...'

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Text files, tables and YAML, within limits; foreign texts are only text.
+"""Text files, tables and YAML, within limits; foreign text stays text.
 
-A few hundred bytes of YAML can stand for any amount of data: aliases of aliases, nesting, numbers
-with any number of digits. The stream of its events is looked at before anything is made of it.
-A joint, a frame or a robot may be called `<script>`, `| x |` or `=cmd|...`: in a report that is
-markup, in a spreadsheet a formula.
+A few hundred bytes of YAML can expand to any amount of data: aliases of aliases, nesting, numbers
+with any number of digits. Its events are checked before they are loaded. A joint, a frame or a
+robot may be named `<script>`, `| x |` or `=cmd|...`, which is markup in a report and a formula in
+a spreadsheet.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from calib_ros.errors import (
 )
 
 LARGEST_TEXT = 10 * MOST_ENTRIES**2
-"""Bytes of a chain file, calibration, URDF or YAML program: ten lists as long as can be."""
+"""Bytes of a chain file, calibration, URDF or YAML program."""
 LARGEST_TABLE = 10 * LARGEST_TEXT
 """Bytes of a table."""
 MOST_ROWS = LARGEST_TABLE // 500
-"""Rows of a table with quotes, which takes more memory; a row of a journal has 500 bytes."""
+"""Rows of a table with quotes, which takes more memory; a journal row has 500 bytes."""
 DEEPEST = MOST_ENTRIES // 50
 """Levels of nested YAML."""
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
-"""Values in a YAML document with its aliases written out; 20 characters count as one."""
+"""Values in a YAML document with expanded aliases; 20 characters count as one."""
 MARKUP = re.compile(r'[\\`*\[\]|]|(?<![^\W_])_|_(?![^\W_])|^[>#+-]')
-"""What Markdown takes for more than text; underscores only where they may begin emphasis."""
+"""Markdown markup; underscores only where they may start emphasis."""
 FORMULA = re.compile(r"'*[=+\-@\t\r]")
-"""Start of a cell that a spreadsheet computes, after any apostrophes."""
+"""Start of a spreadsheet formula, after any apostrophes."""
 
 
 def read_text(
@@ -51,15 +51,15 @@ def read_text(
     error: type[CalibrationError] = ConfigError,
     what: str = '',
 ) -> str:
-    """Return the text of a UTF-8 file, which `what` describes; raise an `error` if that fails."""
+    """Return the text of a UTF-8 file, described by `what`; raise `error` if that fails."""
     return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
 
 
 def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: str = '') -> bytes:
-    """Return the content of a file, as `read_text` does.
+    """Return the content of a file, as `read_text`.
 
-    Of a pipe only where the shell made it (standard input, process substitution): in a folder it
-    may have nobody at its other end, and would be waited for without end.
+    Pipes are read only from the shell (standard input, process substitution): one in a folder may
+    have no writer and would block for ever.
     """
     if path.is_fifo() and path.parts[:2] not in (('/', 'dev'), ('/', 'proc')):
         raise error(f'{what}{path} is a pipe: give a file, or /dev/stdin')
@@ -84,7 +84,7 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
 
 
 def csv_lines(text: str, where: str) -> io.StringIO:
-    """Return the lines of a table for the reader of csv, which cuts lines of any length."""
+    """Return the lines of a table for csv, which reads lines of any length."""
     longest, most = max(map(len, io.StringIO(text)), default=0), MOST_ENTRIES**2
     if longest > most:
         raise InputError(
@@ -94,7 +94,7 @@ def csv_lines(text: str, where: str) -> io.StringIO:
 
 
 def dump_json(value: Any, indent: str = '') -> str:
-    """Return plain values as JSON: on one line what holds no other lists or mappings."""
+    """Return plain values as JSON: lists and mappings without nested ones on one line."""
     inside = list(value.values()) if isinstance(value, Mapping) else value
     if not isinstance(value, NESTED) or not any(isinstance(each, NESTED) for each in inside):
         return json.dumps(value)
@@ -114,10 +114,10 @@ def csv_text(rows: Iterable[Iterable[object]]) -> str:
 
 
 def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigError) -> Any:
-    """Return the content of a YAML document, None of an empty one; `where` names it in errors.
+    """Return the content of a YAML document, None if empty; `where` names it in errors.
 
-    What is several, has a key twice, or is too large or too deep with its aliases written out is
-    an `error`, as is what is not valid.
+    Raises `error` for invalid YAML, several documents, duplicate keys, or a document that is too
+    large or too deep with its aliases expanded.
     """
     import yaml
 
@@ -139,11 +139,11 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
 
 
 def dump_yaml(document: Mapping[str, Any]) -> str:
-    """Return plain values as YAML; texts of any kind, as names of parameters are, as texts."""
+    """Return plain values as YAML; str subclasses, as names of parameters, as text."""
     import yaml
 
     class Dumper(getattr(yaml, 'CSafeDumper', yaml.SafeDumper)):  # type: ignore[misc]
-        """The fast one if available: a tenth of the time."""
+        """The C dumper if available: a tenth of the time."""
 
     Dumper.add_multi_representer(str, lambda dumper, text: dumper.represent_str(str(text)))
     text = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=1000)
@@ -152,7 +152,7 @@ def dump_yaml(document: Mapping[str, Any]) -> str:
 
 @cache
 def _loader() -> Any:
-    """Return the loader: the fast one if there is one; long numbers stay text."""
+    """Return the C loader if available; long numbers stay text."""
     import yaml
 
     class Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
@@ -169,10 +169,9 @@ def _loader() -> Any:
 
 
 def _weigh(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
-    """Refuse documents that would not fit into memory, or are not meant.
+    """Refuse documents that would not fit into memory.
 
-    Of their events scalars have a value, lists and mappings a tag, and aliases only an anchor,
-    which ends have not.
+    Scalar events have a value, lists and mappings a tag, aliases only an anchor, ends none.
     """
     scales = _Scales(events, where, error)
     for event in events:
@@ -183,14 +182,14 @@ def _weigh(events: Iterator[Any], where: str, error: type[CalibrationError]) -> 
 
 
 class _Scales:
-    """What weighs the nodes of documents, each with its aliases written out."""
+    """Counts the nodes of documents with expanded aliases."""
 
     def __init__(self, events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
         self._events, self._where, self._error = events, where, error
         self.anchors: dict[str, tuple[int, int]] = {}
 
     def node(self, event: Any, above: int) -> tuple[int, int]:
-        """Return how many values a node has, and its levels."""
+        """Return the number of values of a node, and its levels."""
         if hasattr(event, 'value'):
             nodes, height = 1 + len(event.value) // 20, 0
         elif hasattr(event, 'tag'):
@@ -224,7 +223,7 @@ class _Scales:
 
 
 def one_line(text: str) -> str:
-    """Return a text without line breaks and characters that cannot be seen."""
+    """Return a text without line breaks and invisible characters."""
     return ' '.join(''.join(c if c.isprintable() else ' ' for c in text).split())
 
 
@@ -240,5 +239,5 @@ def to_cell(text: str) -> str:
 
 
 def from_cell(cell: str) -> str:
-    """Return the text of a cell by `to_cell`."""
+    """Return the text of a cell written by `to_cell`."""
     return cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers from files, tables and messages: which are accepted, and the errors for others."""
+"""Checks of numbers and names from files, tables and messages."""
 
 from __future__ import annotations
 
@@ -22,19 +22,18 @@ from calib_ros.errors import (
 )
 
 ROUNDED = 1e-3
-"""Share of a whole that numbers of three digits leave: of the length of a quaternion, of a step
-that joint values are multiples of."""
+"""Relative rounding of numbers with three digits: of the length of a quaternion, of a step of
+joint values."""
 SAME = 1e-9
-"""Lengths [m] and angles [rad] that differ by less are the same; a convention."""
+"""Lengths [m] and angles [rad] that differ by less are equal; a convention."""
 LARGEST = 1e6
-"""Largest number [m or rad] that is measured or set; some devices send the largest float for
-none."""
+"""Largest measured or set number [m or rad]; some devices send the largest float for none."""
 LARGEST_RATE = LARGEST**2
-"""Largest velocity and acceleration [SI]; they are computed, and a journal holds them."""
+"""Largest velocity and acceleration [SI], computed and stored in journals."""
 LARGEST_SETTING = float(np.iinfo(np.int32).max)
-"""Largest number that is set; ROS has integers of as many bits."""
+"""Largest setting: that of 32-bit integers."""
 MOST_NAMES = MOST_ENTRIES // 20
-"""What a cell has of each kind: joints of a chain, frames, targets, sets of joint names."""
+"""Joints of a chain, frames, targets, or sets of joint names in a cell."""
 
 
 def parse_number(
@@ -43,7 +42,7 @@ def parse_number(
     error: type[CalibrationError] = ConfigError,
     largest: float = LARGEST,
 ) -> float:
-    """Return a finite number from YAML or a table; `where` names it in the error."""
+    """Return a finite number from YAML or a table; errors name it `where`."""
     try:  # YAML 1.1 reads 1e-3, without a dot, as a string
         number = float(value) if isinstance(value, int | float | str) else math.nan
     except (ValueError, OverflowError):
@@ -56,10 +55,10 @@ def parse_number(
 
 
 def parse_like(default: Any, value: object, where: str) -> Any:
-    """Return a value of the type of a default, as YAML, ROS or a command line give it.
+    """Return a value of the type of a default, from YAML, ROS or a command line.
 
-    A single text does for a list of texts (tuple), whose empty ones are left out. `where` names
-    the value in the ConfigError for others.
+    A single text is accepted for a list of texts (tuple); empty ones are dropped. The ConfigError
+    for other values names it `where`.
     """
     if isinstance(default, bool):
         if isinstance(value, bool):
@@ -112,14 +111,14 @@ def parse_name(value: object, where: str) -> str:
 def parse_numbers(
     value: object, count: int, where: str, error: type[CalibrationError] = ConfigError
 ) -> NDArray[np.float64]:
-    """Return so many finite numbers (count,) from YAML; `where` names them in the error."""
+    """Return finite numbers (count,) from YAML; errors name them `where`."""
     if not isinstance(value, list) or len(value) != count:
         raise error(f'{where} must be a list of {count} numbers, not {value!r}')
     return np.array([parse_number(item, where, error) for item in value])
 
 
 def cell_integer(text: str, where: str) -> int:
-    """Return the integer in a cell of a table; it has 64 bits at most."""
+    """Return the 64-bit integer in a table cell."""
     number = int(text) if re.fullmatch(r'-?[0-9]{1,19}', text) else 2**63
     if abs(number) >= 2**63:
         raise InputError(f'{where} must be an integer of 64 bits, not {text!r}')
@@ -127,15 +126,15 @@ def cell_integer(text: str, where: str) -> int:
 
 
 def covariance_fault(covariance: NDArray[np.float64]) -> str:
-    """Return what is wrong with a covariance (6, 6) of a measured pose; empty if nothing."""
+    """Return the fault of a covariance (6, 6) of a measured pose; empty if valid."""
     return str(covariance_faults(covariance[np.newaxis])[0])
 
 
 def covariance_faults(covariances: NDArray[np.float64]) -> NDArray[np.str_]:
-    """Return what is wrong with each of some covariances (N, 6, 6) of measured poses.
+    """Return the fault of each covariance (N, 6, 6) of measured poses.
 
-    Zeros alone mean that none was measured. Zeros in all that concerns the rotation mean that it
-    was not measured, or that its covariance is not known (trackers of positions).
+    All zeros mean that none was measured. Zeros for the rotation mean that it was not measured, or
+    that its covariance is unknown (trackers of positions).
     """
     found = np.full(len(covariances), '', dtype='U60')
 

@@ -65,8 +65,8 @@ class Chain(Shown):
     convention : 'standard' or 'modified'
     joints : tuple of Joint
     parallel : tuple of str, optional
-        Joints whose row joins two parallel revolute axes: beta is fitted there and d is not.
-        Found from the nominal table when None.
+        Joints whose row joins two parallel axes, where beta is fitted instead of d. By default
+        found from the nominal table.
     base, tool : Frame, optional
         T_world_base and T_flange_target; None if unknown.
     frames : tuple of (str, Frame or None)
@@ -75,7 +75,6 @@ class Chain(Shown):
         Non-geometric effects by name, with their values.
     gravity : three floats
         Acceleration of gravity [m/s^2] in the base frame, for compliance.
-
     """
 
     name: str
@@ -89,7 +88,7 @@ class Chain(Shown):
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
 
     def __post_init__(self) -> None:
-        """Check the names and find the parallel axes if they are not given."""
+        """Check the names, and find parallel axes if not given."""
         if self.convention not in get_args(Convention):
             raise UnknownNameError('convention', self.convention, get_args(Convention))
         if not self.joints:
@@ -109,10 +108,10 @@ class Chain(Shown):
                 raise ConfigError(f'"parallel" names joint "{name}" twice')
 
     def _find_parallel(self) -> tuple[str, ...]:
-        """Return the joints whose row joins two (nearly) parallel axes, one at least revolute.
+        """Return the joints whose row joins two nearly parallel axes, at least one revolute.
 
         At a prismatic axis, too, theta tilts a parallel axis only to second order. Row i leads
-        from axis i to the next in the standard convention, and to it in the modified one.
+        from axis i to the next in the standard convention, and to axis i in the modified one.
         """
         first, last = (0, 1) if self.convention == 'standard' else (1, 0)
         rows = self.joints[first : len(self.joints) - last]
@@ -125,15 +124,12 @@ class Chain(Shown):
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
-        """Return the names of the joints, in the order of the chain."""
+        """Return the names of the joints, in order."""
         return tuple(joint.name for joint in self.joints)
 
     @cached_property
     def parameter_names(self) -> tuple[Parameter, ...]:
-        """Return the names of all parameters of the error model, frames first.
-
-        The model holds beta instead of d at the joints named in `parallel`.
-        """
+        """Return the names of all parameters of the error model, frames first."""
         frames = {name: self.frame(name) for name in self.frame_names}
         names = [name for frame in frames for name in parameters_of(frame)]
         names += [Parameter(name, DELAY) for name in frames if frames[name].delay is not None]
@@ -173,7 +169,7 @@ class Chain(Shown):
         return float(owner.offsets()[FRAME_KINDS.index(kind)])
 
     def offset(self, name: str, nominal: Chain) -> float:
-        """Return the offset from the nominal chain's parameter, as for `with_offsets`."""
+        """Return the offset from a nominal chain, as for `with_offsets`."""
         owner, kind = self._split(name)
         if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
             return self.value(name) - nominal.value(name)
@@ -181,7 +177,7 @@ class Chain(Shown):
         return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
-        """Return a base or tool frame by its name; the identity if unknown."""
+        """Return a base or tool frame; the identity if unknown."""
         return self.all_frames[name] or ANYWHERE
 
     def owns_frame(self, parameter: str) -> bool:
@@ -189,13 +185,13 @@ class Chain(Shown):
         return parameter.partition('.')[0] in self.all_frames
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
-        """Return the chain with a replaced or added base or tool frame."""
+        """Return the chain with a replaced or added frame."""
         if name in ('base', 'tool'):
             return replace(self, base=frame) if name == 'base' else replace(self, tool=frame)
         return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
 
     def with_effects(self, names: Sequence[str]) -> Chain:
-        """Return the chain with further effects, all zero."""
+        """Return the chain with further effects of value zero."""
         known = dict(self.effects)
         added = tuple((name, 0.0) for name in dict.fromkeys(names) if name not in known)
         for name, _ in added:
@@ -212,8 +208,7 @@ class Chain(Shown):
     def with_offsets(self, offsets: Mapping[str, float]) -> Chain:
         """Return the chain with offsets [m or rad] added to the named parameters.
 
-        Identified errors are added to the parameters, not to the transforms: the paper's
-        A + dA leaves SE(3).
+        Errors are added to parameters, not to transforms: the paper's A + dA leaves SE(3).
         """
         by_owner: dict[str, dict[str, float]] = {}
         for name, offset in offsets.items():
@@ -288,7 +283,7 @@ class Chain(Shown):
         return target[:3], target[3]
 
     def at_the_tool(self, flange: FloatArray, tool: str) -> FloatArray:
-        """Return the frame (4, 3, B) of a tool from that of the flange (4, 3, B)."""
+        """Return the frame (4, 3, B) of a tool, given the flange's (4, 3, B)."""
         end = self.frame(tool).matrix
         return np.asarray((end.T @ flange.reshape(4, -1)).reshape(flange.shape))
 
@@ -302,7 +297,7 @@ class Chain(Shown):
         return rng.uniform(lower, upper, (count, len(self.joints)))
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
-        """Return the joint or frame that a parameter belongs to, and the kind of parameter."""
+        """Return the owner and the kind of a parameter."""
         if name not in self._all_parameters:
             raise UnknownNameError('parameter', name, self.parameter_names)
         owner, _, kind = name.partition('.')
@@ -310,12 +305,12 @@ class Chain(Shown):
 
     @cached_property
     def _all_parameters(self) -> frozenset[str]:
-        """Return the names of all parameters that joints, frames and effects may have."""
+        """Return all possible parameter names of joints, frames and effects."""
         return _parameters(self.joint_names, self.frame_names, tuple(self._effect_values))
 
     @cached_property
     def all_frames(self) -> Mapping[str, Frame | None]:
-        """Return base, tool and further frames by name; None where unknown."""
+        """Return base, tool and further frames by name; None if unknown."""
         return {'base': self.base, 'tool': self.tool, **dict(self.frames)}
 
     @cached_property
@@ -345,10 +340,7 @@ Value = TypeVar('Value', Joint, Chain)
 
 
 def _with(value: Value, changes: Mapping[str, object], kept: Sequence[str]) -> Value:
-    """Return a value with other numbers in it: what was checked is not checked again.
-
-    Nor is what of it was worked out before and is `kept`.
-    """
+    """Return a changed value without repeating its checks, with the `kept` cached properties."""
     found = object.__new__(type(value))
     known = vars(value)
     vars(found).update({name: known[name] for name in value.__dataclass_fields__})

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Chain files and calibrations: YAML to chain and back.
+"""Chain files and calibrations (docs/formats.md): YAML to chain and back.
 
-Nominal and corrected chains share one schema, so an output can be an input. `docs/formats.md`
-describes it. A URDF is read as a nominal chain.
+Nominal and corrected chains share one schema, so an output can be an input.
 """
 
 from __future__ import annotations
@@ -46,15 +45,15 @@ CHAIN_KEYS = (
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
 JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 TWO_TURNS = 4.0 * math.pi
-"""What no angle of a table exceeds [rad]: degrees do, all that tables have."""
+"""Largest angle of a table [rad]; tables in degrees exceed it."""
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
 
 
 def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
-    """Read a chain file, a URDF, or a supplied robot by its name, such as "ur10e".
+    """Read a chain file, a URDF, or a supplied robot by name, such as "ur10e".
 
-    The base and tool frames of a URDF are omitted: they lead to its links, not to the measuring
-    device and its target.
+    Base and tool of a URDF are omitted: they lead to its links, not to the measuring device and
+    its target.
     """
     path = Path(name_or_path)
     if path.suffix in URDF_SUFFIXES:
@@ -83,21 +82,21 @@ def read_text(path: Path) -> str:
 
 
 def shipped_robots() -> dict[str, Path]:
-    """Return the chain files that come with calib_ros, by name."""
+    """Return the supplied chain files by name."""
     return shared_files('robots')
 
 
 @cache
 def shipped_chains() -> tuple[Chain, ...]:
-    """Return the chains that come with calib_ros."""
+    """Return the supplied chains."""
     return tuple(load_chain(name) for name in shipped_robots())
 
 
 def shared_files(folder: str) -> dict[str, Path]:
-    """Return the YAML files in a folder of `config` that come with calib_ros, by name.
+    """Return the supplied YAML files in a folder of `config`, by name.
 
-    Looked for in the share folders of the ROS workspaces in use, in that of the Python
-    environment, and in the source tree.
+    Searched in the share folders of the ROS workspaces, in that of the Python environment, and in
+    the source tree.
     """
     prefixes = [Path(p) for p in os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep) if p]
     shares = [prefix / 'share' / 'calib_ros' for prefix in (*prefixes, Path(sys.prefix))]
@@ -109,7 +108,7 @@ def shared_files(folder: str) -> dict[str, Path]:
 
 
 def parse_chain(text: str, where: str = 'chain file') -> Chain:
-    """Turn the text of a chain file into a chain; `where` names it in errors."""
+    """Parse the text of a chain file; errors name it `where`."""
     document = parse_yaml(text, where)
     content = parse_mapping(document, CHAIN_KEYS, where, ('convention', 'joints'))
     rows = content['joints']
@@ -146,7 +145,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
 
 
 def parse_frames(content: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the arguments of a chain that hold its frames; `where` names them in errors."""
+    """Return the frame arguments of a chain; errors name them `where`."""
     others = dictionary(content.get('frames'), f'{where}: frames')
     return {
         'base': _frame(content.get('base'), f'{where}: base'),
@@ -159,15 +158,15 @@ def parse_frames(content: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def calibration_record(text: str) -> dict[str, Any]:
-    """Return the record of a chain file: where its numbers come from."""
+    """Return the record of a chain file: the origin of its numbers."""
     record = parse_yaml(text, 'chain file').get('calibration')
     return record if isinstance(record, dict) else {}
 
 
 def table_hash(chain: Chain) -> str:
-    """Return the SHA-256 of the table and effects of a chain, by which its files are known.
+    """Return the SHA-256 of the table and effects, which identifies files of a chain.
 
-    Files of before hold it: what goes into it never changes.
+    Existing files hold it, so its input must never change.
     """
     rows = [
         [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
@@ -226,7 +225,7 @@ def _frame_document(frame: Frame) -> dict[str, Any]:
 
 
 def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
-    """Return the text of a chain file; `calibration` says where the numbers come from."""
+    """Return the text of a chain file; `calibration` is the origin of its numbers."""
     document = chain_document(chain)
     if calibration is not None:
         document['calibration'] = dict(calibration)
@@ -245,7 +244,7 @@ def _texts(values: Iterable[object]) -> bool:
 
 
 def dictionary(value: object, where: str) -> dict[str, Any]:
-    """Return a mapping of names, empty for none; `where` names it in the error."""
+    """Return a mapping of names, empty for none; errors name it `where`."""
     if value is None:
         return {}
     if not isinstance(value, dict) or not _texts(value):
@@ -269,7 +268,7 @@ def _joint(row: object, where: str) -> Joint:
     for key in ('lower', 'upper'):
         if content.get(key) is not None:
             limit = parse_number(content[key], f'{where}: {key}', largest=math.inf)
-            if abs(limit) <= LARGEST:  # what some write where there is none
+            if abs(limit) <= LARGEST:  # larger ones mean none
                 numbers[key] = limit
     sign = numbers.pop('sign', 1.0)
     x, y, z = parse_numbers(content.get('com', [0.0, 0.0, 0.0]), 3, f'{where}: com').tolist()

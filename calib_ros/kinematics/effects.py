@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Non-geometric errors of joints (Vacarescu et al., section 1): what a joint value hides.
+"""Non-geometric errors of joints (Vacarescu et al., section 1).
 
 Each effect adds `value * phi(q)` to the value of one joint, so its column of the error model is
 that of the joint's motion times phi. An effect is a parameter named after its joint:
@@ -9,12 +9,12 @@ that of the joint's motion times phi. An effect is a parameter named after its j
     joint_6.coupling_joint_5    phi = q_5                                          [1]
     joint_2.sin_1, .cos_1       phi = sin(1 q_2), cos(1 q_2)                       [rad or m]
     joint_2.gravity_joint_4     phi = torque on joint 2 of unit weight at joint 4's end  [rad/m]
-    joint_2.compliance          phi = torque on joint 2 of the masses given [N m]  [rad/(N m)]
+    joint_2.compliance          phi = torque on joint 2 of the given masses [N m]  [rad/(N m)]
     joint_2.backlash            phi = sign of the approach: -1, 0 or 1             [rad or m]
 
-Eccentricities of gears and encoders are harmonics 1 and 2; a harmonic drive shows harmonics near
-its ratio and twice that. Unknown masses: torques by weights at the joints' ends span the torques
-of any masses that lie along the arm.
+Eccentricities of gears and encoders are harmonics 1 and 2; a harmonic drive has harmonics near its
+ratio and twice that. With unknown masses, torques of weights at the joints' ends span the torques
+of any masses along the arm.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from calib_ros.kinematics.walk import Walk
 
 
 class _Arm(Protocol):
-    """What effects need of a chain."""
+    """Interface of a chain for effects."""
 
     @property
     def joints(self) -> tuple[Joint, ...]: ...
@@ -52,7 +52,7 @@ class _Arm(Protocol):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a group of effects, or a harmonic of a joint, would bring: RMS on poses left out."""
+    """Held-out RMS with and without a group of effects or a harmonic."""
 
     what: str
     rms_mm_before: float
@@ -61,17 +61,19 @@ class Verdict:
 
 
 GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 'backlash')
-"""Groups of effects that can be switched on together. `gear` has the harmonics at the gear ratio
-and twice that of joints that give one; others are found from data (`model_choice.py`). `coupling`
-is that of the wrist, the last three joints."""
+"""Groups of effects that can be fitted together. `gear` has the harmonics at the gear ratio and
+twice that; others are found from data (`model_choice.py`). `coupling` is that of the wrist, the
+last three joints."""
 EXPECTED = dict.fromkeys(GROUPS, 1e-4)
+"""Typical size [rad] of an effect by group: a third of an arc minute for drives, an arc minute for
+bending (at a torque arm of a metre) and play."""
 EXPECTED |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
 """Size [rad] that an effect may have, by its group: a third of an arc minute of a drive's own
 errors, an arc minute of what bends (for a torque arm of a metre) or has play."""
 
 
 def group_of(name: str) -> str:
-    """Return the group that an effect belongs to."""
+    """Return the group of an effect."""
     first, rest = Parameter(name).effect
     if first in ('sin', 'cos'):
         return 'eccentricity' if rest in ('1', '2') else 'gear'
@@ -114,7 +116,7 @@ def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:
 
 
 def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
-    """Return the effects that a group or a single name stands for."""
+    """Return the effects of a group or a single name."""
     if name in GROUPS:
         return members(chain, name)
     joint = Parameter(name).owner
@@ -126,7 +128,7 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
 
 
 def check(name: str, joints: Sequence[str]) -> None:
-    """Refuse the name of an effect that does not exist."""
+    """Refuse an unknown effect."""
     first, rest = Parameter(name).effect
     if first in ('coupling', 'gravity'):
         if rest not in joints:
@@ -143,10 +145,10 @@ def check(name: str, joints: Sequence[str]) -> None:
 
 
 def expected(name: str) -> float:
-    """Return the size that an effect may have: the standard deviation of its prior.
+    """Return the typical size of an effect: the standard deviation of its prior.
 
-    Without it a harmonic that is sampled over part of a turn trades against constants without
-    bound, and misleads wherever else the arm goes.
+    Without a prior, a harmonic sampled over part of a turn trades off against constants without
+    bound, and is wrong elsewhere.
     """
     return EXPECTED[group_of(name)]
 
@@ -156,8 +158,7 @@ def basis(
 ) -> FloatArray:
     """Return phi (E, B) of the named effects at joint values (n, B).
 
-    `approach` (n, B) holds the signs of the velocity with which each joint came to its value;
-    without it no backlash shows.
+    `approach` (n, B) holds the signs of the preceding velocities; without it there is no backlash.
     """
     phi = np.zeros((len(names), q.shape[1]))
     if not names:
@@ -185,7 +186,7 @@ def _wave(
 ) -> NDArray[np.complex128]:
     """Return exp(i k q) (K, B) of orders k (K,) at the values (B,) of a joint.
 
-    Powers of exp(i q), kept in `circles`, where most orders up to the highest are wanted.
+    From powers of exp(i q), cached in `circles`, if most orders up to the highest are needed.
     """
     highest, whole = int(orders.max()), (orders == np.round(orders)) & (orders > 0.0)
     if 2 * len(orders) <= highest or not whole.all():
@@ -197,7 +198,7 @@ def _wave(
 
 
 def moved(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
-    """Return joint values (n, B) with what effects add to them, by their phi (E, B)."""
+    """Return joint values (n, B) plus effects with phi (E, B)."""
     known = dict(chain.effects)
     values = [known[name] for name in names]
     if not any(values):
@@ -209,7 +210,7 @@ def moved(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> 
 
 @lru_cache(maxsize=256)
 def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> list[int]:
-    """Return the number of the joint that each effect moves."""
+    """Return the index of the joint of each effect."""
     return [joint_names.index(Parameter(name).owner) for name in names]
 
 
@@ -238,7 +239,7 @@ def _torques(
 ) -> FloatArray:
     """Return torques of gravity (E, B) on joints at joint values (n, B).
 
-    Of a unit weight [m] at the `ends` (E,) of links, or [N m] of all masses that they carry.
+    Of a unit weight [m] at the `ends` (E,) of links, or [N m] of all masses carried.
     """
     start = chain.frame('base').matrix
     frames, places = chain.walk.along(q, start)

@@ -1,23 +1,23 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values at which one arm reaches the poses of another.
+"""Joint values at which one arm reaches the poses of another (docs/compensation.md).
 
-A `Follower` minimises, with x the change of the joints in units of the largest that is allowed and
+A `Follower` minimises, with x the change of the joints in units of the largest allowed one and
 e, J the error and its derivative as in `inverse.py`,
 
     |e|^2 + x^T D x         step = (J^T J + D)^-1 (J^T e - D x)
 
-D is next to nothing, so that x is the smallest change that reaches the pose, or the best
-compromise of an arm that cannot. Samples that would need more than is allowed, as near a
-singularity, are damped. With J = sum_k s_k u_k v_k^T at the command, a direction whose share
-e_k = u_k^T e of the error would need x_k = e_k / s_k > 1 gets x_k = s_k / e_k, which is what
-D = sum_k (e_k^2 - s_k^2) v_k v_k^T does: continuous where damping begins, zero at the singularity
-(variable damping after Nakamura and Hanafusa 1986), and exact in all other directions.
+D is negligible, so that x is the smallest change that reaches the pose, or the best compromise.
+Samples that need more than is allowed, as near a singularity, are damped. With
+J = sum_k s_k u_k v_k^T at the command, a direction whose share e_k = u_k^T e of the error needs
+x_k = e_k / s_k > 1 gets x_k = s_k / e_k by D = sum_k (e_k^2 - s_k^2) v_k v_k^T: continuous where
+damping begins, zero at the singularity (variable damping after Nakamura and Hanafusa 1986), and
+exact in all other directions.
 
-The errors of an arm let it move a little in directions in which it cannot by design, as out of
-the plane of parallel joints. Steps of thousandths would take joint moves of radians, so |e|^2
-counts only directions in which the leader moves: of the position where it never moves in all
-three, and of the orientation, too, if joints are left over that could be spent on it.
+The errors of an arm let it move a little in directions in which it cannot by design, as out of the
+plane of parallel joints. Steps of thousandths would take joint moves of radians, so |e|^2 counts
+only directions in which the leader moves: of the position if it does not move in all three, and of
+the orientation too if the arm has redundant joints.
 
 Arrays inside are laid out (component, sample), as in `jacobian.py`.
 """
@@ -50,18 +50,18 @@ from calib_ros.shown import Shown
 from calib_ros.values import SAME
 
 BY_DESIGN = 0.01
-"""Share of the largest motion from which on an arm is made to move so: the shipped arms have 0.05
-and more in every direction, errors of arms add thousandths."""
+"""Share of the largest motion that counts as designed: supplied arms have at least 0.05 in every
+direction, errors of arms add thousandths."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution(Shown):
-    """Changes (N, n) to be added to commands [rad or m], and the errors with and without them.
+    """Changes (N, n) to add to commands [rad or m], and the errors with and without them.
 
-    Errors (N,) of `position` [m] and `orientation` [rad] remain, those `before` are without a
-    change; `reachable` (N,) [m] is what remains of the position where the arm can move.
+    Errors (N,) of `position` [m] and `orientation` [rad] remain, those `before` are without the
+    change; `reachable` (N,) [m] is the remaining position error in directions the arm can move.
     `iterations` are those of the slowest sample. Joints `limited` (N, n) are held at a limit;
-    samples `damped` (N,) are changed in part, as the full change would exceed the largest.
+    samples `damped` (N,) are changed in part, because the full change would exceed the largest.
     """
 
     change: FloatArray
@@ -77,10 +77,7 @@ class Solution(Shown):
 
 
 def mobility(chain: Chain) -> tuple[int, int, int]:
-    """Return how many freedoms of its target's pose, position and orientation an arm controls.
-
-    Six, three and three at most.
-    """
+    """Return the number of freedoms of pose, position and orientation that an arm controls."""
     model = ErrorModel(chain, [joint.driven for joint in chain.joints])
     jacobian = model.jacobian(chain.random_joints(10, np.random.default_rng(0)))
     for part in (jacobian[:, :3], jacobian[:, 3:]):
@@ -130,11 +127,11 @@ class Follower:
         self.complete, self.anywhere = freedoms == 6, self._ranks[0] == 3
         self._weight = weight or (LEVER if self.complete else LEVER_IN_PART)
         self._first_weight = LEVER if self.complete else self._weight
-        # where more joints than freedoms make J^T J singular, D stands above its rounding
+        # redundant joints make J^T J singular: D must exceed its rounding
         ridge = ROUNDING if len(unit) > freedoms else HALF_THE_DIGITS**2
         self._ridge = ridge * np.eye(len(unit))[:, :, np.newaxis]
         if len(unit) <= freedoms:
-            self._ranks[1] = 3  # no joint is idle: the nearest of all orientations
+            self._ranks[1] = 3  # no redundant joint: any orientation counts
 
     def solve(
         self,
@@ -143,10 +140,7 @@ class Follower:
         bounded: bool = True,
         told: Told = nobody,
     ) -> Solution:
-        """Return the changes for commands (N, n), within the limits of the joints if bounded.
-
-        `told` is called with the share that is done.
-        """
+        """Return the changes for commands (N, n), within the joint limits if `bounded`."""
         parts = []
         for start in range(0, len(joints), BLOCK):
             rows = slice(start, start + BLOCK)
@@ -162,7 +156,7 @@ class Follower:
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
         """Solve for commands (n, B).
 
-        A joint that would go beyond a limit is held there, and the others do without it.
+        A joint that would exceed a limit is held there, and the others are solved again.
         """
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
         nothing = np.zeros_like(q)
@@ -189,9 +183,9 @@ class Follower:
         )
 
     def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags, int]:
-        """Return x (n, B), errors (B, 3), what converged and is damped (B,), and the iterations.
+        """Return x (n, B), errors (B, 3), convergence and damping (B,), and the iterations.
 
-        Where the first attempt fails the weight of the orientation makes the compromise.
+        If the first attempt fails, the weight of the orientation decides the compromise.
         """
         x, _, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
         errors = self._errors(task, x)
@@ -212,10 +206,9 @@ class Follower:
     def _minimise(
         self, task: _Task, stiffness: FloatArray, weight: float, settle: bool = False
     ) -> Minimum:
-        """Minimise |e|^2 + x^T D x, the cost.
+        """Minimise |e|^2 + x^T D x.
 
-        Samples settle for a cost that does not fall any more if told so; else they are given up
-        when x is longer than 1.
+        With `settle`, samples end when the cost stops falling; else when x is longer than 1.
         """
         stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], len(task.q[0])))
 
@@ -233,7 +226,7 @@ class Follower:
     def _linearise(
         self, task: _Task, x: FloatArray, weight: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the weighted error (6, B), and what x changes of the pose (n, 6, B)."""
+        """Return the weighted error (6, B), and its derivative by x (n, 6, B)."""
         q = task.q + self._unit * x
         error, columns = self._aim.linearise(q, task.approach, task.origin, task.axes, weight)
         columns *= self._unit[:, np.newaxis] * ~task.held[:, np.newaxis]
@@ -245,10 +238,7 @@ class Follower:
     def _ways(
         self, q: FloatArray, approach: FloatArray | None, origin: FloatArray, axes: FloatArray
     ) -> FloatArray | None:
-        """Return what takes from errors (6, 6, B) all that the leader cannot move, None of others.
-
-        Its errors are zero: `Aim` is asked for the columns alone.
-        """
+        """Return projections (6, 6, B) of errors onto the motion of the leader; None for all."""
         if self._ranks == [3, 3]:
             return None
         columns = Aim(self._leader).linearise(q, approach, origin, axes, LEVER)[1]
@@ -270,7 +260,7 @@ class Follower:
     def _errors(self, task: _Task, x: FloatArray) -> FloatArray:
         """Return the lengths (B, 3) of position [m] and orientation error [rad].
 
-        The last are those of the position's part that the arm can reach.
+        The last is that of the reachable position error.
         """
         q = task.q + self._unit * x
         axes, origin = self._follower.trace(self._follower.effective(q, task.approach))
@@ -284,8 +274,8 @@ class Follower:
 class _Task(NamedTuple):
     """Samples to solve: commands (n, B), wanted axes (3, 3, B) and origins (3, B).
 
-    `ways` (6, 6, B) keep of errors what counts; None keeps all. Joints that are `held` (n, B) keep
-    the x that they have at the `start` (n, B).
+    `ways` (6, 6, B) project errors on those that count; None keeps all. Joints `held` (n, B) keep
+    the x of `start` (n, B).
     """
 
     q: FloatArray

@@ -1,15 +1,14 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values that bring the target to wanted poses.
+"""Inverse kinematics.
 
-`solve` takes Newton's steps on the error e = (p_wanted - p, rotation vector from R to R_wanted),
-with J = -de/dq by the error model's columns for theta or d of every joint:
+`solve` takes Newton steps on the error e = (p_wanted - p, rotation vector from R to R_wanted),
+with J = -de/dq from the error model's columns for theta or d of every joint:
 
     dq = (J^T J + tiny I)^-1 J^T e
 
-is the shortest step that removes e.
-
-Arrays inside are laid out (component, sample), as in `jacobian.py`.
+is the shortest step that removes e. Arrays inside are laid out (component, sample), as in
+`jacobian.py`.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from calib_ros.values import SAME
 
 @dataclass(frozen=True, eq=False)
 class Inverse:
-    """Joint values (N, n) [rad or m] for wanted poses, within the limits, and what is left.
+    """Joint values (N, n) [rad or m] for wanted poses, within the limits, and their errors.
 
     `position` (N,) [m] and `orientation` (N,) [rad] are the distances to the wanted poses. Those
     not `converged` (N,) are out of reach, or need another start.
@@ -69,12 +68,11 @@ def solve(
     base, tool : str
         Frames at the ends of the chain.
     part : slice
-        What counts of the position and the rotation in world axes, six in all.
+        Components to reach, of position and rotation in world axes, six in all.
     iterations : int
         Steps at most.
     lever : float
-        Metres that a radian counts, where not both can be reached.
-
+        Metres per radian, if not both can be reached.
     """
     aim = Aim(chain, base, tool)
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
@@ -99,7 +97,7 @@ def solve(
 
 
 def _within(chain: Chain, q: FloatArray) -> FloatArray:
-    """Bring joint values (n, B) into the limits, by a full turn where that helps."""
+    """Move joint values (n, B) into the limits, by a full turn if possible."""
     lower, upper = (end[:, np.newaxis] for end in limits(chain))
     turns = np.array([[2.0 * np.pi * (joint.type == 'revolute')] for joint in chain.joints])
     q = np.where((q > upper) & (q - turns >= lower), q - turns, q)
@@ -125,19 +123,18 @@ class Aim:
         axes: FloatArray,
         lever: float,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the error (6, B), and what the joints change of the pose (n, 6, B).
+        """Return the error (6, B), and the derivative of the pose by the joints (n, 6, B).
 
         Parameters
         ----------
         q : (n, B)
             Joint values [rad or m].
         approach : (n, B), optional
-            Signs of the velocities before, for backlash.
+            Signs of the preceding velocities, for backlash.
         positions, axes : (3, B), (3, 3, B)
             Wanted positions [m], and wanted axes; the first index counts them.
         lever : float
-            Metres that a radian counts.
-
+            Metres per radian.
         """
         model, turning = self._model, self._turning
         found, origin, shift, turn = model.linearise(q, approach)
@@ -150,9 +147,9 @@ class Aim:
         return np.concatenate([positions - origin, turned]), columns
 
     def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
-        """Return the derivative (n, n, B) of the effective joint values by those reported."""
-        count, step = len(q), 1e-6  # right to 1e-9 of what effects add
-        moved = np.repeat(q[:, np.newaxis], count + 1, axis=1)  # the last as it is
+        """Return the derivative (n, n, B) of effective by reported joint values."""
+        count, step = len(q), 1e-6  # accurate to 1e-9 of the effects
+        moved = np.repeat(q[:, np.newaxis], count + 1, axis=1)  # the last unchanged
         moved[np.arange(count), np.arange(count)] += step
         came = None if approach is None else np.tile(approach, count + 1)
         found = self._chain.effective(moved.reshape(count, -1), came).reshape(moved.shape)
@@ -160,7 +157,7 @@ class Aim:
 
 
 def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and the upper limits (n,) of the joints [rad or m], infinite if none."""
+    """Return the lower and upper limits (n,) of the joints [rad or m], infinite if none."""
     ends = [(joint.lower, joint.upper) for joint in chain.joints]
     return (
         np.array([-np.inf if lower is None else lower for lower, _ in ends]),

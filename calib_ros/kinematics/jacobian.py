@@ -90,11 +90,11 @@ class ErrorModel:
         q : (n, B)
             Joint values [rad or m], a row per joint.
         approach : (n, B), optional
-            Signs of the velocities before, for backlash.
+            Signs of the preceding velocities, for backlash.
         velocity : (n, B), optional
             Velocities of the joints, for the delay of the measuring device.
         out : (P + 1, 3, B), (P_rotational + 1, 3, B), optional
-            Get the derivatives: those of a block before, which are not needed any longer.
+            Receives the derivatives, to reuse memory.
 
         Returns
         -------
@@ -103,11 +103,10 @@ class ErrorModel:
         origin : (3, B)
             Its position [m].
         shift : (P + 1, 3, B)
-            Derivative of the position, rotational parameters first. The last row is left free
-            for the caller, who can put the residual there.
+            Derivative of the position, rotational parameters first. The last row is free for the
+            residual.
         turn : (P_rotational + 1, 3, B)
             Derivative of the orientation as a rotation vector in the world. Likewise.
-
         """
         layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
         names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
@@ -115,7 +114,7 @@ class ErrorModel:
         frames, target = self._frames(effects.moved(self.chain, names, phi, q))
         flat = frames.reshape(4 * len(frames), 3, samples)
         axes = flat[layout.axes]
-        levers = np.zeros((len(axes) + 1, 3, samples))  # the last is that of what does not move
+        levers = np.zeros((len(axes) + 1, 3, samples))  # the last stays zero
         se3.cross(axes, target[3] - flat[layout.points], levers[:-1])
         shift, turn = out or (
             np.empty((len(self.names) + 1, 3, samples)),
@@ -140,8 +139,8 @@ class ErrorModel:
     def _frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return frames (n + 3, 4, 3, B) along the chain and the target's (4, 3, B).
 
-        They are those before the joints, of the flange, of the world at the base, and the
-        flange's axes without an origin; q (n, B) holds effective joint values.
+        Those before the joints, of the flange, of the world at the base, and the flange's axes
+        without an origin; q (n, B) holds effective joint values.
         """
         count, samples = q.shape
         base, walk = self.chain.frame(self._ends[0]).matrix, self.chain.walk
@@ -165,8 +164,8 @@ class ErrorModel:
     ) -> FloatArray:
         """Return the Jacobian (N, 6, P) of position [m] and orientation [rad] at poses q (N, n).
 
-        Rows 0-2 are the target's position in the world. Rows 3-5 are its rotation as a vector
-        in world axes: the turned orientation is exp(J[3:] dx) R.
+        Rows 0-2 are the target's position in the world, rows 3-5 its rotation vector in world
+        axes: the orientation becomes exp(J[3:] dx) R.
         """
         rows = np.ascontiguousarray(self.chain.joint_values(q).T)
         came = None if approach is None else np.ascontiguousarray(approach.T)
@@ -180,13 +179,13 @@ class ErrorModel:
 
 
 class _Layout(NamedTuple):
-    """Where the columns of parameters stand, rotations first, and in which `order` of the names.
+    """Rows of the parameters, rotations first, in `order` of the names.
 
-    Of the rows of all frames, four each, `axes` and `points` are those that something turns
-    about; `levers` (of these), `shifts` and `turns` the ones that each parameter takes, `still`
-    those that move nothing. `behind` are the frames behind the constant part of each link, `bent`
-    where something goes along or about x there; `effects` are the last rotations and the last of
-    all, rows `driven`, of the `joints` that they drive; `delay` is the row of a delay.
+    Of the rows of all frames, four each, `axes` and `points` belong to rotations; `levers` (of
+    these), `shifts` and `turns` to each parameter; `still` ones move nothing. `behind` are the
+    frames after the constant part of each link, `bent` if something moves along or about x there;
+    `effects` are the last rotations and the last rows of all, `driven`, of the `joints`; `delay`
+    is the row of a delay.
     """
 
     rotations: int
@@ -206,7 +205,7 @@ class _Layout(NamedTuple):
 
 
 Line: TypeAlias = tuple[int | None, int, bool]
-"""Frame of a walk, None for nowhere; axis along or about which something moves; if it turns."""
+"""Frame of a walk, or None; axis of the motion; whether it is a rotation."""
 
 
 def _lines(
@@ -215,7 +214,7 @@ def _lines(
     frames: Sequence[str],
     ends: tuple[str, str],
 ) -> dict[str, Line]:
-    """Return along or about which line of a walk each parameter of joints and frames moves."""
+    """Return the line of a walk that each parameter of joints and frames moves along or about."""
     at = {ends[0]: len(joints) + 1, ends[1]: len(joints) + 2}
     found: dict[str, Line] = {}
     for frame in frames:
@@ -254,7 +253,7 @@ def _layout(
     rotations = sum(lines[name][2] for name in names)
     taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
     moved = [lines[name][0] is not None for name in ordered]
-    # turned about itself the target stays where it is
+    # rotations of the target about itself do not move it
     away = [lines[name][0] not in (None, len(joints) + 2) for name in ordered[:rotations]]
     axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
     levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
@@ -281,7 +280,7 @@ def _layout(
 def _twist(
     walk: Walk, velocity: FloatArray, frames: FloatArray, origin: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the effect of a delay of one second: turn and shift (3, B) of a target there."""
+    """Return the effect of a delay of one second: turn and shift (3, B) of a target."""
     rates, turning = -walk.signs * velocity, walk.turning
     driven, points = frames[: len(rates), 2], frames[: len(rates), 3]
     moved = se3.cross(driven, origin - points)
@@ -299,7 +298,7 @@ def _indices(numbers: Iterable[int]) -> NDArray[np.intp]:
 
 
 def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
-    """Return the rotation vector (3, B) in world axes that turns the model onto the measurement.
+    """Return the rotation vector (3, B) in world axes from the model to the measurement.
 
     Parameters
     ----------
@@ -308,11 +307,8 @@ def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
     model : (3, 3, B)
         The same of the model.
 
-    Notes
-    -----
-    E = R_measured R^T is summed from its columns; its vector is log E, as long as
-    log(R^T R_measured): angle / sin(angle) times half of what E differs from its transpose.
-
+    Notes ----- E = R_measured R^T is summed from its columns; its vector is log E, as long as
+    log(R^T R_measured): angle / sin(angle) times half the difference of E and its transpose.
     """
     turn = np.einsum('kib,kjb->ijb', measured, model)
     sine_vector = 0.5 * (turn[[2, 0, 1], [1, 2, 0]] - turn[[1, 2, 0], [2, 0, 1]])

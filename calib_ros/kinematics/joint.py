@@ -33,7 +33,7 @@ class Joint:
     """One row of the DH table: lengths in m, angles in rad, limits in rad or m.
 
     `mass` [kg] and `com` [m], its centre in the frame at the link's end, serve compliance only;
-    `gear_ratio` (motor turns per joint turn, 0 when unknown) serves gear harmonics.
+    `gear_ratio` (motor turns per joint turn, 0 if unknown) serves gear harmonics.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Joint:
     gear_ratio: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a row that no robot has."""
+        """Refuse an invalid row."""
         if not self.name or '.' in self.name:
             raise ConfigError(f'a joint needs a name without dots, not "{self.name}"')
         if self.type not in get_args(JointType):
@@ -79,7 +79,7 @@ class Joint:
 
     @property
     def range(self) -> tuple[float, float]:
-        """Return the limits [rad or m], +-180 degrees or +-0.5 m where none are given."""
+        """Return the limits [rad or m], by default +-180 degrees or +-0.5 m."""
         reach = np.pi if self.type == 'revolute' else 0.5
         lower, upper = self.lower, self.upper
         if lower is None:
@@ -89,10 +89,10 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A constant transform (4, 4); `fixed` when it is known and must not be fitted.
+    """A constant transform (4, 4); `fixed` if it is known and must not be fitted.
 
-    `delay` [s] is how much later than the joints' the stamps of the device at a base frame are;
-    None where the arm stood and no delay shows. `lens` belongs to a camera that is there.
+    `delay` [s] is the delay of the stamps of the device at a base frame after the joints'; None if
+    the arm stood. `lens` belongs to a camera there.
     """
 
     matrix: FloatArray = field(default_factory=lambda: np.eye(4))
@@ -103,8 +103,8 @@ class Frame:
     def moved(self, offsets: Mapping[str, float]) -> Frame:
         """Return the frame shifted by x, y, z [m] and turned by rx, ry, rz [rad].
 
-        Shift and turn are along and about the axes of the frame's parent (world for the base,
-        flange for the tool), the turn through the frame's own origin.
+        Along and about the axes of the frame's parent (world for the base, flange for the tool),
+        turned through the frame's own origin.
         """
         matrix = self.matrix.copy()
         matrix[:3, 3] += [offsets.get(kind, 0.0) for kind in FRAME_KINDS[:3]]
@@ -116,7 +116,7 @@ class Frame:
         return Frame(matrix, self.fixed, later, self.lens and self.lens.moved(seen))
 
     def offsets(self, reference: Frame | None = None) -> FloatArray:
-        """Return (6,) what moves `reference` here: x, y, z [m] and a rotation vector [rad]."""
+        """Return the move (6,) from `reference`: x, y, z [m] and a rotation vector [rad]."""
         return _offsets(self, reference or ANYWHERE)
 
 

@@ -2,14 +2,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera: from points in its frame to pixels, with derivatives.
 
-A pinhole with the distortion of Brown (1971), as ROS names it `plumb_bob`: z looks forward, x to
-the right and y down in the image. With x = X / Z, y = Y / Z and r^2 = x^2 + y^2
+A pinhole with the distortion of Brown (1971), `plumb_bob` in ROS: z looks forward, x to the right
+and y down in the image. With x = X / Z, y = Y / Z and r^2 = x^2 + y^2
 
     u = cx + fx (x c + 2 p1 x y + p2 (r^2 + 2 x^2))        c = 1 + k1 r^2 + k2 r^4 + k3 r^6
     v = cy + fy (y c + p1 (r^2 + 2 y^2) + 2 p2 x y)
 
-A camera is at one end of a chain, a board at the other. Moving and turning the board by a twist
-(v, w) in the world moves a point of it by v + w x arm; a camera that moves sees the opposite.
+A camera is at one end of a chain, a board at the other. A twist (v, w) of the board in the world
+moves a point of it by v + w x arm; a moving camera sees the opposite.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from calib_ros.values import SAME
 
 @dataclass(frozen=True)
 class Lens:
-    """Focal lengths and centre [px], and distortion; `fixed` when they must not be fitted."""
+    """Focal lengths and centre [px], and distortion; `fixed` if they must not be fitted."""
 
     fx: float
     fy: float
@@ -41,7 +41,7 @@ class Lens:
     fixed: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what no camera has."""
+        """Refuse invalid values."""
         for kind in LENS_KINDS:
             if not np.isfinite(getattr(self, kind)):
                 raise ConfigError(f'{kind} of a camera must be a finite number')
@@ -59,7 +59,7 @@ class Lens:
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return pixels (2, B) of points (3, B) [m], and their derivative (2, 3, B) [px/m].
 
-        What is behind the camera is seen as at the side, so that a fit finds its way back.
+        Points behind the camera appear at the side, so that a fit can recover.
         """
         inverse = 1.0 / np.maximum(points[2], SAME)
         x, y = points[0] * inverse, points[1] * inverse
@@ -86,7 +86,7 @@ class Lens:
     def by_lens(
         self, points: FloatArray, pixels: FloatArray, kinds: Sequence[str], out: FloatArray
     ) -> None:
-        """Put the derivatives (K, 2, B) of the pixels of points by parameters of the lens."""
+        """Write the derivatives (K, 2, B) of the pixels of points by lens parameters."""
         if not kinds:
             return
         plane = points[:2] / np.maximum(points[2], SAME)
@@ -111,7 +111,7 @@ class Lens:
                 row[0], row[1] = 0.0, (pixels[1] - self.cy) / self.fy if kind == 'fy' else 1.0
 
     def rays(self, pixels: FloatArray) -> FloatArray:
-        """Return (N, 2) the points at depth 1 of pixels (N, 2), by Newton steps."""
+        """Return the points (N, 2) at depth 1 of pixels (N, 2), by Newton steps."""
         target = np.ascontiguousarray(pixels.T)
         points = np.ones((3, len(pixels)))
         points[0], points[1] = (target[0] - self.cx) / self.fx, (target[1] - self.cy) / self.fy
@@ -129,18 +129,17 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Points of a board as a camera sees them.
+    """Points of a board in a camera.
 
     Attributes
     ----------
     points, arm : (3, C)
-        In the camera's frame [m], from the camera and from what is at the chain's end.
+        In the camera's frame [m], from the camera and from the chain's end.
     pixels : (2, C)
     by_shift : (2, 3, C)
-        Derivative by a shift [m] of what is at the chain's end, along the camera's axes.
+        Derivative by a shift [m] of the chain's end, along the camera's axes.
     axes : (3, 3, C), optional
-        Those of a camera that is at the chain's end, in the world.
-
+        Those of a camera at the chain's end, in the world.
     """
 
     points: FloatArray
@@ -150,7 +149,7 @@ class View:
     axes: FloatArray | None
 
     def by_twist(self, out: FloatArray) -> None:
-        """Put the derivatives (6, 2, C) by shift [m] and turn [rad] along the camera's axes."""
+        """Write the derivatives (6, 2, C) by shift [m] and turn [rad] along the camera's axes."""
         out[:3] = self.by_shift.transpose(1, 0, 2)
         for k in range(3):
             i, j = (k + 1) % 3, (k + 2) % 3
@@ -158,9 +157,9 @@ class View:
             out[3 + k] -= self.arm[j] * out[i]
 
     def at_the_board(self, residual: FloatArray) -> FloatArray:
-        """Return the shortest shifts (C, 3) [m] in the world that residuals (2, C) amount to.
+        """Return the shortest shifts (C, 3) [m] in the world for residuals (2, C).
 
-        For points behind the camera, all of which it sees in one direction, along that.
+        Points behind the camera shift along the one direction in which it sees them.
         """
         length = np.linalg.norm(self.by_shift, axis=1)
         first, second = self.by_shift / length[:, np.newaxis]
@@ -181,23 +180,22 @@ def view(
     points: FloatArray,
     on_flange: bool,
 ) -> View:
-    """Return what a camera sees of points (3, C) of a board in some images.
+    """Return the view of points (3, C) of a board in some images.
 
     Parameters
     ----------
     lens : Lens
         Of the camera.
     axes, origin : (3, 3, M), (3, M)
-        Of what is at the end of the chain, for each image: the board in a camera that is the
-        world, or with the camera `on_flange` the camera in a board that is the world. The first
-        index counts the axes.
+        Of the end of the chain, for each image: the board in a camera that is the world, or with
+        the camera `on_flange` the camera in a board that is the world. The first index counts the
+        axes.
     owner : (C,)
         The image of each point.
     points : (3, C)
         In the frame of the board [m].
     on_flange : bool
-        Where the camera is.
-
+        Whether the camera is on the flange.
     """
     placed = np.concatenate([axes.reshape(9, -1), origin]).take(owner, axis=1)
     turned = placed[:9].reshape(3, 3, -1)
@@ -212,7 +210,7 @@ def view(
 
 
 def require_lens(lens: Lens | None, camera: str) -> Lens:
-    """Return the lens of a camera, which pixels cannot be used without."""
+    """Return the lens of a camera, or raise InputError without one."""
     if lens is None:
         raise InputError(
             f'pixels need the intrinsics of their camera ({camera}): give them (--intrinsics FILE,'

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thousands of small least-squares problems at once, each with its own damping.
 
-Gauss-Newton steps; one that does not lower the cost is not taken, and tried again with more
-damping (Levenberg 1944, Marquardt 1963). Arrays are laid out (component, problem), as in
-`jacobian.py`. `leastsquares.minimise` solves one problem of many rows, whose cost may rise on the
-way through curved valleys.
+Gauss-Newton steps; one that does not lower the cost is rejected and tried again with more damping
+(Levenberg 1944, Marquardt 1963). Arrays are laid out (component, problem), as in `jacobian.py`.
+`leastsquares.minimise` solves one problem of many rows, whose cost may rise in curved valleys.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, Flags, F
 
 
 class Normal(NamedTuple):
-    """Normal matrices (n, n, B), slopes (n, B) downwards and costs (B,) of problems."""
+    """Normal matrices (n, n, B), downward slopes (n, B) and costs (B,) of problems."""
 
     matrix: FloatArray
     slope: FloatArray
@@ -27,7 +26,7 @@ class Normal(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """What was found (..., B), its cost (B,), which have settled (B,), and the steps of all."""
+    """Minima (..., B), costs (B,), which are settled (B,), and the number of steps."""
 
     x: FloatArray
     cost: FloatArray
@@ -44,18 +43,18 @@ def minimise(
     enough: float | None = None,
     rounds: int = ROUNDS,
 ) -> Minimum:
-    """Return where the cost is least, from a start (..., B) for each problem.
+    """Return the minima from starts (..., B).
 
     `linearise` gives the normal equations at points (..., K) of the problems with numbers (K,),
     `move` the points after steps (n, K). A problem settles when its step vanishes, or its cost
-    changes by a smaller share than `fall`; where a cost is `enough`, that settles it instead, and
-    damping is by the identity, for the shortest steps, from the first one on. It is given up when
-    no damping lowers its cost, x is longer than the `longest`, or after `rounds` rounds.
+    changes by a smaller share than `fall`. With `enough`, it settles at that cost instead, and
+    damping is by the identity, for shortest steps, from the first one on. It is given up when no
+    damping lowers its cost, x is longer than `longest`, or after `rounds` rounds.
     """
     x, active = start, np.arange(start.shape[-1])
     found, settled = start.copy(), np.zeros(active.size, dtype=bool)
     first, least = (1e-6, 1e-12) if enough else (0.0, 1e-3)
-    slack = 0.0 if enough else ROUNDING  # at the minimum costs tell half the digits of x only
+    slack = 0.0 if enough else ROUNDING  # the cost determines only half the digits of x
     damping, over = np.full(active.size, first), settled.copy()
     now = linearise(x, active)
     cost = now.cost.copy()

@@ -1,9 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The parameters of a chain, each an owner's property: `elbow_joint.theta`, `tool.x`.
+"""The parameters of a chain, each a property of an owner: `elbow_joint.theta`, `tool.x`.
 
-A parameter is its own name, so that it is a key, a column's heading and what users write in files
-all at once; what it says of itself is read from it here and nowhere else.
+A parameter is its own name, so it serves as key, column heading and text in users' files at once.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
 ANGLES = ('alpha', 'theta', 'beta')
 FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 DELAY = 'delay'
-"""Kind of parameter [s] of a base frame: how late the stamps of its device are."""
+"""Parameter [s] of a base frame: delay of the stamps of its device."""
 LENS_KINDS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2', 'k3')
-"""Kinds of a camera's frame: the first four in pixels."""
+"""Parameters of a camera's frame, the first four in pixels."""
 IN_PIXELS = LENS_KINDS[:4]
 
 _UNITS = {
@@ -33,7 +32,7 @@ _UNITS = {
 
 
 class Parameter(str):
-    """A parameter: `Parameter('tool', 'x')`, or by its name, `Parameter('tool.x')`."""
+    """A parameter: `Parameter('tool', 'x')`, or by name, `Parameter('tool.x')`."""
 
     __slots__ = ()
 
@@ -43,17 +42,17 @@ class Parameter(str):
 
     @property
     def owner(self) -> str:
-        """Return the joint or frame that has it."""
+        """Return the joint or frame."""
         return self.partition('.')[0]
 
     @property
     def kind(self) -> str:
-        """Return what it is of its owner; empty for a name without a dot."""
+        """Return the property; empty for a name without a dot."""
         return self.partition('.')[2]
 
     @property
     def effect(self) -> tuple[str, str]:
-        """Return the kind of an effect and what it refers to: a joint, or a harmonic."""
+        """Return the kind of an effect and its reference: a joint, or a harmonic."""
         first, _, rest = self.kind.partition('_')
         return first, rest
 
@@ -64,17 +63,17 @@ class Parameter(str):
 
     @property
     def of_dh(self) -> bool:
-        """Tell whether it is one of a joint's Denavit-Hartenberg parameters."""
+        """Tell whether it is a Denavit-Hartenberg parameter."""
         return self.kind in DH_KINDS
 
     @property
     def of_lens(self) -> bool:
-        """Tell whether it belongs to a camera's lens."""
+        """Tell whether it belongs to a lens."""
         return self.kind in LENS_KINDS
 
     @property
     def unit(self) -> str:
-        """Return its unit; '1' for a pure number."""
+        """Return the unit; '1' for a pure number."""
         return _unit(self)
 
 
@@ -84,9 +83,9 @@ def _unit(name: Parameter) -> str:
 
 
 def parameters_of(owner: str, kinds: Iterable[str] = FRAME_KINDS) -> tuple[Parameter, ...]:
-    """Return parameters of one owner; those of a frame's place if no kinds are given."""
+    """Return parameters of one owner, by default those of a frame's place."""
     return tuple(Parameter(owner, kind) for kind in kinds)
 
 
 IN_A_FRAME = len(FRAME_KINDS)
-"""Parameters of a frame's place; base and tool alone explain nearly all of fewer poses."""
+"""Parameters of a frame; base and tool alone explain nearly all of fewer poses."""

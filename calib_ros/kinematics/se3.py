@@ -19,12 +19,12 @@ FloatArray: TypeAlias = NDArray[np.float64]
 Flags: TypeAlias = NDArray[np.bool_]
 Index: TypeAlias = NDArray[np.intp]
 ROUNDS = 100
-"""Steps to a fixed point, which ends in far fewer unless there is none. A convention."""
+"""Iterations of a fixed-point search, which normally needs far fewer. A convention."""
 HALF_THE_DIGITS = float(np.sqrt(np.finfo(float).eps))
-"""A share whose square is rounding: after such a Newton step nothing is left, and a column of
-which no more is left depends on those before it."""
+"""Share whose square is rounding: such a Newton step is the last, and a column with less left
+depends on those before it."""
 ROUNDING = HALF_THE_DIGITS**1.5
-"""Share of the whole from which on a number is more than rounding: 12 of its 16 digits."""
+"""Share of the whole above rounding: 12 of 16 digits."""
 
 
 def transform(rotation: FloatArray, translation: FloatArray) -> FloatArray:
@@ -45,7 +45,7 @@ def invert(matrix: FloatArray) -> FloatArray:
 
 def from_quat(quat_xyzw: FloatArray) -> FloatArray:
     """Turn (..., 4) quaternions, normalised here, into (..., 3, 3) rotation matrices."""
-    if not quat_xyzw.size:  # older versions of scipy take none
+    if not quat_xyzw.size:  # older versions of scipy refuse empty arrays
         return np.zeros((*quat_xyzw.shape[:-1], 3, 3))
     flat = Rotation.from_quat(_own(quat_xyzw, 4)).as_matrix()
     return np.asarray(flat).reshape(*quat_xyzw.shape[:-1], 3, 3)
@@ -84,7 +84,7 @@ def turned(x: float, y: float, z: float) -> FloatArray:
 
 
 def cos_sin(angles: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the cosines and sines of angles (...) [rad], from the tangents of half of them."""
+    """Return cosines and sines of angles (...) [rad], from the tangents of half angles."""
     tangent = np.tan(0.5 * angles)
     square = tangent * tangent
     scale = 1.0 / (1.0 + square)
@@ -124,7 +124,7 @@ def cross(first: FloatArray, second: FloatArray, out: FloatArray | None = None) 
 
 
 def norms(vectors: FloatArray) -> FloatArray:
-    """Return the lengths (N,) of vectors (N, c) in a third of the time of `np.linalg.norm`."""
+    """Return the lengths (N,) of vectors (N, c), in a third of the time of `np.linalg.norm`."""
     return np.asarray(np.sqrt(np.einsum('nc,nc->n', vectors, vectors)))
 
 
@@ -149,5 +149,5 @@ def nearest_rotation(matrix: FloatArray) -> FloatArray:
 
 
 def _own(array: FloatArray, *shape: int) -> FloatArray:
-    """Return a copy (N, *shape): scipy of Ubuntu 24.04 takes no read-only arrays."""
+    """Return a copy (N, *shape): scipy of Ubuntu 24.04 refuses read-only arrays."""
     return np.array(array, dtype=np.float64).reshape(-1, *shape)

@@ -6,16 +6,16 @@
     chain    T_base_tip(q) = base A_1(q_1) ... A_n(q_n) tool
 
 O are origins of joints, fixed joints multiplied in; M turns about an axis, or shifts along it.
-The lines of the axes at q = 0 are all that matters. In both conventions the same five parameters
-lead from a frame on one axis to a frame on the next,
+Only the lines of the axes at q = 0 matter. In both conventions the same five parameters lead from
+a frame on one axis to a frame on the next,
 
     Rz(theta_i) Tz(d_i) Tx(a) Rx(alpha) Ry(beta)
 
 with a, alpha and beta in row i of the standard convention and in row i + 1 of the modified one.
-Axes that are skew or intersect take their common normal, with beta = 0. Those that are parallel or
-nearly so take d = 0: theta and a lead to the point where the next axis pierces the plane across
-this one, alpha and beta tilt z into it. Nothing is divided by the angle between the axes there,
-so the tilts in a calibrated URDF make no absurd lengths (Hayati and Mirmirani 1985).
+Skew or intersecting axes take their common normal, with beta = 0. (Nearly) parallel ones take
+d = 0: theta and a lead to the point where the next axis pierces the plane across this one, alpha
+and beta tilt z into it. Nothing is divided by the angle between the axes there, so the tilts in a
+calibrated URDF give no absurd lengths (Hayati and Mirmirani 1985).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES, SAME
 
 MOST_APART = 2.0 * Settings.largest_angle
-"""Mean difference [m or rad] of poses from which a chain is not the arm of a URDF."""
+"""Mean pose difference [m or rad] at which a chain is not the arm of a URDF."""
 
 
 def chain_from_urdf(
@@ -92,7 +92,7 @@ def chain_from_urdf(
         rows[i] = _towards(rows[i], frame, axes[i + 1], places[i + 1][:3, 3])
         frame = frame @ _ends(Chain('row', 'standard', (rows[i],)))[0]
     rows[-1] = replace(rows[-1], d=_clean(float(frame[:3, 2] @ (tip - frame)[:3, 3])))
-    if convention == 'modified':  # bends stand in the next row
+    if convention == 'modified':  # bends are in the next row
         bends = [Joint('straight'), *rows[:-1]]
         pairs = zip(rows, bends, strict=True)
         rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
@@ -195,7 +195,7 @@ def _row(joint: DescribedJoint) -> Joint:
 
 
 def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return a frame (4, 4) with z along an axis, near the origin and near x of the joint."""
+    """Return a frame (4, 4) with z along an axis, near the origin and x of the joint."""
     across = joint[:3, 0] - axis * (axis @ joint[:3, 0])
     if np.linalg.norm(across) < 0.1:  # the axis is the joint's x
         across = joint[:3, 1] - axis * (axis @ joint[:3, 1])
@@ -207,7 +207,7 @@ def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:
 def _towards(row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray) -> Joint:
     """Return a standard row that leads from a frame on its axis to the next axis.
 
-    Of the two directions of its x the one within 90 degrees of the frame's is taken.
+    Of the two directions of its x the one within 90 degrees of the frame's is chosen.
     """
     z = frame[:3, :3].T @ axis
     p = frame[:3, :3].T @ (point - frame[:3, 3])
@@ -237,12 +237,12 @@ def _towards(row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray)
 
 
 def _clean(length: float) -> float:
-    """Return a length [m] as it was before sums of such were rounded, in their last digit."""
+    """Return a length [m] without the rounding of sums in its last digit."""
     return round(length, np.finfo(float).precision - 1) + 0.0
 
 
 def _clean_angle(angle: float) -> float:
-    """Return an angle [rad] as it was; the right angle where it differs by rounding only."""
+    """Return an angle [rad] without rounding; a right angle if that close."""
     right = round(angle / (np.pi / 2)) * (np.pi / 2)
     return _clean(angle) if _clean(angle - right) else right
 
@@ -254,10 +254,7 @@ def _ends(chain: Chain) -> FloatArray:
 
 
 def _on_axes(chain: Chain) -> FloatArray:
-    """Return the frames (n, 4, 4) on the axes at zero, each behind theta and d of its row.
-
-    z is the axis about or along which the reported value moves.
-    """
+    """Return the frames (n, 4, 4) at zero after theta and d of each row, z along the motion."""
     frames = _ends(chain)
     if chain.convention == 'standard':
         for i, row in enumerate(chain.joints):
@@ -274,7 +271,7 @@ def _with_masses(
     moving: Sequence[DescribedJoint],
     poses: Mapping[str, FloatArray],
 ) -> tuple[Joint, ...]:
-    """Return rows with the mass that each joint moves and the next does not, and its centre."""
+    """Return rows with the mass carried by each joint but not the next, and its centre."""
     number = {joint.child: i for i, joint in enumerate(moving)}
     masses, moments = np.zeros(len(rows)), np.zeros((len(rows), 3))
     for joint in robot.joints:  # from the root outwards

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot description (URDF) as a tree of links and joints, and origins back into its text.
 
-Origins are written into the text itself: everything else stays as it is, byte for byte.
+Only the origins are edited in the text; all other bytes stay.
 """
 
 from __future__ import annotations
@@ -29,14 +29,13 @@ TYPES = (*MOVING, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
 ENDS = ('lower', 'upper')
 MOST_LINKS = 10 * MOST_ENTRIES
-"""Links, and joints, of a URDF."""
 
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
 
 
 @dataclass(frozen=True, eq=False)
 class DescribedJoint:
-    """A joint of a URDF; `axis` is a unit vector in its frame, zero where nothing moves."""
+    """A joint of a URDF; `axis` is a unit vector in its frame, zero if fixed."""
 
     name: str
     type: str
@@ -70,7 +69,6 @@ class Description:
         ------
         ConfigError
             If no serial chain of joints connects them.
-
         """
         base = self.root if base is None else base
         for link in (base, tip):
@@ -101,7 +99,7 @@ class Description:
         return tuple(path)
 
     def _usual_tip(self, base: str) -> str:
-        """Return the link at the end of the arm, if it is unambiguous."""
+        """Return the link at the end of the arm, if unambiguous."""
         behind, moved = {base}, set()
         for joint in self.joints:
             if joint.parent in behind:
@@ -119,7 +117,7 @@ class Description:
         return ends[0]
 
     def poses(self, base: str) -> dict[str, FloatArray]:
-        """Return the frames (4, 4) of all links behind a base at zero, in that of the base."""
+        """Return the frames (4, 4) of all links behind a base at zero, in the base."""
         poses = {base: np.eye(4)}
         for joint in self.joints:
             if joint.parent in poses:
@@ -128,14 +126,7 @@ class Description:
 
 
 def parse_urdf(text: str) -> Description:
-    """Turn the text of a URDF into a tree of links and joints.
-
-    Raises
-    ------
-    ConfigError
-        When it is no URDF.
-
-    """
+    """Parse a URDF to a tree of links and joints, or raise ConfigError."""
     root = _robot(text)
     masses = [(element.get('name', ''), _inertial(element)) for element in root.findall('link')]
     links = dict(masses)
@@ -172,7 +163,7 @@ def _robot(text: str) -> ET.Element:
         raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
     try:
         root = ET.fromstring(text)
-    except (ET.ParseError, ValueError) as err:  # the latter for what UTF-8 cannot hold
+    except (ET.ParseError, ValueError) as err:  # ValueError: not UTF-8
         raise ConfigError(f'the URDF is not valid XML: {err}') from err
     if any('xacro' in element.tag.rpartition('}')[0] for element in root.iter()):
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
@@ -182,7 +173,7 @@ def _robot(text: str) -> ET.Element:
 
 
 def _outwards(joints: Sequence[DescribedJoint], root: str) -> tuple[DescribedJoint, ...]:
-    """Return joints in an order in which what carries them is before them."""
+    """Return joints ordered from the root outwards."""
     behind: dict[str, list[DescribedJoint]] = {}
     for joint in joints:
         behind.setdefault(joint.parent, []).append(joint)
@@ -212,7 +203,7 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     if kind in MOVING:
         axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
         size = np.abs(axis).max()
-        if size < SAME:  # a zero as others round it
+        if size < SAME:  # a rounded zero
             raise ConfigError(f'the axis of {where} has no direction')
         axis = axis / size
         axis = axis / np.linalg.norm(axis)
@@ -239,13 +230,13 @@ def _origin(element: ET.Element, where: str) -> FloatArray:
 
 
 def _placed(origin: ET.Element, where: str) -> tuple[FloatArray, FloatArray]:
-    """Return the transform (4, 4) of the tag of an origin, and its roll, pitch, yaw [rad]."""
+    """Return the transform (4, 4) of an origin tag, and its roll, pitch, yaw [rad]."""
     xyz, rpy = (_numbers(origin, key, where, '0 0 0') for key in ('xyz', 'rpy'))
     return se3.transform(np.asarray(Rotation.from_euler('xyz', rpy).as_matrix()), xyz), rpy
 
 
 def _child(element: ET.Element, tag: str) -> ET.Element:
-    """Return the first child of a kind, an empty one when there is none."""
+    """Return the first child with a tag, or an empty element."""
     found = element.find(tag)
     return ET.Element(tag) if found is None else found
 
@@ -279,15 +270,12 @@ _TAG = re.compile(r"""<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""
 
 
 def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
-    """Return the text of a URDF with other origins (4, 4) of joints, all else as it is.
-
-    A joint without an origin gets one, first in it.
-    """
+    """Return a URDF with other joint origins (4, 4), added first in joints without one."""
     data = text.encode()
     for start, tag, name in sorted(_places(data, origins), reverse=True):
         before, rest = data[:start].decode(), data[start:].decode()
         match = _TAG.match(rest)
-        assert match is not None  # without entities, an element begins where expat says
+        assert match is not None  # without entities, expat's index is exact
         head, tail = rest[: match.end()], rest[match.end() :]
         if tag == 'origin':
             head = _with_origin(head, origins[name])
@@ -298,7 +286,7 @@ def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
 
 
 def _places(data: bytes, joints: Mapping[str, object]) -> list[tuple[int, str, str]]:
-    """Return where the origin of each joint starts, or else the joint: byte, tag, joint."""
+    """Return the start of each joint's origin, or else of the joint: byte, tag, joint."""
     places: dict[str, tuple[int, str, str]] = {}
     above: list[str] = []
     inside = ''
@@ -323,7 +311,7 @@ def _places(data: bytes, joints: Mapping[str, object]) -> list[tuple[int, str, s
 
 
 def _with_origin(tag: str, origin: FloatArray) -> str:
-    """Return the text of an origin's tag with another value; what stays is not touched."""
+    """Return an origin tag with another value; equal attributes are not touched."""
     element = ET.fromstring(tag if tag.endswith('/>') else tag[:-1] + '/>')
     written, rpy = _placed(element, 'origin')
     change = np.abs(origin - written)
@@ -343,10 +331,10 @@ def _with_attribute(tag: str, key: str, values: FloatArray) -> str:
 
 
 def to_rpy(rotation: FloatArray, near: FloatArray) -> FloatArray:
-    """Return roll, pitch, yaw (3,) [rad] of a rotation; of the two solutions the nearer one.
+    """Return roll, pitch, yaw (3,) [rad] of a rotation, the solution nearer to `near` (3,).
 
-    The roll is that of the rotation behind yaw and pitch as they were found, so that the three
-    fit together near a pitch of 90 degrees, too, where yaw and roll alone are undetermined.
+    The roll follows from the found yaw and pitch, so that the three are consistent near a pitch of
+    90 degrees, where yaw and roll alone are undetermined.
     """
     first = np.arctan2(rotation[1, 0], rotation[0, 0])
     level = np.hypot(rotation[0, 0], rotation[1, 0])

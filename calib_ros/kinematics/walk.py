@@ -7,9 +7,9 @@ A link is a joint's motion along and about z, and a constant L = Tx(a) Rx(alpha)
     standard   A = Rz(theta) Tz(d) L        modified   A = L Rz(theta) Tz(d)
 
 Frames are (4, 3, B): the x, y and z axis and the origin in the world, of B samples, so a constant
-transform is one product of matrices. Every parameter of a joint moves what is behind it along or
-about an axis of one of these frames: theta and d along z of the frame before the joint's motion,
-a, alpha and beta along x, x and y of the frame behind L (before its turn by beta for the first).
+transform is one product of matrices. Every parameter of a joint moves what follows along or about
+an axis of one of these frames: theta and d along z of the frame before the joint's motion, a,
+alpha and beta along x, x and y of the frame after L (before its turn by beta for the first two).
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from calib_ros.kinematics.se3 import FloatArray, cos_sin
 
 BLOCK = 1024
-"""Samples that one operation runs over: their arrays stay in the caches (benchmarks/peers.py)."""
+"""Samples per operation: their arrays fit the caches (benchmarks/peers.py)."""
 
 
 class Walk:
-    """What of a chain's links does not depend on the joint values.
+    """The parts of a chain's links that do not depend on the joint values.
 
     Parameters
     ----------
@@ -36,7 +36,6 @@ class Walk:
         True for revolute joints.
     standard : bool
         The convention; else the modified one.
-
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class Walk:
         self._d = np.zeros_like(d) if standard else d
 
     def along(self, q: FloatArray, base: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the frames (n + 1, 4, 3, B) that `frames` writes, and those at links' ends."""
+        """Return the frames (n + 1, 4, 3, B) as `frames`, and those at the links' ends."""
         found = np.empty((len(q) + 1, 4, 3, q.shape[1]))
         if self.standard:
             return self.frames(q, base, found), found[1:]
@@ -91,9 +90,8 @@ class Walk:
         found : (n + 1, 4, 3, B)
             Receives the frames, and is returned.
         ends : (n, 4, 3, B), optional
-            Gets the frames at the ends of the links of the modified convention; of the standard
-            one they are those that follow.
-
+            Receives the frames at the ends of the links of the modified convention; in the
+            standard one these are the following frames.
         """
         values = self.signs * q
         angles = self._theta + (values if self._all_turning else values * self._turns)
