@@ -20,7 +20,7 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 class Visibility:
     """Where the measuring device sees the target.
 
-    `box` (2, 3) [m] holds two opposite corners of the measurable region, `tracker` (3,) [m] the
+    `box` (2, 3) [m] holds opposite corners of the measurable region, `tracker` (3,) [m] the
     position of the device, both in the `world` or else in the arm's base frame. The `axis` in the
     target's frame must point to the device within a `cone` [rad].
     """
@@ -46,7 +46,7 @@ class Visibility:
             )
 
     def sees(self, design: Design, joints: FloatArray) -> Flags:
-        """Return (N,) whether the target can be measured at joint values (N, n)."""
+        """Tell (N,) whether the target can be measured at joint values (N, n)."""
         base = design.chain.all_frames[design.base]
         poses = design.targets(joints)
         if not self.world:
@@ -77,7 +77,7 @@ def draw_candidates(
 ) -> FloatArray:
     """Draw joint values (count, n) within the limits at which the target can be measured.
 
-    The region counts as out of reach after so many `tries` for each.
+    The region counts as out of reach after `tries` for each.
     """
     found = np.zeros((0, len(design.chain.joints)))
     drawn = 0
@@ -96,11 +96,11 @@ def draw_candidates(
 
 
 def visit_order(joints: FloatArray, velocities: FloatArray) -> Index:
-    """Return a fast order (N,) in which to visit configurations (N, n).
+    """Return a fast order (N,) to visit configurations (N, n).
 
     The slowest joint, at `velocities` (n,) [rad/s or m/s], determines the time of a move. Nearest
-    neighbour from the outermost configuration, then parts of the path are reversed while that
-    shortens it (2-opt; Croes 1958).
+    neighbour from the outermost configuration, improved by reversing parts of the path (2-opt;
+    Croes 1958).
     """
     travel = travel_times(joints, velocities)
     count = len(joints)
@@ -111,7 +111,7 @@ def visit_order(joints: FloatArray, velocities: FloatArray) -> Index:
         order.append(int(np.where(free, travel[order[-1]], np.inf).argmin()))
     path = np.array(order)
     while True:
-        # turning i ... j round joins i - 1 to j and i to j + 1; an end of the way joins nothing
+        # reversing i ... j joins i - 1 to j and i to j + 1; ends of the path join nothing
         there = np.zeros((count + 2, count + 2))
         there[1:-1, 1:-1] = travel[np.ix_(path, path)]
         legs = np.diagonal(there, 1)
@@ -132,14 +132,14 @@ CORNERS = 0.5 * np.array(
     [[x, y, z * x] for z in (1, -1) for x, y in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
 )
 TILTED = range(len(CORNERS) // 2)
-"""Corners of the plane x = z of the cube, round about: they come first."""
+"""Corners of the plane x = z of the cube, in order around it."""
 
 
 @dataclass(frozen=True, eq=False)
 class TestPoses:
     """Joint values (5, n) [rad or m] of the test poses P1 to P5, and the edge [m] of the cube."""
 
-    __test__ = False  # no test class, whatever its name
+    __test__ = False  # no test class
 
     joints: FloatArray
     edge: float
@@ -153,7 +153,6 @@ class _Cubes(NamedTuple):
     corners: FloatArray
 
     def select(self, index: NDArray[np.generic]) -> _Cubes:
-        """Return some of the cubes."""
         return _Cubes(*(each[index] for each in self))
 
 
@@ -161,21 +160,20 @@ def iso_9283_poses(
     design: Design,
     rng: np.random.Generator,
     visibility: Visibility | None = None,
-    centres: int = 500,
-    edge: float = 0.02,
 ) -> TestPoses:
     """Return five poses to verify an arm in the largest cube found (ISO 9283:1998, 6.10.2).
 
     The arm reaches the cube and the device sees it, beside the z axis of the base; its edges are
     parallel to the base frame. All poses have one orientation: P1 is at the centre, P2 to P5 on a
-    diagonal plane, each a tenth of the diagonal away from a corner. Cubes grow about so many
-    reachable `centres`, from this `edge` [m] on, while inverse kinematics tracks their corners. An
-    arm that cannot keep its orientation in any, as with fewer than six joints, is refused.
+    diagonal plane, each a tenth of the diagonal away from a corner. Cubes grow about 500 reachable
+    centres while inverse kinematics tracks their corners. An arm that cannot keep its orientation
+    in any, as with fewer than six joints, is refused.
     """
-    middle = draw_candidates(design, centres, rng, visibility)
+    edge = 0.02  # of the smallest cubes [m]
+    middle = draw_candidates(design, 500, rng, visibility)
     start = np.repeat(middle[:, np.newaxis], 8, axis=1)
     cubes = _at(design, visibility, _Cubes(design.targets(middle), middle, start), edge)
-    for factor in 1.3**0.5 ** np.arange(5):  # finer and finer
+    for factor in 1.3**0.5 ** np.arange(5):  # increasingly fine
         while len((grown := _at(design, visibility, cubes, edge * factor)).centres):
             cubes, edge = grown, edge * factor
     if not len(cubes.centres):
@@ -195,7 +193,7 @@ def iso_9283_poses(
 
 
 def _at(design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float) -> _Cubes:
-    """Return those cubes that may have this edge [m]."""
+    """Return the cubes that can have this edge [m]."""
     count, _, joints = cubes.corners.shape
     wanted = _poses(design, cubes.centres, edge).reshape(-1, 4, 4)
     start = cubes.corners.reshape(-1, joints)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The program point to which each measurement belongs.
+"""Assignment of measurements to program points.
 
-An arm stands at the joint values of the program if that was not corrected, else at those that the
-correction makes of them. Along a path with points closer than the correction, the corrected ones
-are nearer to those of other points than to their own.
+An arm stands at the joint values of the uncorrected program, or at their corrected ones. If points
+of a path are closer than the correction, corrected ones are nearer to other points than to their
+own.
 """
 
 from __future__ import annotations
@@ -23,13 +23,12 @@ def meant(
 ) -> FloatArray:
     """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
 
-    Those are the nearest of the program (M, n), as it is or corrected by the calibration.
+    The nearest of the program (M, n), as it is or corrected by the calibration.
 
     Raises
     ------
     InputError
-        For measurements further from all of the program than anything is corrected.
-
+        For measurements further from the program than any correction.
     """
     far, _ = cKDTree(commanded).query(joints, p=np.inf)
     lost = np.flatnonzero(far > Compensator.largest_turn)

@@ -2,16 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The correction of a program: joint commands that reach the intended pose.
 
-A controller believes the nominal arm N, the real one is the calibrated arm C. A command q means
-the pose N(q) of the flange in the arm's base frame; it is replaced by the q' nearest to it with
+A controller assumes the nominal arm N, the real one is the calibrated arm C. A command q means the
+pose N(q) of the flange in the arm's base frame; it is replaced by the nearest q' with
 
     C(q') = N(q)
 
-Both arms are taken without the base and tool frames of the measurement (tracker, reflector). In
-equal frames these cancel: T_base C(q') T_tool = T_base N(q) T_tool. What a calibration leaves
-open, where the base frame stands and the tool sits, is the subject of docs/compensation.md.
-
-What cannot be corrected within the limits given is refused, sample by sample, with the reason.
+Base and tool frames of the measurement (tracker, reflector) cancel if equal: T_base C(q') T_tool =
+T_base N(q) T_tool. docs/compensation.md explains what a calibration leaves open, where the base
+stands and the tool sits. Samples that cannot be corrected within the limits are refused with the
+reason.
 """
 
 from __future__ import annotations
@@ -42,15 +41,14 @@ class Compensator(Shown, Limits):
     Parameters
     ----------
     nominal : Chain
-        The arm as the controller believes it, with the limits of its joints.
+        The arm the controller assumes, with its joint limits.
     calibrated : Chain
-        The arm as identified. Base and tool frames of both are ignored.
+        The identified arm. Base and tool frames of both are ignored.
     tool : three floats
         Tool point [m] in the flange frame. It matters for arms that cannot reach every
         orientation, and for the reported errors.
     region : Region, optional
         Where the calibration may be used; samples elsewhere are refused.
-
     """
 
     nominal: Chain
@@ -93,7 +91,7 @@ class Compensator(Shown, Limits):
 
 @dataclass(frozen=True)
 class Refusal:
-    """A sample that cannot be corrected as asked for, and why."""
+    """A sample that cannot be corrected, and why."""
 
     sample: int
     reason: str
@@ -108,10 +106,9 @@ class Compensation(Solution):
     command : (N, n)
         Joint values [rad or m] before correction.
     joints : (N, n)
-        The corrected ones; NaN in samples that are refused.
+        The corrected ones; NaN in refused samples.
     refusals : tuple of Refusal
         In the order of the samples.
-
     """
 
     command: FloatArray
@@ -139,7 +136,6 @@ def compensate(
     ------
     InputError
         For joint values of the wrong shape, or not finite.
-
     """
     command = np.array(joints, dtype=np.float64)
     count = len(compensator.nominal.joints)
@@ -201,7 +197,7 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
 
 
 def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
-    """Return the samples at which the calibration may not be used."""
+    """Return the samples outside the region of the calibration."""
     region = compensator.region
     if region is None or region.whole:
         return []
@@ -220,7 +216,7 @@ def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
 
 
 def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
-    """Return the samples that are not corrected as asked for."""
+    """Return the samples that are not corrected as requested."""
     follower, names = compensator.follower, compensator.nominal.joint_names
     tolerated = compensator.largest_orientation_error
     if tolerated is None:
@@ -232,7 +228,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
     beyond = (command < follower.lower - EXACT) | (command > follower.upper + EXACT)
     too_large = np.abs(correction) > compensator.largest
     remaining = (apart > most) | (result.orientation > tolerated)
-    # a redundant arm may go to and fro among its many ways, and be right all the time
+    # a redundant arm may oscillate among solutions, all of them correct
     astray = ~result.converged & ((result.position > EXACT) | (result.orientation > EXACT))
     wrong = beyond.any(axis=1) | too_large.any(axis=1) | remaining | astray
     largest = f'{compensator.largest_turn:g} rad or {compensator.largest_shift:g} m'
@@ -272,10 +268,10 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
 def too_fast(
     compensator: Compensator, changes: FloatArray, moves: FloatArray, words: str, first: int = 0
 ) -> list[Refusal]:
-    """Return the samples, the `first` of them and on, whose correction changes too much.
+    """Return the samples, from `first` on, whose correction changes too much.
 
-    `changes` (N, n) of it are held against `moves` (N, n) of the joints, both positive; `words`
-    have places for the change and the move.
+    `changes` (N, n) of it are compared with `moves` (N, n) of the joints, both positive; `words`
+    have places for change and move.
     """
     shares = (changes - EXACT) / compensator.largest
     allowed = compensator.largest_change * (moves / compensator.largest).max(axis=1)
@@ -288,7 +284,7 @@ def too_fast(
 
 
 def refused(result: Compensation, more: Sequence[Refusal]) -> Compensation:
-    """Return the result with further samples refused, their joint values set to NaN."""
+    """Return the result with further samples refused, their joint values NaN."""
     joints = result.joints.copy()
     joints[[refusal.sample for refusal in more]] = np.nan
     known = {refusal.sample for refusal in result.refusals}

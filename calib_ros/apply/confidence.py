@@ -7,24 +7,22 @@ configurations with errors e_k is approximated by theta / nu chi2(nu) (Satterthw
 
     S = mean of e_k e_k^T        g = 2 tr S^2 / (tr S)^2        nu = 2 K / max(g, c^2)
 
-For Gaussian errors of equal size nu lies between K (g = 2: all errors in one direction) and 3 K
-(isotropic). It is smaller if errors vary over the workspace, as under compliance and eccentricity:
-c^2 is the variance of the squared errors over their squared mean, estimated with g for one more
-configuration and raised by SAFETY standard deviations, because few configurations rarely include
-the worst places. Measurements of one configuration share its error and count as one. Limits are
-one-sided, each at the wanted confidence.
+For Gaussian errors of equal size nu is between K (g = 2: all errors in one direction) and 3 K
+(isotropic). It is smaller if errors vary over the workspace: c^2 is the variance of the squared
+errors over their squared mean, estimated with g for one more configuration and raised by SAFETY
+standard deviations, because few configurations rarely include the worst places. Measurements of
+one configuration count as one. Limits are one-sided.
 
-A chart of nights: the RMS error r of one, with nu degrees of freedom, is held against the pooled
-square s^2 of nights before. r^2 / s^2 has an F distribution where nothing has changed, with nu and
-all of their degrees of freedom, which makes it a normal variable z, independent of those before.
-Two cumulative sums (CUSUM; Page 1954),
+A chart of nights: the RMS error r of one, with nu degrees of freedom, is compared with the pooled
+square s^2 of earlier nights. If nothing has changed r^2 / s^2 has an F distribution, which makes
+it a normal variable z, independent of earlier ones. Two cumulative sums (CUSUM; Page 1954),
 
     S_0 = 0        S = max(0, S + z - k)
 
 detect shifts of about 2 k: a small k slow changes, a large one jumps. S > h raises an alarm. The
 mean number of nights until a false alarm follows from a discretised Markov chain of S (Brook and
-Evans 1972); h is set from the wanted number of years between false alarms. Two charts per robot
-double the rate of false alarms, so each gets half. Both restart after an alarm.
+Evans 1972); h is set from the wanted number of years between false alarms, half of which each
+chart gets. Both restart after an alarm.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0
-"""With this many, limits of 95 % hold in 95 % where places differ (benchmarks/verification.py)."""
+"""Limits of 95 % then hold in 95 % if places differ (benchmarks/verification.py)."""
 
 
 def rms_limits(
@@ -58,8 +56,7 @@ def rms_limits(
 def rms_interval(errors: FloatArray, group: Index, confidence: float) -> tuple[float, float]:
     """Return the one-sided limits [m] of the RMS of errors (N, 3) over poses like these.
 
-    `group` (N,) are the configurations, of which each counts for one. With a single one nothing
-    is known: (0, inf).
+    `group` (N,) are the configurations, each counted once; with a single one they are (0, inf).
     """
     moments = moments_of(errors, np.unique(group, return_inverse=True)[1])
     if len(moments) < 2:
@@ -80,7 +77,7 @@ def interval_of(which: Comparison, when: int, confidence: float) -> tuple[float,
 
 
 def freedom_of(moments: FloatArray) -> float:
-    """Return the degrees of freedom of one of the configurations with moments (K, 3, 3)."""
+    """Return the degrees of freedom per configuration, with moments (K, 3, 3)."""
     spread, count = moments.mean(axis=0), len(moments)
     squares = np.trace(moments, axis1=1, axis2=2)
     normal = 2.0 * np.trace(spread @ spread) / np.trace(spread) ** 2
@@ -99,16 +96,16 @@ def moments_of(errors: FloatArray, group: Index) -> FloatArray:
 
 
 SLOPES = (0.5, 2.0)
-"""References k of both charts, by Page (1954) half of the shifts that are to show soonest: of one
-and of four standard deviations."""
+"""References k of both charts, by Page (1954) half of the shifts to detect soonest: of one and
+four standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What a chart of one robot shows: nights of `alarms`, and the night `since` which, for each.
+    """Result of a chart of one robot: nights of `alarms`, and the night `since` which, for each.
 
-    `scores` (N,) are errors against those before as normal variables, NaN in the first night and
-    in the first after an alarm; `sums` (N, 2) shares of the heights of both charts.
+    `scores` (N,) are errors relative to earlier ones as normal variables, NaN in the first night
+    and in the first after an alarm; `sums` (N, 2) are shares of the heights of both charts.
     """
 
     scores: FloatArray
@@ -120,7 +117,7 @@ class Drift:
 def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift:
     """Find the nights since which an arm is worse.
 
-    Errors of the nights (N,) are in any unit, with their degrees of freedom (N,) as of
+    Errors of the nights (N,) are in any unit, with their degrees of freedom (N,) as in
     `Verification.freedom`; `years` pass between two false alarms, with a night each day.
     """
     errors, nus = np.asarray(rms, dtype=float), np.asarray(freedom, dtype=float)
@@ -148,11 +145,12 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift
     return Drift(scores, shares, tuple(alarms), tuple(since))
 
 
-def run_length(slope: float, height: float, states: int = 200) -> float:
-    """Return after how many normal values a one-sided CUSUM exceeds a height, on average.
+def run_length(slope: float, height: float) -> float:
+    """Return the mean number of normal values until a one-sided CUSUM exceeds a height.
 
-    More states of the Markov chain change it by less than a hundredth (test_chart.py).
+    More states change it by less than a hundredth (test_chart.py).
     """
+    states = 200  # of the Markov chain
     width = 2.0 * height / (2 * states - 1)
     middles = width * np.arange(states)
     upper = middles[np.newaxis] - middles[:, np.newaxis] + 0.5 * width + slope
@@ -169,6 +167,6 @@ def limit(slope: float, nights: float) -> float:
         return float(np.log(run_length(slope, height) / nights))
 
     top = 1.0
-    while less(top) < 0.0:  # not far beyond: run lengths grow by powers of the height
+    while less(top) < 0.0:  # run lengths grow exponentially with the height
         top *= 2.0
     return float(optimize.brentq(less, 1e-3, top, xtol=1e-4))

@@ -3,9 +3,8 @@
 """The information of poses about the parameters, before they are measured.
 
 A pose adds A^T A to the information M about the parameters, with A (m, P) its rows of the weighted
-Jacobian: 6 by full pose, 3 by position. Neither needs a measured value. With C = M^-1 the
-predicted RMS position error over task poses is the root of the mean of tr J C J^T, with J their
-rows of position.
+Jacobian: 6 by full pose, 3 by position. With C = M^-1 the predicted RMS position error over task
+poses is the root of the mean of tr J C J^T, with J their position rows.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
 ASSUMED_TOOL = 3 * (LEVER / 3.0,)
-"""Where the target is taken to be [m] in the flange's frame when nothing is known about it."""
+"""Assumed place of an unknown target [m] in the flange frame."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,12 +41,11 @@ class Design(Shown):
     names : tuple of str
         P parameters to identify, without gauge freedoms.
     sigma_position, sigma_orientation : float, float or None
-        Of a measured pose [m, rad]; None when only positions are measured.
+        Of a measured pose [m, rad]; None if only positions are measured.
     known : (R, P)
         Rows of existing information, in sigma: priors, poses taken.
     base, tool : str
-        Frames of the chain for the poses to come.
-
+        Frames of the chain for further poses.
     """
 
     chain: Chain
@@ -60,12 +58,11 @@ class Design(Shown):
 
     @classmethod
     def of(cls, problem: Problem, result: Identification | Estimate | None = None) -> Design:
-        """Return the design of a problem: nothing but the priors is known yet.
+        """Return the design of a problem, with nothing known but the priors.
 
-        With the result of an identification, or an estimate while samples come, that is known as
-        well, and poses to come have the noise that it found. Measured values do not count
-        otherwise: `simulation.measure` can make the observations of a problem before anything is
-        measured. Distances are refused.
+        With an identification, or an estimate during sampling, its information is known too, and
+        further poses have its noise. Measured values do not count otherwise: `simulation.measure`
+        can make the observations of a problem before anything is measured. Distances are refused.
         """
         kind = problem.kinds[0]
         if kind.distance or problem.separations:
@@ -112,12 +109,12 @@ class Design(Shown):
         return jacobian
 
     def after(self, joints: FloatArray) -> Design:
-        """Return the design when poses at (N, n) have been measured."""
+        """Return the design after measuring poses at (N, n)."""
         rows = self.rows(joints).reshape(-1, len(self.names))
         return replace(self, known=triangular(np.concatenate([self.known, rows])))
 
     def determined_by(self, joints: FloatArray) -> Design:
-        """Return the design without parameters that not even all poses at (N, n) determine."""
+        """Return the design without parameters that all poses at (N, n) do not determine."""
         names = independent(self.after(joints).known, self.names)
         known = self.known[:, [self.names.index(name) for name in names]]
         return replace(self, names=names, known=known)
@@ -128,9 +125,9 @@ class Design(Shown):
 
 
 class Candidates:
-    """Rows (N, m, P) of candidates in coordinates in which they weigh one on average.
+    """Rows (N, m, P) of candidates, scaled to unit average.
 
-    `factor` (P, P) leads back: rows @ factor are in sigma per metre or radian.
+    With `factor` (P, P), rows @ factor are in sigma per metre or radian.
     """
 
     def __init__(self, design: Design, joints: FloatArray) -> None:
@@ -151,8 +148,8 @@ class Candidates:
 def accuracy(design: Design, joints: FloatArray, task: FloatArray) -> FloatArray:
     """Return the predicted RMS position error (N,) [m] with the first 1, 2, ... N poses.
 
-    At task poses (T, n), from the uncertainty of the parameters alone; infinite while they are
-    not all determined. `joints` (N, n) are the poses, in the order in which they are measured.
+    At task poses (T, n), from the uncertainty of the parameters alone; infinite until all are
+    determined. `joints` (N, n) are the poses, in measuring order.
     """
     space = Candidates(design, joints)
     if space.design.names != design.names:
@@ -175,7 +172,7 @@ def predicted(design: Design, task: FloatArray) -> float:
 
 
 def times(rows: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Return the product of (N, m, P) and (P, P), which BLAS does in one piece."""
+    """Return the product of (N, m, P) and (P, P) as one BLAS operation."""
     flat = np.ascontiguousarray(rows).reshape(-1, rows.shape[2]) @ matrix
     return flat.reshape(*rows.shape[:2], -1)
 
@@ -194,17 +191,17 @@ def triangular(rows: FloatArray) -> FloatArray:
 
 
 def _root_of_inverse(covariance: FloatArray) -> FloatArray:
-    """Return rows (P, P) with the information whose inverse is a covariance."""
+    """Return rows (P, P) whose information is the inverse of a covariance."""
     std = np.sqrt(np.diag(covariance))
     values, vectors = linalg.eigh(covariance / np.outer(std, std))
-    least = len(std) * np.finfo(float).eps * values[-1]  # by rounding, zero and below as well
+    least = len(std) * np.finfo(float).eps * values[-1]  # rounding may give zero and less
     return np.asarray((vectors / np.sqrt(np.maximum(values, least))).T / std)
 
 
 def _with_assumed_tool(chain: Chain, tool: str) -> Chain:
-    """Return the chain with its target off the flange's axis, if nothing is known about it.
+    """Return the chain with its target off the flange's axis, if unknown.
 
-    On the axis, where a frame of no size would put it, its position hides the last joint.
+    On the axis, where an identity frame puts it, its position hides the last joint.
     """
     if chain.all_frames[tool] is not None:
         return chain

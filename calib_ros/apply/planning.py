@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Choice of poses to measure, and the accuracy to expect.
+"""Choice of poses to measure, and the expected accuracy.
 
-A pose with the rows A (m, P) of information (`design.py`) is judged by a matrix of m x m:
+A pose with the rows A (m, P) of information (`design.py`) is judged by an m x m matrix:
 
     d       ln det(M + A^T A) - ln det M = ln det(I + A C A^T)          (O1, Borm and Menq 1991)
     task    tr V C - tr V (M + A^T A)^-1 = tr (I + A C A^T)^-1 A C V C A^T
             with V the mean of J^T J over the poses of a task: tr V C is the mean squared error
     o2-o5   observability indices (`identifiability.observability`), from eigenvalues
 
-Poses are chosen one by one, the best first, and then exchanged one by one while that helps
-(Fedorov 1972, Mitchell 1974). A trace over A^T A, quick for all candidates at once, bounds `d` and
-`task` from above: only candidates whose bound passes the best are judged in full. The indices o2
-to o5 say nothing while M is singular: there the choice by `d` is where exchanges start.
+Poses are chosen one by one, best first, and then exchanged one by one while that helps (Fedorov
+1972, Mitchell 1974). A trace over A^T A, quick for all candidates at once, bounds `d` and `task`
+from above: only candidates with a bound above the best are judged in full. The indices o2 to o5
+are undefined while M is singular: exchanges then start from the choice by `d`.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ def choose(
 ) -> Index:
     """Choose poses to measure among candidates (N, n) [rad or m].
 
-    Return the indices (count,) of the chosen poses, the most informative first. The criterion
+    Returns the indices (count,) of the chosen poses, the most informative first. The criterion
     `task` needs joint values (T, n) at which the arm must be accurate. Any two poses differ by at
-    least `apart` [rad or m] in the joint that moves most. Exchanges begin at `start`, indices
-    (count,), if a good choice is known; a quick choice skips them.
+    least `apart` [rad or m] in the joint that moves most. Exchanges start at `start`, indices
+    (count,), if known; a quick choice skips them.
     """
     if count < 1:
         raise ConfigError(f'at least one pose must be chosen, not {count}')
@@ -74,7 +74,7 @@ def choose(
 
 
 class _Pick:
-    """The candidates chosen so far, and the information that they bring."""
+    """The candidates chosen so far, and their information."""
 
     def __init__(self, space: Candidates, apart: float) -> None:
         self._joints, self._rows = space.joints, space.rows
@@ -115,7 +115,7 @@ class _Pick:
         self.information = self.information + information_of(self._rows[index])
 
     def exchange(self, worth: _Worth) -> bool:
-        """Exchange every chosen candidate for the best one; return whether any was changed."""
+        """Exchange chosen candidates for better ones; return whether any changed."""
         rows = self._rows[self.chosen]
         self.information = self._start + information_of(rows)  # no rounding left
         changed = False
@@ -133,7 +133,7 @@ class _Pick:
         return changed
 
     def in_order(self, worth: _Worth) -> Index:
-        """Return the chosen, the best first."""
+        """Return the chosen candidates, best first."""
         left, ordered, information = list(self.chosen), [], self._start
         while left:
             best = left.pop(int(worth.of(information, self._rows[left]).argmax()))
@@ -142,13 +142,12 @@ class _Pick:
         return np.array(ordered)
 
     def _traces(self, matrix: FloatArray) -> FloatArray:
-        """Return tr A K A^T (N,) of all candidates with a symmetric matrix K (P, P)."""
         twice = 2.0 * matrix - np.diag(np.diag(matrix))
         return np.asarray(self._each @ twice[self._upper])
 
 
 class _Worth:
-    """What candidates are worth by a criterion."""
+    """Worth of candidates by a criterion."""
 
     def __init__(
         self, space: Candidates, criterion: Criterion, task: FloatArray | None = None
@@ -163,7 +162,7 @@ class _Worth:
             self._wanted = space.of_task(task)
 
     def of(self, information: FloatArray, rows: FloatArray) -> FloatArray:
-        """Return the worth (N,) of candidates with rows (N, m, P) from information (P, P)."""
+        """Return the worth (N,) of candidates with rows (N, m, P) beside information (P, P)."""
         if self._criterion in INDICES:
             # of M + A^T A, in sigma per metre or radian
             back = times(rows, self._factor)
@@ -180,7 +179,7 @@ class _Worth:
         return np.asarray(np.trace(np.linalg.solve(whole, spread), axis1=1, axis2=2))
 
     def at_most(self, information: FloatArray, traces: Traces) -> FloatArray:
-        """Return what no worth (N,) passes: ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
+        """Return upper bounds (N,): ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
         if self._criterion in INDICES:  # every candidate is judged in full
             return np.full_like(traces(information), np.inf)
         root = _root(information)
@@ -199,12 +198,12 @@ def _root(information: FloatArray) -> FloatArray:
 def efficiency(
     design: Design, candidates: FloatArray, chosen: Index, task: FloatArray | None
 ) -> float:
-    """Return a lower bound on how good a choice (K,) is against the best of as many candidates.
+    """Return a lower bound of the quality of a choice (K,) relative to the best of that size.
 
     For the criterion `d`, or `task` with the joint values (M, n) of one; `candidates` are (N, n).
     As a share of poses: with 0.9 even the best choice would need 90 % of them. Both criteria are
-    convex, and the tangent at the choice (Kiefer and Wolfowitz 1960) bounds what the candidates
-    with the steepest slopes would bring.
+    convex, and the tangent at the choice (Kiefer and Wolfowitz 1960) bounds the gain of the
+    candidates with the steepest slopes.
     """
     space = Candidates(design, candidates)
     ridge = HALF_THE_DIGITS * np.eye(len(space.known))
@@ -251,9 +250,9 @@ class Plan(Shown):
     lacking: tuple[str, ...]
 
     def to_frame(self) -> Any:
-        """Return the joint values [rad or m] in the order of visit as a pandas.DataFrame.
+        """Return the joint values [rad or m] in visiting order as a pandas.DataFrame.
 
-        `telling` is the place of a pose among the most telling ones, the first of which is 1.
+        `telling` is the rank of a pose by information, from 1.
         """
         columns = {f'q{k}': column[self.visit] for k, column in enumerate(self.joints.T, 1)}
         return as_frame({'telling': self.visit + 1, **columns})
@@ -273,9 +272,9 @@ def plan(
 ) -> Plan:
     """Plan a number of measurements, and compare them with random draws.
 
-    `candidates` (N, n) and the `task` (M, n) are joint values, `velocities` (n,) their largest
-    rates. `chosen` (K,) are indices already found by `fewest`; `choose` and `visit_order` describe
-    the other arguments.
+    `candidates` (N, n) and the `task` (M, n) are joint values, `velocities` (n,) the largest
+    rates. `chosen` (K,) are indices found by `fewest`; `choose` and `visit_order` describe the
+    other arguments.
     """
     excited = design.determined_by(candidates)
     if chosen is None:
@@ -311,9 +310,9 @@ def fewest(
     apart: float = STILL,
     told: Told = nobody,
 ) -> Index:
-    """Return the indices (K,) of the fewest poses with the accuracy `wanted`, the best first.
+    """Return the indices (K,) of the fewest poses with the accuracy `wanted`, best first.
 
-    It is the predicted RMS position error [m] at the task poses (T, n).
+    That is the predicted RMS position error [m] at the task poses (T, n).
     """
     excited = design.determined_by(candidates)
     best = predicted(excited.after(candidates), task)
@@ -333,9 +332,9 @@ def fewest(
         growth = (errors[-1] / wanted) ** 2  # errors fall with the root of the number
         count = max(count + 1, int(count * min(growth, 2.0)))
     reached = int(np.flatnonzero(errors <= wanted)[0]) + 1
-    while reached > 1:  # the first of many are not quite the best of few
+    while reached > 1:  # the first of many are not the best of few
         start = found[:reached] if reached < len(found) else found[: reached - 1]
-        for begin in (start, None):  # the quick way first
+        for begin in (start, None):  # quick first
             fewer = choose(excited, candidates, len(start), criterion, task, apart, told, begin)
             errors = accuracy(excited, candidates[fewer], task)
             if errors[-1] <= wanted:

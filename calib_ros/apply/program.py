@@ -24,8 +24,8 @@ from calib_ros.progress import Told, nobody
 from calib_ros.shown import Shown
 
 NUDGE = HALF_THE_DIGITS**0.25
-"""Step of the differences, in units of the largest correction: second ones of what is right by
-half the digits lose least so."""
+"""Step of differences, in units of the largest correction: optimal for second differences of
+values accurate to half the digits."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,11 +39,9 @@ class Program(Shown):
     positions : (N, m)
         Joint values [rad or m], in their order of execution.
     velocities, accelerations : (N, m), optional
-        Their derivatives.
     approach : (N, n), optional
-        Signs of the velocities with which the arm's joints reach their values, for backlash. Found
-        from the order of the positions if None.
-
+        Signs of the velocities with which the arm's joints reach their values, for backlash. By
+        default from the order of the positions.
     """
 
     names: tuple[str, ...]
@@ -64,8 +62,7 @@ def compensate_program(
     Raises
     ------
     InputError, UnknownNameError
-        For a missing joint of the arm, and arrays that do not fit the names.
-
+        For a missing joint of the arm, and arrays that do not match the names.
     """
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]
@@ -97,7 +94,7 @@ def compensate_program(
 
 
 def approaches(positions: FloatArray) -> FloatArray:
-    """Return the sign (N, n) of the last move of each joint, 0 before it first moves."""
+    """Return the sign (N, n) of the last move of each joint, 0 before the first."""
     moves = np.sign(np.diff(positions, axis=0, prepend=positions[:1]))
     last = np.where(moves != 0.0, np.arange(len(moves))[:, np.newaxis], 0)
     return np.asarray(np.take_along_axis(moves, np.maximum.accumulate(last, axis=0), axis=0))

@@ -22,7 +22,7 @@ from calib_ros.kinematics.se3 import FloatArray
 
 @dataclass(frozen=True)
 class Cell:
-    """Make, motion and measurement of the simulated arm: m, rad, s, Hz."""
+    """Arm, motion and measurement of a simulated cell: m, rad, s, Hz."""
 
     length_error: float = 5e-4
     angle_error: float = 1e-3
@@ -35,10 +35,9 @@ class Cell:
 
 
 def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
-    """Return a chain with normally distributed errors, and frames anywhere.
+    """Return a chain with normally distributed errors, and arbitrary frames.
 
-    Only parameters other than gauge freedoms get errors, so that they can be compared with
-    identified ones.
+    Gauge freedoms get no errors, so that errors can be compared with identified ones.
     """
     names = [
         name
@@ -55,7 +54,7 @@ def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
 
 
 def random_frame(rng: np.random.Generator, reach: float) -> Frame:
-    """Return a frame turned anyhow, within `reach` [m] along each axis."""
+    """Return a randomly turned frame, within `reach` [m] along each axis."""
     quat = rng.normal(size=4)
     rotation = se3.from_quat(quat / np.linalg.norm(quat))
     return Frame(se3.transform(rotation, rng.uniform(-reach, reach, 3)))
@@ -69,7 +68,7 @@ def measure(
     noise_orientation: float = 0.0,
     oriented: bool = True,
 ) -> Observations:
-    """Measure the poses of a chain at joint values (N, n) with normally distributed noise."""
+    """Measure the poses of a chain at joint values (N, n) with Gaussian noise."""
     poses = chain.forward(joints)
     positions = poses[:, :3, 3] + rng.normal(scale=noise_position, size=(len(joints), 3))
     turns = se3.exp_rotation(rng.normal(scale=noise_orientation, size=(len(joints), 3)))
@@ -80,7 +79,7 @@ def measure(
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera, and how boards are held before it, up to `tilt` from facing it: px, m, rad."""
+    """A camera, and boards held up to `tilt` from facing it: px, m, rad."""
 
     lens: Lens = field(
         default=Lens(1350.0, 1355.0, 795.0, 605.0, -0.12, 0.15, 0.001, -0.001, -0.05)
@@ -94,9 +93,9 @@ class Camera:
 def before_camera(
     chain: Chain, camera: Camera, points: FloatArray, on_flange: bool, rng: np.random.Generator
 ) -> Chain:
-    """Return the chain with frames that let a camera see a board, in reach of the arm.
+    """Return the chain with frames that let a camera see a board in reach of the arm.
 
-    One of camera and board is on the flange; the board has `points` (M, 3) [m].
+    Camera or board is on the flange; the board has `points` (M, 3) [m].
     """
     mounted = random_frame(rng, 0.1).matrix
     bare = replace(chain, base=Frame(), tool=Frame())
@@ -121,10 +120,10 @@ def photograph(
     noise: float = 0.0,
     tries: int = 2000,
 ) -> Observations:
-    """Return images of all points (M, 3) of a board, with normally distributed noise [px].
+    """Return images of all points (M, 3) of a board, with Gaussian noise [px].
 
-    The board faces the camera from anywhere in its view; the arm holds it with its joints anyhow.
-    After so many `tries` it counts as out of reach.
+    The board faces the camera from anywhere in its view, with random joint values. After `tries`
+    it counts as out of reach.
     """
     size = len(points)
     joints = np.zeros((0, len(chain.joints)))
@@ -164,7 +163,7 @@ def photograph(
 def _facing(
     camera: Camera, points: FloatArray, count: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return poses (count, 4, 4) of a board in a camera that faces it, turned about at random."""
+    """Return poses (count, 4, 4) of a board facing a camera, randomly turned."""
     depth = camera.depth * rng.uniform(0.7, 1.3, count)
     aside = rng.uniform(-0.25, 0.25, (count, 2)) * depth[:, np.newaxis]
     tilts = np.column_stack([rng.uniform(-camera.tilt, camera.tilt, (count, 2)), np.zeros(count)])
@@ -179,8 +178,8 @@ def drive(
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
     """Move an arm smoothly from one configuration (K, n) to the next, standing at each.
 
-    Return stamps (M,) [ns] and joint values (M, n) at the joint rate, and the stamps
-    (K * poses_per_dwell,) [ns] of the poses, within the dwells.
+    Returns stamps (M,) [ns] and joint values (M, n) at the joint rate, and the stamps
+    (K * poses_per_dwell,) [ns] of the poses, within the stops.
     """
     period = cell.move + cell.dwell
     times = np.arange(0.0, period * len(configurations), 1.0 / cell.joint_rate)

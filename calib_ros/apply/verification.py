@@ -3,9 +3,9 @@
 """Is the corrected arm accurate enough? A verdict from new measurements.
 
 A controller corrected by a calibration C stands at joint values q where C predicts the wanted
-pose, so its error is measured - C(q); without the correction it would be measured - N(q). Both
-follow from the joint values that the controller reports. If the uncorrected program is known, the
-wanted pose is N(q_commanded), and a correction that did not arrive shows as well.
+pose, so its error is measured - C(q); uncorrected it would be measured - N(q). Both follow from
+the joint values that the controller reports. If the uncorrected program is known, the wanted pose
+is N(q_commanded), and a missing correction shows as well.
 
 The figure is the RMS position error over poses like those measured, with its limits
 (`confidence.py`):
@@ -15,9 +15,8 @@ The figure is the RMS position error over poses like those measured, with its li
     UNDECIDED   neither: more poses are needed
 
 On request, frames of the new measurements are fitted to both arms: the base if the device was
-moved, the tool if the target was changed or remounted. A frame that is not fitted must equal that
-of the calibration; otherwise its change counts as an error of the arm and says nothing about which
-of two calibrations is better.
+moved, the tool if the target was changed or remounted. The change of any other frame counts as an
+error of the arm.
 """
 
 from __future__ import annotations
@@ -52,10 +51,10 @@ from calib_ros.values import SAME
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None: 'no verdict'}
 NEEDED = 1 + len(TILTED)
-"""Configurations from which a verdict is given, those of a fitted frame not counted: the test
-poses of ISO 9283."""
+"""Configurations needed for a verdict, besides those for fitted frames: the test poses of ISO
+9283."""
 DECIDING = 10 * MOST_ENTRIES
-"""Configurations up to which it is said how many would decide."""
+"""Largest number of configurations reported as deciding."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +88,13 @@ class Verification(Shown):
     confidence : float
         Of each limit.
     group : (N,)
-        The configuration that each measurement belongs to; `configurations` counts them.
+        Configuration of each measurement; `configurations` counts them.
     rms, lower, upper : float
         RMS position error [m] over poses like these, and its limits.
     freedom : float
         Degrees of freedom of that error.
     verdict : 'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds' or 'does not hold'
-        'no verdict' where neither is known.
+        'no verdict' if neither is known.
     needed : int or None
         Number of configurations that would decide with the same RMS error, if undecided; None if
         even DECIDING would not.
@@ -104,12 +103,11 @@ class Verification(Shown):
     by_program : bool
         Whether the wanted poses are those of the uncorrected program.
     fitted : tuple of str
-        Frames that were fitted to the new measurements.
+        Frames fitted to the new measurements.
     holds : bool or None
-        Whether the error agrees with the one of the calibration (`Calibration.holds`), if known.
+        Whether the error agrees with that of the calibration (`Calibration.holds`), if known.
     reused : float
-        Share of the measurements to which the calibration was fitted (`Calibration.reused`).
-
+        Share of the measurements that the calibration was fitted to (`Calibration.reused`).
     """
 
     comparison: Comparison
@@ -130,12 +128,12 @@ class Verification(Shown):
 
     @property
     def configurations(self) -> int:
-        """Return how many different configurations were measured."""
+        """Return the number of different configurations."""
         return int(self.group.max()) + 1
 
     @property
     def each(self) -> tuple[Attained, ...]:
-        """Return what was attained at each configuration; nothing with more than LISTED."""
+        """Return the accuracy at each configuration; nothing with more than LISTED."""
         if self.configurations > LISTED:
             return ()
         both = (self.comparison.before.position, self.comparison.after.position)
@@ -169,8 +167,8 @@ def verify(
         Of the verdict.
     new_base, new_tool : bool
         The measuring device was moved; the target was replaced or remounted. Their frames are
-        fitted, and each absorbs the errors of as many configurations, of three freedoms each, as
-        it has freedoms.
+        fitted, and absorb the errors of as many configurations, of three freedoms each, as they
+        have freedoms.
     commanded : (M, n), optional
         Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
         poses there. Each measurement belongs to one of them (`commanded.py`).
@@ -180,9 +178,8 @@ def verify(
     Raises
     ------
     InputError
-        For too few poses, distances, a device or target that the calibration does not know, or
+        For too few poses, distances, a device or target unknown to the calibration, or
         measurements far from all commands.
-
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm.chain, sets, tolerance, confidence, fitted)
@@ -190,7 +187,7 @@ def verify(
     told(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
-    moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # as simulated without noise
+    moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # simulated without noise
     in_base = 6 // 3  # freedoms; the turn of a tool does not move the target
     lost = new_base * in_base + new_tool
     rms, count = _rms(moments, lost), len(moments)
@@ -200,7 +197,7 @@ def verify(
     holds = arm.holds(rms)
     decided = None if tolerance is None else _decided(tolerance, lower, upper, numbers)
     verdict, common = decided or (HOLDS[holds], None), 1.0
-    if not new_base and all(each.pixels is None for each in sets):  # which have no positions
+    if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, holds, arm.reused(sets))
@@ -213,7 +210,7 @@ def _compared(
     commanded: FloatArray | None,
     fitted: tuple[str, ...],
 ) -> tuple[Comparison, FloatArray]:
-    """Return the residuals, and those of position (N, 3) [m] without one motion that all share."""
+    """Return the residuals, and those of position (N, 3) [m] without one common motion."""
     before, after = arm.before, arm.chain
     wanted = sets
     if commanded is not None:
@@ -243,7 +240,7 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
 def _decided(
     tolerance: float, lower: FloatArray, upper: FloatArray, numbers: Index
 ) -> tuple[Verdict, int | None]:
-    """Return the verdict by the first limits, and which of the numbers of poses would decide."""
+    """Return the verdict by the first limits, and the least of the numbers that decides."""
     decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
     needed = int(numbers[decided[0]]) if decided.size else None
     if lower[0] <= tolerance < upper[0]:
@@ -258,7 +255,7 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
-    """Refuse invalid limits, and measurements outside what the calibration knows."""
+    """Refuse invalid limits, and measurements unknown to the calibration."""
     if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
         raise ConfigError(
             'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
@@ -281,10 +278,10 @@ def _check(
 
 
 def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str, ...]) -> Chain:
-    """Return the chain with base and tool frames, as asked, fitted to measured positions.
+    """Return the chain with the requested base and tool frames fitted to positions.
 
-    A new tool is turned as the orientations say, if any were measured. Where they hardly vary, the
-    tool keeps the translation that it had: the base takes up the same.
+    A new tool gets its rotation from the orientations, if measured. If these hardly vary, the tool
+    keeps its translation: the base absorbs the change.
     """
     if 'base' in fitted:
         chain = _rebased(chain, sets)
@@ -312,7 +309,7 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
 
 
 def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
-    """Return the chain with the base frames that bring it closest to measured positions."""
+    """Return the chain with base frames fitted to positions."""
     for base in dict.fromkeys(each.base for each in sets):
         mine = [each for each in sets if each.base == base]
         found = np.concatenate(

@@ -28,12 +28,12 @@ from calib_ros.shown import Shown
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey(Shown):
-    """Errors at `joints` (N, n) [rad or m] all over the workspace.
+    """Errors at `joints` (N, n) [rad or m] over the workspace.
 
     `positions` (N, 3) [m] are those of the target in the arm's base frame. The calibration removes
     `removed` (N,) [m] and `turned` (N,) [rad]; `sigma` (N,) [m] is the standard deviation of the
-    position by the uncertainty of the parameters, and `remaining` (N,) [m] what is expected to
-    remain by it and the residuals, both NaN if not known.
+    position by the parameters, `remaining` (N,) [m] the expected remaining error, both NaN if
+    unknown.
     """
 
     joints: FloatArray
@@ -92,7 +92,7 @@ class Spread:
 class Sector:
     """A part of the workspace in cylinder coordinates of the arm's base, and its RMS error [m].
 
-    `radius`, `height` [m] and `azimuth` [rad] are the limits, the latter from the x axis.
+    `radius`, `height` [m] and `azimuth` [rad] from the x axis are its limits.
     """
 
     words: str
@@ -108,11 +108,11 @@ RADII = ('close in', 'half way out', 'far out')
 HEIGHTS = ('low', 'at middle height', 'high')
 
 
-def regions(positions: FloatArray, errors: FloatArray, least: float = 0.005) -> tuple[Sector, ...]:
+def regions(positions: FloatArray, errors: FloatArray) -> tuple[Sector, ...]:
     """Return the regions of positions (N, 3) [m], that of the largest RMS error (N,) first.
 
-    Radius and height are parted so that each third holds as many poses; azimuth in quadrants.
-    Regions with less than the `least` share of all poses are left out.
+    Thirds of the poses by radius and height, and quadrants. Regions with less than 0.5 % of the
+    poses are omitted.
     """
     radius, height = np.hypot(positions[:, 0], positions[:, 1]), positions[:, 2]
     azimuth = np.arctan2(positions[:, 1], positions[:, 0])
@@ -125,7 +125,7 @@ def regions(positions: FloatArray, errors: FloatArray, least: float = 0.005) -> 
     found = []
     for ring, level, side in np.ndindex(3, 3, 4):
         inside = (rings == ring) & (levels == level) & (sides == side)
-        if inside.sum() < max(1, least * len(positions)):
+        if inside.sum() < max(1, 0.005 * len(positions)):
             continue
         middle = 0.5 * np.pi * side
         found.append(
@@ -146,8 +146,8 @@ def rms_map(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the RMS of errors (N,) over cells of two coordinates (N,).
 
-    Edges (cells + 1,) of both, and RMS (cells, cells), NaN where there is nothing; the first
-    coordinate counts rows.
+    Edges (cells + 1,) of both, and RMS (cells, cells), NaN if empty; the first coordinate counts
+    rows.
     """
     number, first_edges, second_edges = np.histogram2d(first, second, cells)
     edges = (first_edges, second_edges)
@@ -157,7 +157,7 @@ def rms_map(
 
 
 AROUND = np.array([each for each in np.ndindex(3, 3, 3) if each != (1, 1, 1)]) - 1
-"""To the neighbours on a grid."""
+"""Steps to the neighbours on a grid."""
 
 
 def task_of(poses: FloatArray) -> FloatArray:
@@ -169,12 +169,12 @@ def task_of(poses: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Placements(Shown):
-    """Where a task's frame may be placed, and the `errors` (M,) [m] expected there.
+    """Placements of a task's frame, and their expected `errors` (M,) [m].
 
     `positions` (M, 3) [m] are in the arm's base frame, `turns` (M,) [rad] about its vertical axis;
-    `joints` (M, K, n) [rad or m] are those of the task's poses. Errors are NaN where not all poses
+    `joints` (M, K, n) [rad or m] are those of the task's poses. Errors are NaN if not all poses
     are reached. `best` is the placement of least error, `centre` the one nearest to the centre of
-    all that are reached.
+    the reached ones.
     """
 
     positions: FloatArray
@@ -200,12 +200,12 @@ def place(
 ) -> Placements:
     """Find the placement of a task with the smallest expected error, mean or worst of its poses.
 
-    Poses (K, 4, 4) of the target are in the task's frame, whose axes are those of the base at
-    turn 0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, which
-    is commanded by a `model`, reaches. The grid has so many `cells` along each axis and `turns`
-    about the vertical, and is halved so many times about the best placement. The first pose is
-    solved from so many `starts` out of random joint values `drawn`. An arm with fewer than six
-    freedoms reaches a pose where its position is, and its orientation to 0.02 rad.
+    Poses (K, 4, 4) of the target are in the task's frame, whose axes are those of the base at turn
+    0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, commanded
+    by a `model`, reaches. The grid has `cells` along each axis and `turns` about the vertical, and
+    is halved `refinements` times about the best placement. The first pose is solved from the
+    nearest `starts` of `drawn` random joint values. An arm with fewer than six freedoms reaches a
+    pose at its position, with the orientation to 0.02 rad.
     """
     search = _Search(arm, task, aim, model, starts, drawn, told)
     corners = search.reach if region is None else region
@@ -241,7 +241,7 @@ def place(
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad].
 
-    All that the arm reaches is within the corners (2, 3) of its `reach` [m].
+    The arm reaches only points within the corners (2, 3) of its `reach` [m].
     """
 
     def __init__(
@@ -267,9 +267,9 @@ class _Search:
         self.reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
 
     def errors(self, placements: FloatArray, later: int) -> tuple[FloatArray, FloatArray]:
-        """Return the errors (M,) [m], NaN where out of reach, and the joint values (M, K, n).
+        """Return the errors (M,) [m], NaN if out of reach, and the joint values (M, K, n).
 
-        So many placements are tried `later`.
+        `later` placements follow.
         """
         turns = placements[:, 3:] * [0.0, 0.0, 1.0]
         frames = se3.transform(se3.exp_rotation(turns), placements[:, :3])
@@ -298,7 +298,7 @@ class _Search:
             joints[placement, branch, k] = found.joints
             start[reached] = found.joints
             near = found.converged
-            if not self._complete:  # as `compensate` tolerates it
+            if not self._complete:  # tolerated as by `compensate`
                 near = (found.position <= EXACT) & (found.orientation <= TURN_IN_PART)
             reached[placement, branch] = near
             self._solved += len(wanted)
@@ -308,13 +308,13 @@ class _Search:
 
 
 def _features(poses: FloatArray) -> FloatArray:
-    """Return (N, 12): what is near in position, and in orientation times LEVER, is near in it."""
+    """Return (N, 12) features: position, and orientation times LEVER."""
     columns = LEVER / np.sqrt(2.0) * poses[:, :3, :3].reshape(-1, 9)
     return np.concatenate([poses[:, :3, 3], columns], axis=1)
 
 
 def in_words(placements: Placements, aim: str, model: str) -> str:
-    """Return where to place a task, against the centre of all places."""
+    """Return where to place a task, compared with the centre of all places."""
     reached = placements.errors[~np.isnan(placements.errors)]
     best, centre = (
         f'{1e3 * placements.errors[k]:.4f} mm at '
