@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""plant.yaml: which robots there are, what was measured of each, and how it is identified."""
+"""plant.yaml: robots, their measurements and settings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from calib_ros.texts import parse_yaml, read_text
 from calib_ros.values import parse_like, parse_mapping, parse_number
 
 COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
-"""What a group says for its robots, and a robot for itself."""
+"""Keys of a group or a robot."""
 KEYS = {
     'the plant': ('groups', 'robots'),
     'a group': COMMON,
@@ -32,7 +32,7 @@ KEYS = {
 
 @dataclass(frozen=True)
 class Measured:
-    """Files by a glob pattern, local or at a URL; of tables one session, or what stands alone."""
+    """Files by a glob pattern, local or at a URL; of tables one session, if named."""
 
     files: str
     session: str = ''
@@ -47,11 +47,11 @@ class Robot:
     measured: tuple[Measured, ...]
     settings: Settings = field(default_factory=Settings)
     tolerance: float | None = None  # wanted RMS position error [mm]
-    largest_loss: float = EXCEPTION  # share of the messages of a bag that may be lost
-    since: datetime | None = None  # what was measured before is not compared with what is now
+    largest_loss: float = EXCEPTION  # share of a bag's messages that may be lost
+    since: datetime | None = None  # earlier measurements are not compared
 
     def compares(self, time: datetime) -> bool:
-        """Tell whether what was measured at a time is compared with what came later."""
+        """Tell whether measurements at a time are compared with later ones."""
         return self.since is None or time >= self.since
 
     @cached_property
@@ -66,7 +66,7 @@ def read_plant(path: Path) -> tuple[Robot, ...]:
 
 
 def parse_plant(text: str, folder: Path, where: str = 'plant file') -> tuple[Robot, ...]:
-    """Return the robots of the text of a plant file."""
+    """Return the robots in the text of a plant file."""
     content = parse_mapping(parse_yaml(text, where), KEYS['the plant'], where)
     groups = content.get('groups') or {}
     if not isinstance(groups, dict):
@@ -128,7 +128,7 @@ def _robot(
 
 
 def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> Chain:
-    """Return the chain of a robot; that of many is read once."""
+    """Return the chain of a robot; shared ones are read once."""
     if not isinstance(name, str) or not name:
         raise ConfigError(f'{where}: give chain, a file or a robot by its name, or a group')
     if name not in chains:
@@ -160,7 +160,7 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
 
 
 def _moment(value: object, where: str) -> datetime | None:
-    """Return a date of YAML as a time; without a zone it is in UTC."""
+    """Return a date of YAML as a time, in UTC without a zone."""
     if value is None:
         return None
     try:
@@ -169,6 +169,6 @@ def _moment(value: object, where: str) -> datetime | None:
     except (TypeError, ValueError):
         raise ConfigError(f'{where} must be a date, such as 2026-11-20, not {value!r}') from None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-    if moment - datetime.now(timezone.utc) > timedelta(days=1):  # tomorrow, in some time zones
+    if moment - datetime.now(timezone.utc) > timedelta(days=1):  # tomorrow in some time zones
         raise ConfigError(f'{where} is in the future, so no night would be compared: {value!s}')
     return moment

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A run over the fleet: what is new is identified by the workers and filed as each completes.
+"""A run over the fleet: workers identify new sources, and each result is filed at once.
 
-Workers are processes of this machine, or those of any cluster of dask. Each result is filed when
-it arrives, so whatever is lost, a worker, the scheduler or this process, costs the tasks that were
-running; the next run does the rest.
+Workers are local processes, or those of a dask cluster. If a worker, the scheduler or this process
+is lost, only running tasks are lost; the next run repeats them.
 """
 
 from __future__ import annotations
@@ -37,29 +36,29 @@ DASK = {
     'distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_': 2**28,
     'distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_': 2**25,
 }
-"""Settings of dask: it watches itself less, which takes more than its work, and workers keep what
-memory [bytes] they need again: to get it back costs a third of a large task's time."""
+"""Settings of dask: less self-monitoring, which costs more than its work; workers keep freed
+memory [bytes], because getting it back costs a third of a large task's time."""
 NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 class LostError(CalibrationError):
-    """The scheduler, or all of its workers, are gone; what is filed stays."""
+    """The scheduler or all workers are gone; filed results stay."""
 
 
 @dataclass(frozen=True)
 class Cluster:
     """Where the work is done."""
 
-    address: str = ''  # of a scheduler; without one processes here do it
-    workers: int = 0  # of these; 0: one a core
-    memory: str = '2GiB'  # that each of these may take, as dask has it
+    address: str = ''  # of a scheduler; empty for local processes
+    workers: int = 0  # local processes; 0: one per core
+    memory: str = '2GiB'  # limit of each, in dask's format
 
 
 @dataclass
 class Run:
-    """What a run did: results filed, time spent on them [s], and errors by robot and source.
+    """Results filed, time spent on them [s], and errors by robot and source.
 
-    `copies` are, by robot and source, sources whose content is filed as that of another one.
+    `copies` are, by robot and source, sources with the content of another one.
     """
 
     filed: int = 0
@@ -68,7 +67,7 @@ class Run:
     copies: dict[str, dict[str, str]] = field(default_factory=dict)
 
     def note(self, serial: str, source: str, error: str) -> None:
-        """Keep what is wrong with a source."""
+        """Record the error of a source."""
         self.errors.setdefault(serial, {})[source] = error
 
 
@@ -79,13 +78,13 @@ def run(
     out: Path | None = None,
     told: Told = nobody,
 ) -> Run:
-    """Identify all that is new, file it, and write the page of each robot's newest result.
+    """Identify all new sources, file results, and write the page of each robot's newest one.
 
-    The cluster is not used if there is nothing to do. `out` is the folder of the report; without
-    it there are no pages. A LostError is raised when the cluster can no longer be reached.
+    The cluster is not used if there is nothing to do. `out` is the folder of the report, None for
+    no pages. Raises LostError if the cluster can no longer be reached.
     """
     found = Run()
-    history.serials()  # one that cannot be read at all is an error of the run, not of each robot
+    history.serials()  # fail here if it cannot be read at all
     with ExitStack() as stack:
         client = None
         for plan in (_new, _without_page):
@@ -103,34 +102,34 @@ def run(
 
 
 def page_path(out: Path, row: Row) -> Path:
-    """Return where the page of a row is."""
+    """Return the path of a row's page."""
     return out / 'robots' / quote(row.serial, safe='') / f'{row.key}.html'
 
 
 def results(robot: Robot, rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the identifications among rows of a robot that are by its present settings.
+    """Return the identifications of a robot with its present settings.
 
-    There is one for each content, and for each source and time, which a corrected file shares with
-    the wrong one: that of this version, or else the one filed last.
+    One for each content, and for each source and time, which a corrected file shares with the
+    wrong one: that of this version, or else the last filed.
     """
     hashed = robot.settings_hash
     own = [row for row in rows if row.kind == 'identify' and row.settings == hashed]
-    return _once(_once(own, lambda row: row.inputs), lambda row: (row.source, row.time))
+    return _unique(_unique(own, lambda row: row.inputs), lambda row: (row.source, row.time))
 
 
 def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
-    """Return the verifications among rows that can be compared.
+    """Return the comparable verifications.
 
-    There is one for the same poses and calibration, whatever the tolerance or the version.
+    One for each set of poses and calibration, whatever the tolerance or version.
     """
     own = [row for row in rows if row.kind == 'verify' and row.rms_mm and row.rms_freedom]
-    return _once(own, lambda row: (row.inputs, row.chain))
+    return _unique(own, lambda row: (row.inputs, row.chain))
 
 
-def _once(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
-    """Return rows in the order of their times, one of those that are `of` the same.
+def _unique(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
+    """Return rows ordered by time, one for each key `of`.
 
-    What was filed before its time was measured when it was filed.
+    Rows filed before their stamps count as measured when filed.
     """
     dated = [replace(row, time=row.filed) if too_late(row) else row for row in rows]
     newest = sorted(dated, key=lambda row: (row.software == calib_ros.__version__, row.filed))
@@ -139,12 +138,12 @@ def _once(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
 
 
 def too_late(row: Row) -> bool:
-    """Tell whether a result was filed before its stamps, in any time zone: by a wrong clock."""
+    """Tell whether a result was filed before its stamps, in any time zone: a wrong clock."""
     return row.time - row.filed > timedelta(days=1)
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
-    """Return the sources of a robot whose results are not filed; the last one has a page."""
+    """Return the sources of a robot without a filed result; the last one gets a page."""
     try:
         rows = results(robot, history.rows(robot.serial))
     except CalibrationError as err:
@@ -158,19 +157,19 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
     names = {each.name for each in there}
-    known = {row.inputs: row.source if row.source in names else '' for row in rows}  # or moved
+    known = {row.inputs: row.source if row.source in names else '' for row in rows}
     last = max(there, key=lambda each: (each.modified or NEVER, each.name))
     tasks = []
     for source in there:
         if (source.name, source.fingerprint) not in done:
             own = {inputs: name for inputs, name in known.items() if name == source.name}
             page = out is not None and source == last
-            tasks.append(Task(robot, source, own or known, page))  # touched, or perhaps a copy
+            tasks.append(Task(robot, source, own or known, page))  # touched or copied
     return tasks
 
 
 def _without_page(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
-    """Return the source of a robot's newest result if that has no page yet."""
+    """Return the source of a robot's newest result if it has no page yet."""
     names = found.errors.get(robot.serial, {})
     if out is None or '' in names:
         return []
@@ -182,7 +181,7 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
 
 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
-    """File a result, and write its page in place of the earlier ones."""
+    """File a result, and replace the page."""
     found.seconds += outcome.seconds
     row, serial, source, first = outcome.row, task.robot.serial, task.source.name, outcome.known
     if outcome.error:
@@ -210,7 +209,7 @@ def _write_page(path: Path, page: str) -> None:
 
 @contextmanager
 def _client(cluster: Cluster) -> Iterator[Any]:
-    """Yield a client of the workers; those of this machine end with it."""
+    """Yield a client of the workers; local ones end with it."""
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -251,9 +250,9 @@ def _version() -> str:
 def _done(
     client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks with what became of them, as they are done.
+    """Yield tasks with their outcomes, as completed.
 
-    Up to four make a piece: much to dask's 4 ms for it, little to lose.
+    Up to four make a piece: large compared with dask's overhead of 4 ms, small to lose.
     """
     from distributed import as_completed
 
@@ -271,7 +270,7 @@ def _done(
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are saved; run again')
         done = running.pop(future.key)
-        if future.status == 'error' and len(done) > 1:  # which of them ends a worker?
+        if future.status == 'error' and len(done) > 1:  # find the one that kills a worker
             completed.update(submitted([(task,) for task in done]))
             continue
         if future.status == 'error':

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How the robots of a plant stand after a run, the worst first: a page, and for Prometheus."""
+"""The state of the robots of a plant after a run, worst first: a page, and Prometheus metrics."""
 
 from __future__ import annotations
 
@@ -32,20 +32,16 @@ STATES: Mapping[str, tuple[State, str]] = {
     'unreadable': ('open', 'some of its measurements could not be used'),
     'fine': ('good', 'nothing to do'),
 }
-"""From the worst to the best, with their looks and meaning: what calls for a look at the arm, then
-at its calibration, then at files."""
+"""States from worst to best, with their looks and meanings."""
 MOST_NIGHTS = MOST_ENTRIES // 10
-"""Nights of a robot that the page shows; the history lists all."""
+"""Nights of a robot on the page; the history lists all."""
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
-"""How Prometheus takes what would end a label."""
+"""Escapes in Prometheus labels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """A robot, its newest result, changes, unread sources, its verifications and their `drift`.
-
-    `remarks` tell what else there is to know, which is neither good nor bad.
-    """
+    """A robot, its newest result, changes, unread sources, verifications and their `drift`."""
 
     robot: Robot
     last: Row | None
@@ -57,13 +53,13 @@ class Standing:
 
     @classmethod
     def of(cls, robot: Robot, history: History, done: Run, years: float) -> Standing:
-        """Return how a robot stands; a false alarm of each kind comes once in so many years."""
+        """Return the state of a robot; each kind of false alarm occurs once in so many years."""
         try:
             return cls._of(robot, history.rows(robot.serial), done, years)
-        except (CalibrationError, ValueError, KeyError) as err:  # rows of others, or damaged ones
+        except (CalibrationError, ValueError, KeyError) as err:  # foreign or damaged rows
             found = cls._of(robot, (), done, years)
-            told = {**found.errors, '': f'its rows in the history cannot be compared: {err}'}
-            return replace(found, errors=told)
+            errors = {**found.errors, '': f'its rows in the history cannot be compared: {err}'}
+            return replace(found, errors=errors)
 
     @classmethod
     def _of(cls, robot: Robot, rows: tuple[Row, ...], done: Run, years: float) -> Standing:
@@ -82,7 +78,7 @@ class Standing:
 
     @property
     def states(self) -> tuple[str, ...]:
-        """Return all that is to be said of it, the worst first."""
+        """Return all states that apply, worst first."""
         found = {
             'changed': bool(self.watched.changes),
             'worse': bool(self.drift.alarms),
@@ -94,12 +90,12 @@ class Standing:
 
     @property
     def state(self) -> str:
-        """Return the worst that is to be said of it."""
+        """Return the worst state."""
         return self.states[0]
 
     @property
     def alarms(self) -> tuple[str, ...]:
-        """Return what has changed and since when, in words."""
+        """Return what has changed and since when."""
         grown = (
             f'{self.verified[first].time:%Y-%m-%d}: the errors of its verifications have grown'
             for first in self.drift.since
@@ -108,7 +104,7 @@ class Standing:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Return what calls for a look at the robot or its calibration, in words."""
+        """Return reasons to look at the robot or its calibration."""
         found = list(self.alarms)
         if self.last is not None and not self.last.accepted:
             found.append(f'not accepted: {"; ".join(self.last.reasons)}')
@@ -119,14 +115,14 @@ class Standing:
 
     @property
     def share(self) -> float:
-        """Return its error as a share of the tolerance; 0 if either is not known."""
+        """Return the error as a share of the tolerance; 0 if unknown."""
         if self.last is None or self.last.rms_mm is None or self.robot.tolerance is None:
             return 0.0
         return self.last.rms_mm / self.robot.tolerance
 
 
 def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
-    """Yield in words how many nights in the history are not by the settings of today."""
+    """Yield the number of nights in the history with other settings."""
     others = (row for row in rows if row.accepted and row.settings != robot.settings_hash)
     nights = {row.inputs for row in others if row.source and robot.compares(row.time)}
     if number := len(nights.difference(row.inputs for row in own)):
@@ -137,7 +133,7 @@ def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[s
 
 
 def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
-    """Yield in words which nights cannot have been measured when their stamps say."""
+    """Yield nights with impossible stamps."""
     if ahead := [row for row in rows if too_late(row)]:
         row = max(ahead, key=lambda each: each.filed)
         yield (
@@ -158,7 +154,7 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
 def standings(
     robots: Sequence[Robot], history: History, done: Run, years: float
 ) -> tuple[Standing, ...]:
-    """Return how robots stand, the worst first."""
+    """Return the states of robots, worst first."""
     found = [Standing.of(robot, history, done, years) for robot in robots]
     order = list(STATES)
 
@@ -170,13 +166,13 @@ def standings(
 
 
 def counts(found: Sequence[Standing]) -> dict[str, int]:
-    """Return how many robots are in each state."""
+    """Return the number of robots in each state."""
     number = Counter(each.state for each in found)
     return {state: number[state] for state in STATES}
 
 
 def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
-    """Return figures in the text format of Prometheus; `ended` is the time of the run [s]."""
+    """Return metrics in the text format of Prometheus; `ended` is the time of the run [s]."""
 
     def by_robot(value: Callable[[Standing, Row], float | None]) -> dict[str, float | None]:
         labels = (each.robot.serial.translate(ESCAPES) for each in found)
@@ -212,10 +208,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
 
 
 def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
-    """Write the page and the script that it shares with those of the robots.
-
-    Returns what is missing to write it, if anything.
-    """
+    """Write the page and the script shared with robots' pages; return what is missing."""
     script, page = plotly_script(), page_of(out, found, done)
     if script is None or page is None:
         return MISSING
@@ -227,7 +220,7 @@ def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
 
 
 def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
-    """Return the page; None where jinja2 is not installed."""
+    """Return the page, or None without jinja2."""
     shown = found[:MOST_ENTRIES]  # the worst
     return filled(
         'fleet.html.jinja',
@@ -255,7 +248,7 @@ def _link(out: Path, standing: Standing) -> str:
 
 
 def _chart(standing: Standing) -> dict[str, Any]:
-    """Return the nights of a robot: errors, and how strongly each joint seems changed."""
+    """Return the nights of a robot: errors, and the evidence for a change of each joint."""
 
     def times(of: Iterable[Row | Change]) -> list[str]:
         return [each.time.isoformat(timespec='seconds') for each in of]

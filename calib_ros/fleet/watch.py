@@ -2,31 +2,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Did the arm change between nights, when, and which joint?
 
-Night k brings the arm's parameters x_k with covariance C_k; base and tool frames are left out, the
-device may stand elsewhere every night. For each of the last m nights (LAGS) the mean of these m is
-compared with the mean of the nights before, both weighted by information:
+Night k brings the arm's parameters x_k with covariance C_k, without base and tool, because the
+device may be moved every night. For each of the last m nights (LAGS) the mean of these m is
+compared with the mean of the earlier nights, both weighted by information:
 
     d = x_after - x_before,   S = s^2 (C_after + C_before),   u = S^-1 d,   W = S^-1
 
-An arm is bumped at one joint or two, not at all of them. That j alone, a joint or two, changed by
+A bump changes one joint or two. That j alone, a joint or two, changed by
 
     d_j = W_jj^-1 u_j,   covariance W_jj^-1,
 
-explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution where nothing
-changed: as many degrees of freedom as j has parameters, over those of the noise, or of s^2 if it
-has fewer: those of the nights before and of what j leaves. s^2 is by how much the nights so far
-scatter more than their covariances tell, where they clearly do, or by how much more j leaves of
-the difference: what warms up, what the model lacks. `changes.py` names what changed, and the
-comparison starts again.
+explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution if nothing changed:
+as many degrees of freedom as j has parameters, over those of the noise, or of s^2 if fewer: those
+of the earlier nights and of the rest. s^2 is the scatter of the nights beyond their covariances
+(warming up, model error), or of the rest beside j, where clearly larger than 1. `changes.py` names
+what changed, and the comparison restarts.
 
-Nights are compared by the parameters that they have in common. An effect that only some nights
-fitted is taken at its nominal value in the others too: with the information matrix I of all
-parameters of the arm, a fit of the common ones c alone has I_cc and (I x)_c. That does not go for
-DH parameters, which are far from nominal: nights that determine other ones are compared among
-themselves only.
+Nights are compared by their common parameters. An effect that only some nights fitted is nominal
+in the others too: with the information matrix I of all parameters of the arm, a fit of the common
+ones c alone has I_cc and (I x)_c. That does not hold for DH parameters, which are far from
+nominal: nights that determine other ones are only compared among themselves.
 
-Neither warmth nor model makes nights scatter CLEARLY more all at once. Where every joint and pair
-leaves more, several changed: a repaired arm, or measurements of another robot.
+Neither warmth nor model error suddenly makes nights scatter CLEARLY more. If every joint and pair
+leaves more, several changed: a repaired arm, or another robot.
 """
 
 from __future__ import annotations
@@ -56,8 +54,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some
 
 LAGS = tuple(2**k for k in range(TELLING.bit_length()))
-"""Nights, 1 to TELLING, in which a change is sought: a large one shows at once, a small one after
-some."""
+"""Nights, 1 to TELLING, in which a change is sought: large ones show at once, small ones later."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +62,11 @@ class Change:
     """A change of an arm."""
 
     time: datetime  # of the first night after it
-    seen: datetime  # of the night in which it was found
-    reasons: tuple[Explanation, ...]  # the likeliest first; none where two or more joints did
+    seen: datetime  # of the night of its detection
+    reasons: tuple[Explanation, ...]  # most likely first; none if two or more joints changed
     pair: tuple[str, ...] = ()  # the joints if two changed
 
-    @property
-    def joint(self) -> str:
-        """Return the joint that changed, most likely; empty where two or more did."""
-        return self.reasons[0].owner if self.reasons else ''
-
     def __str__(self) -> str:
-        """Return in words what changed."""
         if self.pair:
             return f'two joints changed: {" and ".join(self.pair)}: was it bumped?'
         if not self.reasons:
@@ -87,7 +78,7 @@ class Change:
 
 
 class Night(NamedTuple):
-    """A night, and how strongly each joint seems changed: as that of a normal variable."""
+    """A night, and the evidence for a change of each joint, as a normal variable."""
 
     row: Row
     strength: dict[str, float]
@@ -95,7 +86,7 @@ class Night(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """What the nights of a robot tell, and in words what of them is not compared."""
+    """The nights of a robot, its changes, and remarks on what is not compared."""
 
     nights: tuple[Night, ...] = ()
     changes: tuple[Change, ...] = ()
@@ -103,7 +94,7 @@ class Watched:
 
 
 _Fitted: TypeAlias = tuple[Row, tuple[Parameter, ...]]
-"""A night, and the parameters of the arm that it fitted."""
+"""A night, and the arm parameters it fitted."""
 
 
 def watch(rows: Sequence[Row], years: float) -> Watched:
@@ -137,7 +128,7 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
 
 
 def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
-    """Return in words what some nights determine and the newest does not, and the other way."""
+    """Return how the DH parameters of some nights differ from the newest."""
     differences = (
         ('they alone determine', names - newest),
         ('it alone determines', newest - names),
@@ -186,9 +177,9 @@ def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
 def _cause(
     tests: _Tests, k: int, level: float, row: Row
 ) -> tuple[int, tuple[Explanation, ...], tuple[str, ...]]:
-    """Return the lag of an alarm in night k, and what changed: one joint, or two by their names.
+    """Return the lag of an alarm in night k, and what changed: one joint, or two by name.
 
-    Neither where several did.
+    Neither if several did.
     """
     if tests.several[:, k].min() < level:
         return int(tests.several[:, k].argmin()), (), ()
@@ -202,12 +193,12 @@ def _cause(
 
 
 class _Tests(NamedTuple):
-    """Tests of L lags at K nights for P parameters, by J joints and pairs of these, `groups`."""
+    """Tests of L lags at K nights for P parameters, by J joints and pairs of these (`groups`)."""
 
     names: tuple[Parameter, ...]
     groups: tuple[tuple[str, ...], ...]
     freedom: FloatArray  # (K,)
-    chances: FloatArray  # (L, K, J), 1 where there is no night before
+    chances: FloatArray  # (L, K, J), 1 without earlier nights
     several: FloatArray  # (L, K), that no joint or pair alone changed
     pull: FloatArray  # (L, K, P), u
     weight: FloatArray  # (L, K, P, P), W
@@ -218,7 +209,7 @@ class _Tests(NamedTuple):
 
 
 def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
-    """Return the tests of all nights against those before, by parameters that each fitted."""
+    """Return the tests of all nights against earlier ones, by common parameters."""
     information, pulls = _information(fitted, names)
     count, size = pulls.shape
     groups = _groups(names)
@@ -266,7 +257,7 @@ def _information(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the information (K, P, P) of nights about parameters, and that times values (K, P).
 
-    Others of the arm are taken at their nominal values, base and tool are free.
+    Other arm parameters are nominal, base and tool free.
     """
     information, pulls = [], []
     for row, arm in fitted:
@@ -279,9 +270,9 @@ def _information(
 
 
 def _groups(names: Sequence[Parameter]) -> tuple[tuple[str, ...], ...]:
-    """Return what may change at once: joints, then pairs with half of all parameters at most.
+    """Return what may change at once: joints, then pairs with at most half of all parameters.
 
-    What is left by more than that tells little of how nights scatter.
+    The rest must show how nights scatter.
     """
     known = Counter(name.owner for name in names)
     pairs = combinations(known, 2)
@@ -290,10 +281,10 @@ def _groups(names: Sequence[Parameter]) -> tuple[tuple[str, ...], ...]:
 
 
 def _usual(scatter: FloatArray, size: int) -> float:
-    """Return how much nights scatter, by their covariances; 1 where these may be right."""
+    """Return the scatter of nights relative to their covariances; 1 if these may be right."""
     return float(_clearly(np.median(scatter), size * scatter.size)) if scatter.size else 1.0
 
 
 def _clearly(ratio: FloatArray | np.floating[Any], freedom: int) -> FloatArray:
-    """Return what is clearly more than chance makes of 1 with so many degrees of freedom, or 1."""
+    """Return ratios that clearly exceed chance with so many degrees of freedom, else 1."""
     return np.asarray(np.where(ratio > 1.0 + 2.0 * np.sqrt(2.0 / freedom), ratio, 1.0))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""One piece of a fleet's work, as a worker does it: a bag or a table is fetched and identified."""
+"""A task of a fleet run: a bag or a table is fetched and identified."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from calib_ros.report.words import configuration_yaml
 
 DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
 SUMS = ('ETag', 'etag', 'CRC')
-"""What file systems call dates and sums by which a change of content shows."""
+"""Names of checksums in file systems."""
 PLOTLY = 'plotly.min.js'
-"""The script that all pages of a report share."""
+"""The script shared by all pages of a report."""
 
 
 class Source(NamedTuple):
-    """A bag or table, a session, and what changes with its content; empty where nothing tells."""
+    """A bag or table, a session, and a fingerprint of its content, if any."""
 
     url: str
     session: str = ''
@@ -47,15 +47,15 @@ class Source(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Return what it is known by."""
+        """Return the name of the source."""
         return f'{self.url}#{self.session}' if self.session else self.url
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A source to identify, with a `page` if wanted; not if its content is `known`.
+    """A source to identify, with a `page` if wanted, unless its content is `known`.
 
-    That are hashes of contents, each with the source that it is filed of, if that is still there.
+    `known` maps hashes of contents to the source filed with them, if it still exists.
     """
 
     robot: Robot
@@ -65,7 +65,7 @@ class Task:
 
 
 class Outcome(NamedTuple):
-    """What became of a task: a row, what is wrong with the source, or whose content it has."""
+    """The outcome of a task: a row, an error, or the source with the same content."""
 
     row: Row | None = None
     error: str = ''
@@ -75,7 +75,7 @@ class Outcome(NamedTuple):
 
 
 def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
-    """Return what there is of a robot, by name, and what is wrong with patterns, by pattern."""
+    """Return the sources of a robot, and errors by pattern."""
     found, wrong = [], {}
     for each in robot.measured:
         try:
@@ -84,7 +84,7 @@ def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
         except CalibrationError as err:
             wrong[each.files] = str(err)
             continue
-        except Exception as err:  # file systems fail in ways of their own
+        except Exception as err:  # file systems have their own errors
             wrong[each.files] = f'{each.files} cannot be listed: {err}'
             continue
         if not matched:
@@ -98,11 +98,11 @@ def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
 
 
 def work(task: Task) -> Outcome:
-    """Do a task; what goes wrong is told of its source and harms nothing else."""
+    """Do a task; an error is that of its source and harms nothing else."""
     begin = time.monotonic()
     try:
         outcome = _outcome(task)
-    except Exception as err:  # a fault of ours, or of a file system: it costs this source only
+    except Exception as err:  # costs only this source
         kind = '' if isinstance(err, CalibrationError | OSError) else f'{type(err).__name__}: '
         outcome = Outcome(error=shortened(f'{kind}{err}'))
     return outcome._replace(seconds=time.monotonic() - begin)
@@ -116,7 +116,7 @@ def _outcome(task: Task) -> Outcome:
         if content in task.known:
             return Outcome(known=task.known[content])
         chain, settings = robot.chain, robot.settings
-        if path.suffix.lower() in TABLES:  # anything else is a bag, or a folder that is one
+        if path.suffix.lower() in TABLES:  # anything else is a bag
             sessions = (source.session,) if source.session else ()
             loaded = of_table(table(path, chain, settings, sessions), chain, settings)
         else:
@@ -138,7 +138,7 @@ def _outcome(task: Task) -> Outcome:
 
 @contextmanager
 def fetched(url: str) -> Iterator[Path]:
-    """Yield the path of a local file or folder, or of a copy of what is elsewhere."""
+    """Yield a local path, or that of a copy of a remote file or folder."""
     files, path = _file_system(url)
     if is_local(files):
         yield Path(path)
@@ -160,13 +160,13 @@ def _file_system(url: str) -> tuple[Any, str]:
 
 
 def _is_folder(files: Any, path: str) -> bool:
-    """Tell whether a path is a folder; a name with an ending of a file is not asked for."""
+    """Tell whether a path is a folder; names with a file suffix are not asked for."""
     name = PurePosixPath(path).name.lower()
     return not name.endswith((*TABLES, '.mcap', '.db3', '.zstd')) and bool(files.isdir(path))
 
 
 def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime | None]:
-    """Return the fingerprint of a file or folder, and when it was changed last."""
+    """Return the fingerprint of a file or folder, and its time of change."""
     parts = files.find(path, detail=True) if _is_folder(files, path) else {path: info}
     marks, times = [], []
     for name, part in sorted(parts.items()):
