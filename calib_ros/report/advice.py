@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Why a calibration was refused, for readers without a background in calibration.
 
-Each rule of acceptance has a heading, what it means, and what to do in the order in which to try
-it: `templates/refusals.md`, which is a page of the documentation as well.
+Each rule of acceptance has a heading, its meaning, and what to do in order:
+`templates/refusals.md`, which is also a page of the documentation.
 """
 
 from __future__ import annotations
@@ -29,20 +29,19 @@ class Advice:
 
     heading: str
     meaning: str
-    steps: tuple[str, ...]  # what to do; none where it follows from another refusal
-    refusal: str = ''  # in the words of its rule
-    again: str = AGAIN  # on what to identify next
+    steps: tuple[str, ...]  # what to do; none if it follows from another refusal
+    refusal: str = ''  # the sentence of its rule
+    again: str = AGAIN  # what to identify next
 
 
 ENOUGH = 25
-"""Different poses that are worth judging, and that `calib_ros plan` chooses unless told: a
-convention."""
+"""Poses worth judging, and the default of `calib_ros plan`: a convention."""
 SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'
 
 
 @cache
 def rules() -> Mapping[Rule, Advice]:
-    """Return the advice on each rule: the sections of `templates/refusals.md`."""
+    """Return the advice on each rule, from the sections of `templates/refusals.md`."""
     file = resources.files('calib_ros.report') / 'templates' / 'refusals.md'
     found = {}
     for section in file.read_text(encoding='utf-8').split('\n## ')[1:]:
@@ -65,17 +64,17 @@ GOOD_ARM = Advice(
     'device can see.',
     ('To look for smaller errors, measure with a more accurate device.',),
 )
-"""In place of `Rule.GAIN`, where the error before is no larger than the noise."""
+"""Instead of `Rule.GAIN`, if the error before is within the noise."""
 GOOD_HERE = replace(
     GOOD_ARM,
     meaning='At these poses the error is within the stated noise of the measuring device. '
     'Elsewhere it may be larger: these poses tell little about the rest of the joint range.',
     steps=('Add poses all over the workspace, each joint moved through most of its range.',),
 )
-"""The same where the poses do not tell the error elsewhere."""
+"""The same if the poses do not determine the error elsewhere."""
 
 WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
-"""Where the description does not fit the arm."""
+"""Rules that fail if the description does not fit the arm."""
 WRONG = {*WRONG_ARM, Rule.CONVERGENCE, Rule.DRIFT, Rule.GAIN}
 WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
 """Consequences of a description that does not fit."""
@@ -86,12 +85,12 @@ BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
 """Consequences of each cause; the first cause present counts."""
 
 FAR = 1.0 / EXCEPTION
-"""Ratio of what is left to the noise stated that an arm's own errors rarely reach."""
+"""Ratio of residuals to stated noise that an arm's own errors rarely reach."""
 COARSE = (
     'The measurements scatter {:.0f} times as much as stated (sigma_position): check that target '
     'and device sit firmly, the arm stood still, and the clocks agree.'
 )
-"""What to check first where the measurements are far too coarse."""
+"""First check if the measurements are far too coarse."""
 FEW = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
     'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
@@ -101,14 +100,14 @@ LEFT = (
 
 @dataclass(frozen=True)
 class Situation:
-    """The measurement: different poses, residual over stated noise, that noise [m]."""
+    """Different poses, residual over stated noise, and that noise [m]."""
 
     poses: int = ENOUGH
     left: float = 1.0
     sigma: float | None = None
 
     def said_of(self, one: Advice) -> Advice:
-        """Return the advice on a correction without a proven gain, as is right here."""
+        """Return the advice on an unproven correction that suits the situation."""
         if self.left >= FAR:
             steps = (each for each in one.steps if 'stood still' not in each)
             return replace(one, steps=(COARSE.format(self.left), *steps))
@@ -122,7 +121,7 @@ class Situation:
 
 
 def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Advice, ...]:
-    """Return the refusals in plain words, grouped by rule, and last their consequences."""
+    """Return the refusals in plain words, grouped by rule, consequences last."""
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))

@@ -57,13 +57,12 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     ),
     'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
-"""Verdicts, and what to do next."""
 
 
 def workspace_report(
     arm: Calibration, found: Survey, origin: Origin, placed: Placements | None = None
 ) -> Report:
-    """Return the report of a survey, and of the placements of a task if there are any."""
+    """Return the report of a survey, and of the placements of a task, if any."""
     spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
     first, last = spreads[0][1], spreads[-1][1]
     text = [f'The calibration removes {first.rms:.3f} mm RMS, {first.max:.3f} mm maximum.']
@@ -92,15 +91,15 @@ def workspace_report(
     )
 
 
-def _worst(found: Survey, most: int = 6) -> Iterator[Section]:
+def _worst(found: Survey) -> Iterator[Section]:
     titles = ('Where the calibration removes most', 'Where it is most uncertain')
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
-        shown = sectors if len(sectors) <= most else (*sectors[:most], sectors[-1])
+        shown = sectors if len(sectors) <= 6 else (*sectors[:6], sectors[-1])
         yield Section(
             f'regions-{label.split()[0]}',
             title,
-            (f'The {most} regions with the largest errors, and the one with the smallest.',),
+            ('The 6 regions with the largest errors, and the one with the smallest.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
             rows=tuple(map(_region, shown)),
         )
@@ -199,9 +198,9 @@ def _visit(chain: Chain, joints: FloatArray) -> Section:
     return Section('visit', 'Where the target will be', (about,), figures.space(path), height=560)
 
 
-def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
+def _listed(chain: Chain, joints: FloatArray) -> Section:
     show = [unit_of(joint) for joint in chain.joints]
-    more = f' The first {most} are shown.' if len(joints) > most else ''
+    more = ' The first 200 are shown.' if len(joints) > 200 else ''
     return Section(
         'poses',
         'The poses',
@@ -209,7 +208,7 @@ def _listed(chain: Chain, joints: FloatArray, most: int = 200) -> Section:
         head=('', *(f'{j.name} [{s[1]}]' for j, s in zip(chain.joints, show, strict=True))),
         rows=tuple(
             (str(k + 1), *(f'{s[0] * q:.{s[2]}f}' for s, q in zip(show, row, strict=True)))
-            for k, row in enumerate(joints[:most].tolist())
+            for k, row in enumerate(joints[:200].tolist())
         ),
     )
 

@@ -27,23 +27,23 @@ DOTTED = {'color': LIMIT, 'dash': 'dot'}
 QUANTILES = 2 * SOME_POSES
 """Points of a curve for any number of poses."""
 REVERSED = {'autorange': 'reversed', 'automargin': True}
-"""A vertical axis with the first row on top."""
+"""Vertical axis with the first row on top."""
 ROUND = ('eccentricity', 'gear')
-"""Groups of effects that go round with a joint."""
+"""Periodic groups of effects."""
 
 
 def label(name: str) -> str:
-    """Return a name of others for plotly, which reads some tags."""
+    """Return a foreign name without the tags that plotly interprets."""
     return one_line(name).replace('&', '&amp;').replace('<', '&lt;')
 
 
 def axis(title: str, **more: Any) -> Figure:
-    """Return an axis, or a scale of colours, with its title."""
+    """Return an axis, or a colour scale, with its title."""
     return {'title': {'text': title}, **more}
 
 
 def scale_of(title: str, colours: str = 'Viridis', **more: Any) -> Figure:
-    """Return how values are shown as colours, with the scale beside the figure."""
+    """Return a colour scale beside the figure."""
     bar = axis(title, thickness=12)
     return {'colorscale': colours, 'reversescale': True, 'colorbar': bar, **more}
 
@@ -63,7 +63,7 @@ def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> F
 
 
 def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figure:
-    """Return the share of poses, or other `things`, with at most a given position error (N,)."""
+    """Return the share of poses, or other `things`, within a position error (N,)."""
     share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
     data = [
         _curve('lines', name, np.quantile(errors, share), 100.0 * share, line=line)
@@ -75,7 +75,7 @@ def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figur
 
 
 def against_noise(poses: Poses) -> Figure:
-    """Return the quantiles of residuals in stated sigmas against those of a normal law."""
+    """Return the quantiles of residuals in stated sigmas against normal quantiles."""
     chosen = poses.select(poses.judged)
     data: list[Figure] = []
     for name, errors, column, colour, symbol in (
@@ -98,7 +98,7 @@ def against_noise(poses: Poses) -> Figure:
 
 
 def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> Figure | None:
-    """Return offsets with 95 % intervals [mm or mrad], and a `limit` [m or rad] if it is near."""
+    """Return offsets with 95 % intervals [mm or mrad], and a `limit` [m or rad] if near."""
     found = [p for p in parameters if p.std is not None and p.name.is_length == lengths]
     if not found:
         return None
@@ -147,7 +147,7 @@ def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
 def coverage(
     chain: Chain, joints: FloatArray, parts: int = 36
 ) -> tuple[Figure, tuple[tuple[str, ...], ...]]:
-    """Return how often joint values (N, n) lie in each part of a joint's range, and a table."""
+    """Return how often joint values (N, n) fall in each part of a joint's range, and a table."""
     counts = np.zeros((len(chain.joints), parts))
     labels, rows = [], []
     for k, joint in enumerate(chain.joints):
@@ -169,15 +169,15 @@ def coverage(
     return {'data': [mesh], 'layout': layout}, tuple(rows)
 
 
-def drives(chain: Chain, joints: FloatArray, parts: int = 720) -> Figure | None:
-    """Return what the drives add to joint values (N, n), over their range; None if nothing."""
+def drives(chain: Chain, joints: FloatArray) -> Figure | None:
+    """Return the errors of drives over the range of joint values (N, n); None without any."""
     waves = [each for each in chain.effects if effects.group_of(each[0]) in ROUND]
     owners = np.array([Parameter(name).owner for name, _ in waves])
     driven = [k for k, name in enumerate(chain.joint_names) if name in owners]
     if not driven:
         return None
     low, high = joints[:, driven].min(axis=0), joints[:, driven].max(axis=0)
-    q = np.linspace(low.min(), high.max(), parts)
+    q = np.linspace(low.min(), high.max(), 720)
     phi = effects.basis(chain, [name for name, _ in waves], np.tile(q, (len(joints.T), 1)), None)
     added = 1e3 * np.array([value for _, value in waves])[:, np.newaxis] * phi
     names = [chain.joint_names[k] for k in driven]
@@ -215,7 +215,7 @@ def error_map(survey: Survey) -> Figure:
 
 
 def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | None) -> Figure:
-    """Return the errors (K,) [m] that 1, 2, ... K planned poses promise, and random ones."""
+    """Return the predicted errors (K,) [m] of 1, 2, ... K planned poses, and of random ones."""
     count = np.arange(1.0, len(accuracy) + 1)
     data = []
     for name, errors, line in (('planned', accuracy, SOLID), ('at random', at_random, DASHED)):
@@ -238,7 +238,7 @@ def in_space(positions: FloatArray, name: str, **more: Any) -> Figure:
 
 
 def space(*data: Figure) -> Figure:
-    """Return a figure in space, all axes in one scale."""
+    """Return a figure in space with equal scales."""
     axes = {f'{name}axis': axis(f'{name} [m]') for name in 'xyz'}
     margin = {'l': 0, 'r': 0, 't': 30, 'b': 0}
     layout = {'scene': {'aspectmode': 'data', **axes}, 'margin': margin}

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A report as HTML, PDF and Markdown: each a single file that needs no network.
+"""A report as HTML, PDF and Markdown: single files that need no network.
 
-jinja2, plotly's JavaScript and weasyprint are imported here only; `render` and `on_paper` return
-None where they are not installed. All text of others is escaped.
+Only this module imports jinja2, plotly and weasyprint; without them `render` and `on_paper` return
+None. All foreign text is escaped.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from calib_ros.texts import in_markdown, one_line
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
 TYPED = re.compile(r'(?<![\w-])--[a-z][a-z0-9-]*|calib_ros [a-z0-9]+(?![\w])')
-"""An option, or a command."""
+"""An option or a command."""
 MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
@@ -38,7 +38,7 @@ MISSING_PDF = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a reader sees first: how it looks, words, and the `gain` from before to after."""
+    """What a reader sees first: state, words, and the `gain` from before to after."""
 
     state: State
     heading: str
@@ -48,7 +48,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Section:
-    """Text, a plotly figure, a table, or several of them; `said` also holds without the figure."""
+    """Text, a plotly figure, a table, or several; `said` also holds without the figure."""
 
     name: str
     title: str
@@ -61,13 +61,13 @@ class Section:
 
 
 def section(name: str, title: str, *text: str, **more: Any) -> Section:
-    """Return a section with those paragraphs of text that are not empty."""
+    """Return a section with the paragraphs that are not empty."""
     return Section(name, title, tuple(filter(None, text)), **more)
 
 
 @dataclass(frozen=True)
 class Input:
-    """A file that was read."""
+    """An input file."""
 
     name: str
     size: int
@@ -76,23 +76,23 @@ class Input:
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a result, as known only to whoever started it; empty where not given."""
+    """Origin of a result, known only to its caller; empty if not given."""
 
     inputs: tuple[Input, ...] = ()
     operator: str = ''
     serial: str = ''
     device: str = ''
-    settings: str = ''  # the configuration with which the same is done again
-    command: str = ''  # that does it, if it was one
+    settings: str = ''  # configuration to repeat it
+    command: str = ''  # command to repeat it, if any
 
     def document(self) -> dict[str, Any]:
-        """Return it as plain values, without the settings, which have a file of their own."""
+        """Return it as plain values, without the settings, which have their own file."""
         return {name: value for name, value in asdict(self).items() if name != 'settings'}
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that the page shows, in its order."""
+    """Content of the page, in order."""
 
     kind: str
     robot: str
@@ -110,12 +110,12 @@ class Report:
 
     @property
     def title(self) -> str:
-        """Return the name of the robot, with its serial number if that is known."""
+        """Return the name of the robot, with its serial number if known."""
         return ' '.join(filter(None, (self.robot, self.origin.serial)))
 
     @property
     def of(self) -> str:
-        """Return the name of the first input file read."""
+        """Return the name of the first input file."""
         return next((each.name.split('/')[0] for each in self.origin.inputs), '')
 
     @property
@@ -125,7 +125,7 @@ class Report:
 
 
 def plotly_script() -> str | None:
-    """Return plotly's JavaScript; None where plotly is not installed."""
+    """Return plotly's JavaScript, or None."""
     try:
         from plotly.offline import get_plotlyjs
 
@@ -149,12 +149,12 @@ def on_paper(report: Report) -> bytes | None:
     """Return a report as PDF, without figures in space; None without jinja2 or weasyprint."""
     try:
         import weasyprint
-    except (ImportError, OSError):  # OSError: its libraries of the system
+    except (ImportError, OSError):  # OSError: missing system libraries
         return None
     from calib_ros.report.plots import drawing
 
     drawn = ((each.name, drawing(each.figure, each.height)) for each in report.shown)
-    logging.getLogger('weasyprint').setLevel(logging.ERROR)  # it misses what is for screens
+    logging.getLogger('weasyprint').setLevel(logging.ERROR)  # ignores screen styles
     drawings = {name: each for name, each in drawn if each}
     page = filled('report.html.jinja', report=report, drawings=drawings)
     found: bytes | None = weasyprint.HTML(string=page).write_pdf() if page else None
@@ -162,7 +162,7 @@ def on_paper(report: Report) -> bytes | None:
 
 
 def filled(template: str, **values: Any) -> str | None:
-    """Return a page with the style and the scripts of all; None where jinja2 is not installed."""
+    """Return a page with the shared style and scripts, or None without jinja2."""
     try:
         import jinja2
     except ImportError:
@@ -183,12 +183,12 @@ def _template(name: str) -> str:
 
 
 def _typed(text: str) -> str:
-    """Return a text as HTML, with commands and options marked as code, unbroken at hyphens."""
+    """Return a text as HTML, with commands and options as code that does not break at hyphens."""
     return TYPED.sub(r'<code>\g<0></code>', html.escape(str(_shown(text))))
 
 
 def _shown(value: object) -> object:
-    """Return a foreign text without characters that hide or reverse what follows."""
+    """Return a foreign text without characters that hide or reverse others."""
     if isinstance(value, str) and not hasattr(value, '__html__'):
         return '\n'.join(map(one_line, value.split('\n')))
     return value
@@ -245,7 +245,7 @@ def _is_number(cell: str) -> bool:
 
 
 def input_of(path: Path) -> tuple[Input, ...]:
-    """Return a file, or those of a folder such as a bag, with size and hash."""
+    """Return a file, or those in a folder such as a bag, with size and hash."""
     files = sorted(each for each in path.rglob('*') if each.is_file()) if path.is_dir() else [path]
     found = []
     for each in files:
@@ -259,5 +259,5 @@ def input_of(path: Path) -> tuple[Input, ...]:
 
 
 def inputs_of(paths: Sequence[Path | None]) -> tuple[Input, ...]:
-    """Return the files at all paths that are given."""
+    """Return the files at all given paths."""
     return tuple(each for path in paths if path is not None for each in input_of(path))

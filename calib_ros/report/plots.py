@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Figures: each function draws arrays into given Axes."""
+"""Figures by matplotlib."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line
 
 MARGIN = 0.01
-"""What is left free around a board [m]; a convention."""
+"""Free margin around a board [m]; a convention."""
 
 
 def before_after_png(result: Identification) -> bytes:
-    """Return the figure of position errors before and after, on poses that were not fitted."""
+    """Return the figure of held-out position errors before and after."""
     comparison = result.validation or result.fitted
     before, after = (
         1e3 * np.linalg.norm(residuals.position[comparison.judged], axis=1)
@@ -54,7 +54,7 @@ def before_after_png(result: Identification) -> bytes:
 
 
 def workspace_png(survey: Survey) -> bytes:
-    """Return the figure of a survey: what the calibration removes and, if known, what remains."""
+    """Return the figure of a survey: removed and, if known, remaining errors."""
     rows = list(survey.parts.items())[:2]
     x, y, z = survey.positions.T
     low, high = np.quantile(z, [0.4, 0.6])
@@ -106,7 +106,7 @@ def _in_metres(axes: Axes, first: str, second: str) -> None:
 
 
 def board_pdf(rectangles: FloatArray, size: tuple[float, float], words: str) -> bytes:
-    """Return a page with black rectangles (K, 4) [m], true in size: left, top, width, height."""
+    """Return a page with black rectangles (K, 4) [m], to scale: left, top, width, height."""
     from matplotlib.backends.backend_pdf import FigureCanvasPdf
     from matplotlib.collections import PatchCollection
     from matplotlib.patches import Rectangle
@@ -138,9 +138,9 @@ def _png(figure: Figure) -> bytes:
 
 
 def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
-    """Return a figure of plotly as PNG in base64, `height` in pixels; None for one in space.
+    """Return a plotly figure as PNG in base64, `height` in pixels; None for one in space.
 
-    It knows what `figures.py` makes: curves, dots with intervals, and maps of colours.
+    It supports the figures of `figures.py`: curves, dots with intervals, and heat maps.
     """
     data = [] if figure is None else figure['data']
     if figure is None or any(each['type'] == 'scatter3d' for each in data):
@@ -207,5 +207,5 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
 
 
 def _plain(names: Sequence[Any]) -> list[Any]:
-    """Return names without what plotly or matplotlib would read as marks."""
+    """Return names without markup for plotly or matplotlib."""
     return [html.unescape(x).replace('$', r'\$') if isinstance(x, str) else x for x in names]

@@ -2,10 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The measurements pose by pose: place, errors before and after, and source.
 
-It becomes a table, and what a page shows: single poses, above SINGLE bins, cells and quantiles.
-
-Positions and errors are in the frame of the arm's base, which sets measured by several devices
-share. Errors are measured minus predicted, of the judged poses by a fit that did not know them.
+Used for a table and for a page: single poses, above SINGLE bins, cells and quantiles. Positions
+and errors are in the frame of the arm's base, which sets of several devices share. Errors are
+measured minus predicted, of judged poses by a fit without them.
 """
 
 from __future__ import annotations
@@ -37,14 +36,12 @@ FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 SINGLE = MANY
 """Poses shown one by one; of more, this many evenly spread ones give the quantiles."""
 WORST = 2 * SOME_POSES
-"""Poses of the largest errors, and outliers, that are listed of more."""
+"""Poses with the largest errors, and outliers, listed of more."""
 BANDS = 60
-"""Parts of the session, and of each joint's values, whose quantiles are shown; a
-convention."""
+"""Parts of the session, and of each joint's values, with quantiles; a convention."""
 CELLS = round(SINGLE ** (1 / 3))
-"""Cells along the longest edge of the workspace: no more of them than single poses."""
+"""Cells along the longest edge of the workspace: in total no more than single poses."""
 SHARES = (1.0 - CONFIDENT, 0.5, CONFIDENT)
-"""Quantiles that are shown."""
 ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
 WHEN = ('before', 'after')
 NAMELESS: Mapping[int, str] = {}
@@ -52,10 +49,10 @@ NAMELESS: Mapping[int, str] = {}
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """N poses, or corners of a board, in the order of their stamps.
+    """N poses, or corners of a board, in stamp order.
 
-    Errors of position [m] and orientation [rad] are in the arm's base: (error, 0, 0) of a
-    distance, NaN where no orientation was measured.
+    Errors of position [m] and orientation [rad] are in the arm's base: (error, 0, 0) for a
+    distance, NaN without an orientation.
     """
 
     joints: FloatArray  # (N, n) [rad or m]
@@ -76,12 +73,11 @@ class Poses:
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.joints)
 
     @property
     def judged(self) -> NDArray[np.bool_]:
-        """Return (N,) which poses judge, all where none was left out for that, but no outliers."""
+        """Return the poses (N,) that judge, all if none was held out, without outliers."""
         chosen = self.role != FITTED
         return np.asarray((chosen | ~chosen.any()) & ~self.outlier)
 
@@ -92,13 +88,13 @@ class Poses:
 
     @property
     def things(self) -> str:
-        """Return the name of the rows, in the plural."""
+        """Return the plural name of the rows."""
         if not self.corner.any():
             return 'poses'
         return 'corners' if self.corner.all() else 'measurements'
 
     def source(self, row: int) -> str:
-        """Return where a row comes from: the image or the line of the table, or the stamp [s]."""
+        """Return the source of a row: image, line of the table, or stamp [s]."""
         stamp = int(self.stamps_ns[row])
         if self.corner[row] and (name := self.images.get(stamp // 10**9)):
             return name
@@ -107,13 +103,13 @@ class Poses:
         return f'{stamp // 10**9}.{stamp % 10**9:09d} s'
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
-        """Return some of the poses by a mask (N,) or by indices (K,)."""
+        """Return some poses by a mask (N,) or indices (K,)."""
         of_all = ('tools', 'lines', 'images')
         names = (each.name for each in fields(self) if each.name not in of_all)
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def table(self, told: Told = nobody) -> str:
-        """Return a CSV: a row for each pose, in metres and radians."""
+        """Return a CSV with a row for each pose, in metres and radians."""
         names = ['line' if self.lines else 'stamp_ns', 'set', 'role', 'outlier', 'size']
         names += [f'q{k + 1}' for k in range(self.joints.shape[1])]
         names += ['x', 'y', 'z', *(f'{when}_{axis}' for when in WHEN for axis in 'xyz')]
@@ -142,11 +138,7 @@ def _poses(
     lines: bool,
     images: Mapping[int, str],
 ) -> Poses:
-    """Return poses in the order of their stamps.
-
-    They are those of sets, of each of which the comparison has the residuals, with the roles (N,)
-    and sizes (N,).
-    """
+    """Return the poses of sets with residuals, roles (N,) and sizes (N,), in stamp order."""
     parts: list[dict[str, NDArray[Any]]] = []
     for sets, comparison, role, sizes in of:
         first, before, after = 0, comparison.before, comparison.after
@@ -191,12 +183,12 @@ def poses_of(
     lines: bool = False,
     images: Mapping[int, str] = NAMELESS,
 ) -> Poses:
-    """Return all poses of an identification, the judged ones by a fit without them."""
+    """Return all poses of an identification, judged ones by a fit without them."""
     sizes = np.concatenate(result.distances)
     judged = result.validation
     if judged is None or judged.repeated is not None:
         of = [(problem.sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
-    else:  # each was left out once
+    else:  # each was held out once
         of = [(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
     if judged is not None and judged.repeated is not None:
         role = np.where(judged.repeated, REPEATED, JUDGED)
@@ -208,7 +200,7 @@ def poses_of(
 def poses_to_verify(
     chain: Chain, sets: Sequence[Observations], comparison: Comparison, lines: bool = False
 ) -> Poses:
-    """Return the poses of new measurements, which all judge."""
+    """Return the poses of new measurements, all judged."""
     count = len(comparison.judged)
     of = [(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
@@ -216,14 +208,14 @@ def poses_to_verify(
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
-    """Return an array (...) as lists with so many significant digits; None for NaN."""
+    """Return an array (...) as lists with `digits` significant digits; None for NaN."""
     flat = [None if x != x else float(f'{x:.{digits}g}') for x in values.ravel().tolist()]
     shaped: list[Any] = np.array(flat, dtype=object).reshape(values.shape).tolist()
     return shaped
 
 
 def unit_of(joint: Joint) -> tuple[float, str, int]:
-    """Return how joint values are shown: factor, unit and decimals."""
+    """Return factor, unit and decimals for joint values."""
     return (180.0 / np.pi, '°', 2) if joint.type == 'revolute' else (1e3, 'mm', 1)
 
 
@@ -320,7 +312,7 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
 
 
 def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
-    """Return the SHARES (3, B) of values (N,) in the parts (N,) 0 ... B - 1; None for none."""
+    """Return the SHARES (3, B) of values (N,) in bins (N,), None for empty ones."""
     known = ~np.isnan(values)
     values, place = values[known], place[known]
     ordered = values[np.lexsort((values, place))]
@@ -333,7 +325,7 @@ def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
 
 
 def _cells(poses: Poses) -> dict[str, Any]:
-    """Return cubes of the workspace: how many poses, where, their RMS and mean errors."""
+    """Return cubes of the workspace: number of poses, place, RMS and mean errors."""
     good = poses.select(~poses.outlier)
     low = good.position.min(axis=0)
     edge = max(float(np.ptp(good.position, axis=0).max()) / CELLS, 1e-9)

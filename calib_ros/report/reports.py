@@ -44,7 +44,7 @@ UNPROVEN = (
     'All these poses were used to compute the correction: a small error "after" proves nothing.'
 )
 SURVEYED = 20 * SOME_POSES
-"""Random poses of the error map: some for each of its cells."""
+"""Random poses of the error map: several per cell."""
 
 
 def identification_report(
@@ -102,7 +102,7 @@ def _verdict(
 
 
 def somewhere(result: Identification) -> str:
-    """Return where alone an accepted calibration is valid; empty for everywhere."""
+    """Return the region of an accepted calibration; empty for everywhere."""
     whole = result.region is None or result.region.whole
     return '' if whole else ' near the measured poses'
 
@@ -113,7 +113,7 @@ def doubts(result: Identification) -> tuple[str, ...]:
 
 
 def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
-    """Return whether the error left is within the tolerance [m], if one is given."""
+    """Return whether the remaining error is within the tolerance [m], if given."""
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
@@ -149,7 +149,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
 
 
 def _refused(reasons: Sequence[Advice]) -> Verdict:
-    """Return why nothing is corrected: an arm without visible errors is not a bad one."""
+    """Return the verdict of a refusal: an arm without visible errors is not a bad one."""
     tried = 'No correction was saved or sent to the robot. The figures show the correction tried.'
     if reasons[0].heading == GOOD_ARM.heading:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
@@ -254,11 +254,11 @@ def _effects(result: Identification) -> Section:
     )
 
 
-def _outliers(poses: Poses, most: int = 50) -> Section:
+def _outliers(poses: Poses) -> Section:
     rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
     rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
-    more = f' The {most} largest are shown.' if len(rows) > most else ''
+    more = ' The 50 largest are shown.' if len(rows) > 50 else ''
     return section(
         'outliers',
         f'Outliers: {len(rows)} {poses.things} carry little or no weight',
@@ -267,13 +267,13 @@ def _outliers(poses: Poses, most: int = 50) -> Section:
         head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
         rows=tuple(
             (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
-            for k in rows[:most].tolist()
+            for k in rows[:50].tolist()
         ),
     )
 
 
 def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
-    """Return the offsets of the geometry with their intervals, lengths and angles apart."""
+    """Return the geometric offsets with their intervals, lengths and angles separately."""
     others = dict(result.chain.effects)
     own = [p for p in result.parameters if p.name.unit in ('m', 'rad') and p.name not in others]
     own = [p for p in own if not result.chain.owns_frame(p.name)]

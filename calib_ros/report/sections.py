@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sections shared by several pages: accuracy, identity, and figures of poses."""
+"""Sections shared by several pages."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LABELS = (
     *('RMS [mm]', '95 % interval', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
     *('RMS orientation [mrad]', 'RMS [px]'),
 )
-"""Rows of the table of accuracy below its head and count."""
+"""Rows of the accuracy table below head and count."""
 
 
 def gain(which: Comparison, intervals: bool = True) -> str:
@@ -67,7 +67,7 @@ def accuracy_section(
 def _column(
     label: str, found: ErrorFigures, limits: tuple[float, float] | None = None
 ) -> tuple[str, ...]:
-    """Return a column of the table of accuracy, with limits [m] of the RMS if they are known."""
+    """Return a column of the accuracy table, with limits [m] of the RMS if known."""
     lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
     rest = (*lengths, found.rms_mrad, found.rms_px)
     between = '' if limits is None else _between(limits)
@@ -112,7 +112,7 @@ def _measured(poses: Poses | None) -> str:
 
 
 def distribution(poses: Poses) -> Section:
-    """Return how many of the judged poses are how good."""
+    """Return the distribution of errors of the judged poses."""
     chosen = poses.judged
     before, after = (
         1e3 * np.linalg.norm(each[chosen], axis=1) for each in (poses.before, poses.after)

@@ -11,7 +11,7 @@ from calib_ros.settings import Settings
 
 
 def in_words(found: Verification) -> str:
-    """Return the verdict with all that it rests on."""
+    """Return the verdict and its basis."""
     before, after = found.comparison.figures
     share = 100.0 * found.confidence
     lines = [
@@ -35,7 +35,7 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the poses [mm]; none without poses."""
+    """Return the table lines of the poses [mm]."""
     again = any(pose.repeatability is not None for pose in found.each)
     lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
@@ -53,7 +53,7 @@ def limits(found: Verification) -> list[str]:
             '(--commanded) to test whether the correction reaches the arm'
         )
     turned = found.comparison.figures[1].rms_mrad
-    moved = found.common < NEARER  # which explains it
+    moved = found.common < NEARER
     if turned is not None and turned > 1e3 * Settings.largest_angle and not moved:
         lines.append(
             f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
@@ -68,7 +68,7 @@ def remarks(found: Verification) -> list[str]:
 
 
 def hints(found: Verification) -> list[str]:
-    """Return what was refitted, and where the error may come from."""
+    """Return what was refitted, and possible causes of the error."""
     lines = []
     if found.fitted:
         lines.append(f'refitted, before and after alike: {" and ".join(found.fitted)}')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A result in words: a line for the operator, phrases for pages, JSON, the corrected chain."""
+"""A result as text: a line for the operator, phrases for pages, JSON."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from calib_ros.shown import some
 from calib_ros.texts import dump_yaml
 
 WEAK = Settings.largest_error
-"""A parameter with a larger standard deviation [m or rad] is named as weakly determined: an arm
-that errs by more is not accepted."""
+"""Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
+with such an error is not accepted."""
 
 
 def summary(
@@ -40,10 +40,10 @@ def summary(
     warnings: Sequence[str] = (),
     first: str = '',
 ) -> str:
-    """Return the one line that an operator reads.
+    """Return the one line for the operator.
 
-    With the `numbers` of the samples that are outliers these are named; `warnings` are of the
-    measurements. `first` is what to do first about a refusal.
+    `numbers` of outlier samples name these; `warnings` are of the measurements; `first` is what to
+    do first about a refusal.
     """
     before, after = (result.validation or result.fitted).figures
     text = f'{measured(result)}, RMS {before.rms_mm:.3f} -> '
@@ -68,7 +68,7 @@ def summary(
 
 
 def measured(result: Identification) -> str:
-    """Return what was fitted: poses, images with their corners, or both."""
+    """Return what was fitted: poses, images with corners, or both."""
     seen = ~np.isnan(result.fitted.after.pixels[:, 0])
     corners, poses = int(seen.sum()), int((~seen).sum())
     parts = [f'{poses} poses'] if poses or not corners else []
@@ -77,12 +77,12 @@ def measured(result: Identification) -> str:
 
 
 def remarks(result: Identification) -> list[str]:
-    """Return the remarks on a result that do not say the same as why it was refused."""
+    """Return the remarks that do not repeat a refusal."""
     return [each for each in result.remarks if each not in map(str, result.refusals)]
 
 
 def notes(result: Identification) -> list[str]:
-    """Return the remarks on the fitted parameters, one each."""
+    """Return the remarks on the fitted parameters."""
     found = []
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
@@ -99,7 +99,7 @@ def notes(result: Identification) -> list[str]:
 
 
 def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
-    """Return the numbers and stamps [s] of outliers, the largest first."""
+    """Return numbers and stamps [s] of outliers, the largest first."""
     seconds = {each: divmod(each.stamp_ns, 10**9) for each in outliers}
     largest = sorted(outliers, key=lambda each: -each.size)
     words = (
@@ -109,7 +109,7 @@ def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
 
 
 def weakly_determined(result: Identification) -> tuple[str, ...]:
-    """Return the fitted parameters that are hardly known: judge them by predictions only."""
+    """Return the weakly determined parameters: judge them by predictions only."""
     return tuple(
         p.name
         for p in result.parameters
@@ -118,7 +118,7 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
 
 
 def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
-    """Return settings and `more` as a parameter file, by which a node does the same again."""
+    """Return settings and `more` as a parameter file that repeats the run in a node."""
     parameters: dict[str, Any] = {'chain': chain, **more}
     for name, value in asdict(settings).items():
         parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
@@ -126,7 +126,7 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
 
 
 def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
-    """Return whether a calibration holds at the last stops, nothing changed, and why in words."""
+    """Return whether a calibration holds at the last stops, and why."""
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
     if found.changed:
         reasons = changes_in_words(found.changed)
@@ -147,7 +147,7 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
 def verdict(
     calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures, reused: float = 0.0
 ) -> tuple[bool, str]:
-    """Return whether a calibration holds on samples, a share `reused`, and why in words."""
+    """Return whether a calibration holds on samples, of which a share is `reused`, and why."""
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
     if warning := reused_in_words(reused):
@@ -167,7 +167,7 @@ def _lost(calibration: Calibration, text: str) -> str:
 
 
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
-    """Return the result as one JSON document; `samples` is the account of the input."""
+    """Return the result as a JSON document; `samples` is the account of the input."""
 
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
@@ -226,7 +226,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
 
 def region_figures(region: Region) -> dict[str, Any]:
-    """Return where a calibration may be used, in figures; the limit is None for everywhere."""
+    """Return the region in figures; the limit is None for everywhere."""
     limit = None if region.whole else 1e3 * region.limit
     return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
 
@@ -235,13 +235,13 @@ BEFORE = 'the nominal chain with its base and tool frames fitted to the same mea
 
 
 def sigma_over_range(result: Identification) -> dict[str, float]:
-    """Return how well positions are predicted over the whole joint range [mm]."""
+    """Return the accuracy of predicted positions over the joint range [mm]."""
     sigma = 1e3 * result.predicted_sigma()
     return {'median': float(np.median(sigma)), 'max': float(sigma.max())}
 
 
 def scatter_in_words(noise: Noise) -> str:
-    """Return how much more is left than the device should leave."""
+    """Return the excess of the residuals over the device's noise."""
     text = f'The remaining error is {noise.position:.2f} times the stated device noise'
     if noise.orientation is not None:
         text += f', {noise.orientation:.2f} times in orientation'
@@ -254,7 +254,7 @@ def scatter_in_words(noise: Noise) -> str:
 
 
 def drift_in_words(noise: Noise) -> str:
-    """Return the evidence for drift of the device: errors shared in succession only."""
+    """Return the evidence for drift: errors shared in succession only."""
     return neighbours_in_words(noise) if noise.shared == ('successive',) else ''
 
 
@@ -262,7 +262,7 @@ NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other i
 
 
 def neighbours_in_words(noise: Noise) -> str:
-    """Return which neighbours share errors, by how much, and what follows."""
+    """Return which neighbours share errors, their size and consequence."""
     if not noise.shared:
         return 'No test finds errors shared by neighbouring poses.'
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
@@ -276,7 +276,7 @@ def neighbours_in_words(noise: Noise) -> str:
 
 
 def chance_in_words(chance: float) -> str:
-    """Return how well the gain stands up to errors in succession."""
+    """Return how well drift explains the gain."""
     share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'below 0.1'
     return (
         f'The chance that the improvement is only drift of the device is {share} % (share of '
@@ -310,7 +310,7 @@ def _in_thousandths(name: str, sigma: float) -> str:
 
 
 def cameras_in_words(result: Identification) -> list[str]:
-    """Return where cameras and boards are, and the lenses that were fitted."""
+    """Return the places of cameras and boards, and fitted lenses."""
     chain = result.chain
     cameras = [name for name in chain.frame_names if chain.frame(name).lens is not None]
     lines = []
@@ -319,7 +319,7 @@ def cameras_in_words(result: Identification) -> list[str]:
         lines.append(f'RMS {fitted.rms_px:.3f} px on the corners fitted')
     on_flange, other = ('camera', 'board') if 'tool' in cameras else ('board', 'camera')
     about = {'base': f' (arm seen from the {other})', 'tool': f' ({on_flange} on the flange)'}
-    if len(chain.frame_names) > 2:  # of other devices, too
+    if len(chain.frame_names) > 2:  # several devices
         about = {}
     for name in chain.frame_names if cameras else ():
         frame = chain.frame(name)
@@ -339,7 +339,7 @@ def observability_in_words(result: Identification) -> str:
 
 
 def against_truth(result: Identification, truth: Chain) -> str:
-    """Return a table of the fitted joint parameters beside those of the true chain."""
+    """Return a table of fitted and true joint parameters."""
     width = max(len(name) for name in result.names)
     rows = [f'  {"parameter":{width}}     true   identified        std   deviation']
     for p in result.parameters:
