@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros compare | compensate | export`: what is done with calibrations.
-
-Each imports what it alone needs.
-"""
+"""`calib_ros compare | compensate | export`; each imports only what it needs."""
 
 from __future__ import annotations
 

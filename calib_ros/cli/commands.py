@@ -2,10 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The options of all commands; importing them loads nothing else.
 
-They are written as their help shows them: groups, and in these a line for each option. Behind its
-name are `!` if it must be given and, unless it is a flag, its placeholder, from which follows the
-type, or its choices `a|b`; `*3`, `+` or `?` for several values; and `=` with the default. A line
-that begins with `@` adds options that are not written here.
+They are written as their help shows them: groups, with a line for each option. The name is
+followed by `!` if required and, unless it is a flag, by a placeholder, which gives the type, or by
+choices `a|b`; then `*3`, `+` or `?` for several values, and `=` with the default. A line starting
+with `@` adds shared options.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ TYPES = {
     **dict.fromkeys(('BAG', 'FILE', 'FIRST', 'FOLDER', 'IMAGES', 'MEASURED', 'PLANT'), Path),
     **dict.fromkeys(('CALIBRATION', 'PROGRAM', 'RESULT', 'SECOND', 'TABLE'), Path),
 }
-"""By placeholder; of any other a text."""
+"""By placeholder; others are text."""
 FORM = re.compile(r'([^=]*?)([*]\d+|[+?]|)(?:=(.*)|)$')
-"""Placeholder or choices, how many values, and the default."""
+"""Placeholder or choices, number of values, default."""
 CHAIN = 'robot name (calib_ros robots), chain file or URDF'
 EARLIER = 'calibration.yaml, or folder from identify --out'
 FORCE = 'overwrite existing output'
@@ -263,7 +263,7 @@ what to convert
   --force  {FORCE}
 {LAYOUT}
 """
-"""Of each command by its name, behind MODULE.FUNCTION, which is imported when it runs."""
+"""By command name, after MODULE.FUNCTION, which is imported when it runs."""
 COMMANDS = dict(part.split(' ', 1) for part in OPTIONS.split('\n# ')[1:])
 """By name: MODULE.FUNCTION and, in the lines below, the options."""
 EXAMPLES = """
@@ -301,11 +301,11 @@ csv2bag measured.csv measured_bag --chain ur10e --session monday
 import export.csv --length mm --angle deg --euler ZYX --out measured.csv
 import export.csv --preset optitrack --joints log.csv --joints-preset kuka --out measured.csv
 """
-"""For the foot of each help, without "calib_ros"."""
+"""For the end of each help, without "calib_ros"."""
 
 
 def add_options(parser: argparse.ArgumentParser, written: str) -> None:
-    """Add options to a parser, as they are written in OPTIONS."""
+    """Add options to a parser, as written in OPTIONS."""
     group: Group = parser
     for line in filter(None, written.splitlines()):
         first, *names = line.split()
@@ -349,5 +349,5 @@ def _add_option(group: Group, option: str, text: str) -> None:
 
 
 def examples_of(name: str) -> list[str]:
-    """Return whole commands of a name."""
+    """Return example commands of a name."""
     return [line for line in EXAMPLES.splitlines() if line.split()[:1] == [name]]

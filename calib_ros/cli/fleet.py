@@ -37,7 +37,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     screen.title(title, number['fine'] == len(found))
     for each in found:
         for words in each.actions:
-            Screen().bullet(f'{each.robot.serial}, {words}')  # quiet or not: the mail of cron
+            Screen().bullet(f'{each.robot.serial}, {words}')  # even if quiet: the mail of cron
         for error in each.errors.values():
             screen.warn(f'{each.robot.serial}: {error}')
         for remark in () if options.quiet else each.remarks:
@@ -56,7 +56,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
 
 @contextmanager
 def _tidied_up(screen: Screen) -> Iterator[None]:
-    """Let the first Ctrl-C end the work, and no second one what ends the workers then."""
+    """Let the first Ctrl-C end the work, and ignore others while the workers end."""
 
     def end(*_: object) -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)

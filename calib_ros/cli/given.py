@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the given options mean: bags, tables, layouts, histories, reports."""
+"""Objects made from options: bags, tables, layouts, histories, reports."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WRITTEN = 'give the folder written by identify --out'
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
-    """Return how to read a table of others, None where nothing says that it is one."""
+    """Return how to read a table of another system, or None."""
     given = {name: getattr(options, name) for name in LAYOUT}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
@@ -44,7 +44,7 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
 
 
 def history_of(options: argparse.Namespace) -> History | None:
-    """Return where a result is filed, if it is to be; refuse one without a serial number."""
+    """Return the history to file a result in, if any; refuse one without a serial number."""
     if options.history is None:
         return None
     if not options.serial:
@@ -74,7 +74,7 @@ def filing_of(
     measured: Path,
     *judged_by: object,
 ) -> Filing:
-    """Return what is filed with a result."""
+    """Return the filing data of a result."""
     settings = settings_hash(nominal, settings_of(options), *judged_by)
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     content = content_hash(
@@ -96,9 +96,9 @@ def origin_of(
 def page_of(
     report: page.Report, screen: Screen, name: str = 'report.html', pdf: bool = False
 ) -> Contents:
-    """Return a report as the content of files by name; nothing where an extra is missing.
+    """Return a report as files by name; none if a package is missing, with one warning.
 
-    That is said once. `pdf` asks for report.pdf as well.
+    `pdf` adds report.pdf.
     """
     made: list[tuple[str, str | bytes | None, str]]
     made = [(name, page.render(report), page.MISSING)]
@@ -112,7 +112,7 @@ def page_of(
 def replayed(
     path: Path, chain: Chain, settings: Settings, screen: Screen
 ) -> tuple[CalibrationSession, Replayed]:
-    """Return a session that has taken a bag."""
+    """Return a session that has replayed a bag."""
     with screen.work(f'reading {path.name}') as work:
         return loading.replayed(path, chain, settings, work)
 
@@ -125,7 +125,7 @@ def table(
     screen: Screen,
     eye_in_hand: bool = False,
 ) -> Table:
-    """Return a table of measurements, laid out as the options say."""
+    """Return a table of measurements with the layout of the options."""
     foreign = foreign_of(options, chain)
     sessions = sessions_of(options)
     with screen.work(f'reading {path.name}') as work:

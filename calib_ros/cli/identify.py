@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""`calib_ros identify`: a calibration from a bag, a table, or what a camera saw."""
+"""`calib_ros identify`: a calibration from a bag, a table, or images."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
-    """Bring an earlier calibration up to date by a few poses; return the exit status."""
+    """Update an earlier calibration with a few poses; return the exit status."""
     with common.results(options, ('calibration.yaml', 'result.json')) as contents:
         loaded, _ = _loaded(options, screen)
         common.at_least(options, growth=0)
@@ -120,7 +120,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _show_update(found: Recalibration, screen: Screen) -> None:
-    """Print what came of bringing a calibration up to date, and what has changed."""
+    """Print the update of a calibration, and what has changed."""
     before, after = found.before, found.after
     if found.accepted:
         screen.title('accepted: the calibration is brought up to date', True)
@@ -157,7 +157,7 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
 
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
-    """Return what there is to identify in a table or a bag, and the settings."""
+    """Return the problem of a table or a bag, and the settings."""
     source = _source(options)
     posed = options.chain == boards.POSED
     chain = boards.posed_arm() if posed else load_chain(options.chain)
@@ -197,7 +197,7 @@ def _detected(
     touched: dict[str, Any],
     screen: Screen,
 ) -> Loaded:
-    """Return what to fit from board corners, and from a table if given."""
+    """Return the problem of board corners, and of a table if given."""
     for name in ('board', 'places'):
         if getattr(options, name) is None:
             raise InputError(f'--detections needs --{name}')
@@ -238,7 +238,7 @@ def _detected(
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """A result with its input and where that comes from; the wanted error [mm] if there is one."""
+    """A result with its input and origin; the wanted error [mm] if given."""
 
     loaded: Loaded
     result: Identification
@@ -274,7 +274,7 @@ def show(found: Identified, screen: Screen) -> None:
 
 
 def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) -> None:
-    """Print why a result was refused, or what to know about one that is accepted."""
+    """Print why a result was refused, or what to know about an accepted one."""
     if result.accepted:
         drift = words.drift_in_words(result.noise)
         for note in (*doubts(result), drift, *words.notes(result), f'{NOT_YET}: {BRING}'):
@@ -328,10 +328,10 @@ def _document(found: Identified) -> str:
 def result_files(
     found: Identified, screen: Screen, out: Path, pdf: bool = False
 ) -> dict[str, str | bytes]:
-    """Return the files of a result by name; a chain only if it is accepted.
+    """Return the files of a result by name; a chain only if accepted.
 
-    A chain that was accepted earlier, in `out`, is kept under another name when this result is
-    not: it does not belong to the files beside it any more.
+    If this result is not, a chain accepted earlier in `out` is renamed: it no longer belongs to
+    the files beside it.
     """
     from calib_ros.report.plots import before_after_png
 
@@ -361,6 +361,6 @@ def result_files(
 
 
 def _set_aside(out: Path) -> dict[str, bytes]:
-    """Return the calibration that was accepted earlier, if any, under another name."""
+    """Return the calibration accepted earlier, if any, under another name."""
     earlier = out / 'calibration.yaml'
     return {'calibration.previous.yaml': earlier.read_bytes()} if earlier.exists() else {}

@@ -42,7 +42,7 @@ def _by_suffix(name: str) -> str:
 
 
 def kind_of(path: Path) -> str:
-    """Return a key of `WORDS`, or an empty text where nothing tells."""
+    """Return a key of `WORDS`, or empty text if unknown."""
     if path.is_dir():
         names = [each.name for each in path.iterdir()]
         found = [kind for name, kind in IN_FOLDERS if name in names]
@@ -64,7 +64,7 @@ def kind_of(path: Path) -> str:
 
 
 def proposal(path: Path) -> str | None:
-    """Return what to do with a file that stands where a command should; None for no file."""
+    """Return what to do with a file given instead of a command; None for no file."""
     kind = kind_of(path)
     if not kind:
         return None
@@ -73,7 +73,7 @@ def proposal(path: Path) -> str | None:
 
 
 def refuse_others(path: Path, command: str, *wanted: str) -> str:
-    """Return which of the wanted kinds a file is, the last one where nothing tells."""
+    """Return which of the wanted kinds a file is, the last one if unknown."""
     kind = kind_of(path) or wanted[-1]
     if kind not in wanted:
         what, where = WORDS[kind]

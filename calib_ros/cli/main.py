@@ -20,7 +20,7 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
 
-# Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
+# matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
@@ -57,7 +57,7 @@ GROUPS = {
         'import': 'convert a table from another system',
     },
 }
-"""Commands by the groups of the overview, and what they do."""
+"""Commands by the groups of the overview, with descriptions."""
 TEXTS = {name: text for group in GROUPS.values() for name, text in group.items()}
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
@@ -72,17 +72,19 @@ WAY = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    for name in ('stdout', 'stderr'):  # closed by who started this: no file may get its number
+    for name in ('stdout', 'stderr'):  # closed by the caller: no file may get its number
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115
     try:
         options = _options(given)
-        options.typed = re.sub('://[^/@]*@', '://', shlex.join(('calib_ros', *given)))  # no secret
+        options.typed = re.sub(
+            '://[^/@]*@', '://', shlex.join(('calib_ros', *given))
+        )  # no password
         module, function = options.home.split('.')
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
         status: int = run(options, Screen(options.quiet))
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever read it has enough
+    except BrokenPipeError:  # the reader has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 128 + 13
     except KeyboardInterrupt:
@@ -102,7 +104,7 @@ def _failed(text: str, status: int = 1) -> int:
 
 
 def _options(given: Sequence[str]) -> argparse.Namespace:
-    """Return the options given, with the command to run."""
+    """Return the given options, with the command to run."""
     name = given[0] if given else ''
     completed = os.environ.get('COMP_LINE', '') if '_ARGCOMPLETE' in os.environ else ''
     if completed:
@@ -118,7 +120,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
         print(f'calib_ros {__version__}')
         raise SystemExit(0)
     if name not in TEXTS:
-        from pathlib import Path  # what the overview does not need is slow to load
+        from pathlib import Path  # slow to load, not needed by the overview
 
         from calib_ros.cli.kinds import proposal
 
@@ -134,7 +136,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 
 
 def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
-    """Return what is wrong with a word that a command does not know."""
+    """Return what is wrong with an unknown word."""
     if not word.startswith('-'):
         return f'unexpected argument "{word}"'
     option = word.partition('=')[0]
@@ -145,19 +147,19 @@ def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors end with an example of what is right."""
+    """A parser whose errors end with an example."""
 
     example = ''
 
     def error(self, message: str) -> NoReturn:
-        """Tell what must be given, what is wrong, and what is right."""
+        """Report what is required, what is wrong, and an example."""
         self.print_usage(sys.stderr)
         self.exit(2, f'{self.prog}: error: {message}\nexample: {self.example.lstrip()}\n')
 
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
-    """Return the parser of all commands; only the one given knows its options."""
-    from calib_ros.cli.commands import (  # the overview does not need them
+    """Return the parser of all commands; only the given one has its options."""
+    from calib_ros.cli.commands import (  # not needed by the overview
         COMMANDS,
         add_options,
         examples_of,
@@ -188,13 +190,15 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
 
 
 def _example(words: str) -> str:
-    tied = re.sub('(--[a-z-]+) (?!-)', '\\1\xa0', f'calib_ros {words}')  # an option and its value
+    tied = re.sub(
+        '(--[a-z-]+) (?!-)', '\\1\xa0', f'calib_ros {words}'
+    )  # keep an option and its value together
     parts = textwrap.wrap(tied, help_width() - 8, break_on_hyphens=False)
     return ('  ' + ' \\\n      '.join(parts)).replace('\xa0', ' ')
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """Help in 80 columns that tells a default where there is one."""
+    """Help in 80 columns with defaults."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=26, width=help_width())
@@ -202,7 +206,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
     def add_usage(
         self, usage: Any, actions: Iterable[argparse.Action], groups: Any, prefix: Any = None
     ) -> None:
-        """Show what must be given; the rest are options."""
+        """Show what is required; the rest are options."""
         words = ['usage:', self._prog]
         for each in actions:
             name = self._metavar(each)
@@ -232,7 +236,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 
 def _overview() -> str:
-    """Return what all commands do, and the way from here."""
+    """Return the descriptions of all commands, and the first steps."""
     lines = [f'calib_ros {__version__}: kinematic calibration of industrial arms.']
     for group, entries in GROUPS.items():
         lines += ['', f'{group}:']

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What commands share: options, settings from them, and the folder of their results."""
+"""Shared options of commands, settings from them, and the folder of results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from calib_ros.settings import Settings
 
 Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
 Contents: TypeAlias = dict[str, str | bytes]
-"""Of files by name."""
+"""Content of files by name."""
 SETTINGS = {
     'the fit': ('model', 'fixed', 'priors', 'loss', 'folds', 'socket_distance'),
     'how the device measures': (
@@ -35,18 +35,18 @@ SETTINGS = {
         *('joint_buffer', 'pose_buffer', 'wanted_accuracy'),
     ),
 }
-"""Settings by the groups in which a help shows them."""
+"""Settings by the groups of the help."""
 OF_BAGS = (
     *SETTINGS['how the device measures'],
     *SETTINGS['bags: what is read'],
     *SETTINGS['bags: how poses are taken'],
 )
-"""Settings by which poses are made of a bag."""
+"""Settings that affect the poses of a bag."""
 LAYOUT = (
     *('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector'),
     *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
 )
-"""Options of tables of others."""
+"""Options of foreign tables."""
 
 
 class Status(IntEnum):
@@ -58,16 +58,16 @@ class Status(IntEnum):
 
 
 def complete_robots(prefix: str, **_: Any) -> list[str]:
-    """Return completions of the beginning of a robot or file name."""
+    """Return completions of a robot or file name."""
     from glob import glob
 
-    from calib_ros.kinematics.chain_file import shipped_robots  # loads numpy, no `--help` needs it
+    from calib_ros.kinematics.chain_file import shipped_robots  # loads numpy, not needed by --help
 
     return [*shipped_robots(), *glob(f'{prefix}*')]
 
 
 def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> None:
-    """Add options for the settings of some names, or for all, in their groups."""
+    """Add options for some settings, or for all, in their groups."""
     known = {item.name: item for item in fields(Settings)}
     for title, members in SETTINGS.items():
         wanted = [known[name] for name in members if not names or name in names]
@@ -91,7 +91,7 @@ def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
 
 
 def at_least(options: argparse.Namespace, **lowest: float) -> None:
-    """Refuse options that are less than they may be; one that is not given is none."""
+    """Refuse options below their lowest value; missing ones pass."""
     for name, least in lowest.items():
         value = getattr(options, name)
         if value is not None and not value >= least:
@@ -99,7 +99,7 @@ def at_least(options: argparse.Namespace, **lowest: float) -> None:
 
 
 def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
-    """Refuse to write what is there already, or into no folder, before any work is done."""
+    """Refuse to overwrite files, or write to a missing folder, before any work."""
     for path in paths:
         if not path.parent.is_dir():
             raise InputError(f'there is no folder {path.parent} to write {path.name} into')
@@ -108,7 +108,7 @@ def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
 
 
 def settings_of(options: argparse.Namespace) -> Settings:
-    """Return the settings that are among the options, the others by default."""
+    """Return the settings among the options, others by default."""
     given: dict[str, Any] = {
         f.name: getattr(options, f.name) for f in fields(Settings) if hasattr(options, f.name)
     }
@@ -119,7 +119,7 @@ def settings_of(options: argparse.Namespace) -> Settings:
 
 
 def sessions_of(options: argparse.Namespace) -> tuple[str, ...]:
-    """Return the sessions of a table that are asked for."""
+    """Return the wanted sessions of a table."""
     return tuple(options.session.split(',')) if options.session else ()
 
 
@@ -127,8 +127,8 @@ def sessions_of(options: argparse.Namespace) -> tuple[str, ...]:
 def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Contents]:
     """Yield the files of --out, to be filled in; they are written at the end, all or none.
 
-    Files of these names (glob patterns) are refused before any work is done, or replaced by
-    --force. Other files stay in the folder. Without --out nothing is written.
+    Existing files with these names (glob patterns) are refused before any work, or replaced by
+    --force. Other files stay. Without --out nothing is written.
     """
     contents: Contents = {}
     if options.out is None:
@@ -140,6 +140,6 @@ def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Conte
 
 
 def written(out: Path, contents: Contents) -> str:
-    """Return where the files are that were written, and which of them to open."""
+    """Return where the files were written, and which to open."""
     page = 'report.html'
     return f'wrote {out}' + (f': open {out / page}' if page in contents else '')

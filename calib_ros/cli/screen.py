@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Output of a command: results on standard output; progress and warnings on standard error.
 
-On a terminal with rich in colour, with a bar; else plain, in lines of 80 columns. Nothing but
-printable characters leaves it: a topic or a joint may have any name.
+On a terminal with rich in colour, with a bar; else plain, in 80 columns. Only printable characters
+are written: a topic or a joint may have any name.
 """
 
 from __future__ import annotations
@@ -20,27 +20,26 @@ from typing import Any, TextIO
 from calib_ros.progress import Progress
 
 WIDTH = 80
-"""Columns of a help, and of what is no terminal, by convention."""
+"""Columns of help and of non-terminals, by convention."""
 EVERY_S = 2.0
-"""Time between two signs of life; where they stay, as in a log, each time doubles it.
-A convention."""
+"""Time between two progress lines, doubled each time if they stay, as in a log. A convention."""
 FIRST_S = EVERY_S / 4.0
-"""Time after which a bar shows on a terminal."""
+"""Time before a bar appears on a terminal."""
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 
 class Screen:
-    """Where a command says what it does; when `quiet`, nothing but data, warnings and errors."""
+    """Output of a command; if `quiet`, only data, warnings and errors."""
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
 
     def data(self, text: str) -> None:
-        """Print what was asked for, to be read by a program or a person; also when quiet."""
+        """Print requested data, even if quiet."""
         print(text)
 
     def say(self, text: str) -> None:
-        """Print lines as they are; on a terminal, those that are too long are wrapped."""
+        """Print lines; on a terminal, long ones are wrapped."""
         if self.quiet:
             return
         for line in text.splitlines() or ['']:
@@ -48,7 +47,7 @@ class Screen:
             print(_fitted(line, indent, sys.stdout), flush=True)
 
     def title(self, text: str, good: bool | None = None) -> None:
-        """Print a verdict; the colour of a good or bad one never says more than the words."""
+        """Print a verdict; the colour never says more than the words."""
         console = None if self.quiet else _console(sys.stdout)
         if console is None:
             self.say(text)
@@ -74,7 +73,7 @@ class Screen:
             _print(value, f'  {name}'.ljust(width))
 
     def bullet(self, text: str, steps: Sequence[str] = ()) -> None:
-        """Print a reason or a note, and what to do, in steps if there are several."""
+        """Print a reason or note, and what to do, in steps if several."""
         if self.quiet:
             return
         _print(text, '- ')
@@ -92,7 +91,7 @@ class Screen:
 
     @contextmanager
     def work(self, what: str) -> Iterator[Work]:
-        """Show that work goes on in a `with` block, and how much time is left if that is told."""
+        """Show progress in a `with` block, and the time left if known."""
         work = Work(what)
         if self.quiet:
             yield work
@@ -107,7 +106,7 @@ class Screen:
 
 
 class Work(Progress):
-    """A piece of work that begins now, to be watched by another thread until it is done."""
+    """Work that begins now, watched by another thread until done."""
 
     def __init__(self, what: str) -> None:
         super().__init__(what)
@@ -115,7 +114,7 @@ class Work(Progress):
         self.begin()
 
     def watch(self) -> None:
-        """Show that the work goes on until it is done."""
+        """Show progress until the work is done."""
         console = _console(sys.stderr)
         if console is None:
             pause = EVERY_S
@@ -149,7 +148,7 @@ def _print(text: str, head: str) -> None:
 
 
 def _console(stream: TextIO) -> Any:
-    """Return what writes in colour to a terminal; None where there is none, or no rich."""
+    """Return a colour console, or None without a terminal or rich."""
     if not stream.isatty() or os.environ.get('TERM') == 'dumb':
         return None
     try:
@@ -170,7 +169,7 @@ def _width(stream: TextIO) -> int:
 
 
 def help_width() -> int:
-    """Return how many columns a help takes: fewer than usual on a narrow terminal."""
+    """Return the columns of help: fewer on a narrow terminal."""
     return min(WIDTH, _width(sys.stdout))
 
 
@@ -179,12 +178,12 @@ def _printable(text: str) -> str:
 
 
 def _fitted(line: str, indent: str, stream: TextIO) -> str:
-    """Return a line as a terminal takes it; in a file it stays one."""
+    """Return a line wrapped for a terminal; in a file it stays one."""
     return wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
 
 
 def wrapped(text: str, head: str, indent: str, width: int) -> str:
-    """Return a text behind a head, in lines of so many columns, but for longer words."""
+    """Return a text after a head, wrapped to `width` columns except longer words."""
     text = _printable(text)
     if len(head) + len(text) <= width and '\n' not in text:
         return head + text

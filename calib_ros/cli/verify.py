@@ -36,7 +36,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
-    """Judge, print what comes out, and fill in the files of --out; return the exit status."""
+    """Judge, print, and fill in the files of --out; return the exit status."""
     history = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
@@ -69,7 +69,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
 
 
 def show(found: Verification, screen: Screen) -> None:
-    """Print a verdict, six rows, the poses if they are few, and what to do."""
+    """Print a verdict, six rows, the poses if few, and what to do."""
     before, after = found.comparison.figures
     orientation, tolerance = 'not measured', 'none given (--tolerance MM)'
     if before.rms_mrad is not None and after.rms_mrad is not None:
@@ -99,7 +99,7 @@ def show(found: Verification, screen: Screen) -> None:
 def _sets(
     options: argparse.Namespace, nominal: Chain, screen: Screen
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
-    """Return all that was measured, warnings, and whether stamps are the lines of a table."""
+    """Return the measurements, warnings, and whether stamps are lines of a table."""
     settings = common.settings_of(options)
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)

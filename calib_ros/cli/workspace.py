@@ -81,7 +81,7 @@ def _show(survey: Survey, screen: Screen) -> None:
 def _task(
     options: argparse.Namespace, arm: Calibration, rng: np.random.Generator
 ) -> FloatArray | None:
-    """Return the poses (K, 4, 4) of the task to place, if there is one."""
+    """Return the poses (K, 4, 4) of the task to place, if any."""
     if options.task is not None and options.joint_box is not None:
         raise InputError('give either --task or --joint-box')
     if options.task is not None:
@@ -97,5 +97,5 @@ def _task(
     lower, upper = np.reshape(options.joint_box, (2, size))
     if not (lower <= upper).all():
         raise InputError('--joint-box: give all lower values first, then all upper ones')
-    joints = rng.uniform(lower, upper, (30, size))  # poses that stand for all
+    joints = rng.uniform(lower, upper, (30, size))
     return task_of(in_base(arm.commanded_by(options.model), joints))

@@ -6,9 +6,9 @@
     ~/workspace_error    the errors over the workspace, after every accepted identification
     ~/joint_trajectory   -> ~/compensated_joint_trajectory
 
-All of it is computed on one thread of its own, piece by piece: messages are taken meanwhile. On
-one core the next pose takes about 15 ms, the cloud 60 ms, 10,000 points of a trajectory 0.1 s, and
-0.3 s with velocities.
+All is computed on one separate thread, in pieces, while messages are taken. On one core the next
+pose takes about 15 ms, the cloud 60 ms, 10,000 points of a trajectory 0.1 s, and 0.3 s with
+velocities.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ from calib_ros.settings import Settings
 from calib_ros.shown import some
 
 CLOUD = 10 * MOST_ENTRIES
-"""Points of the cloud of errors (60 ms)."""
+"""Points of the error cloud (60 ms)."""
 MOST_POINTS = Settings.pose_buffer
-"""Points of a trajectory; a longer one is refused."""
+"""Points of a trajectory; longer ones are refused."""
 MOST_SIZE = 400 * MOST_POINTS
 """Bytes of a serialised trajectory: ten joints with all rates take 352 a point."""
 MOST_QUEUED = qos_profile_services_default.depth
-"""Trajectories that may wait, as many as calls of a service; those on top are refused."""
+"""Trajectories that may wait; further ones are refused."""
 
 
 class Guide:
-    """Publish help before and after an identification.
+    """Publishes help before and after an identification.
 
-    `guarded` makes a function of one that logs what it raises. The next pose is chosen among
-    `candidates` (N, n), or among random ones within the limits.
+    `guarded` wraps a function to log its exceptions. The next pose is chosen among `candidates`
+    (N, n), or among random ones within the limits.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Guide:
         )
 
     def join(self, timeout: float) -> bool:
-        """Begin nothing more and wait [s] for running work; return whether it has ended."""
+        """Start nothing more and wait [s] for running work; return whether it has ended."""
         self._pool.shutdown(wait=False, cancel_futures=True)
         running = [each for each in self._pending if not each.cancelled()]
         return not wait(running, timeout).not_done
@@ -109,7 +109,7 @@ class Guide:
         return known | {'enough samples': enough, 'last trajectory': self._last_trajectory}
 
     def advise(self) -> None:
-        """Look for the next pose if there are samples that it was not looked for with."""
+        """Search the next pose if there are new samples."""
         busy = self._advising is not None and not self._advising.done()
         if busy or self._session.settings.mode == 'continuous':
             return
@@ -119,7 +119,7 @@ class Guide:
         self._advised = samples
         try:
             problem = self._session.problem_of(samples)
-        except CalibrationError:  # the status tells
+        except CalibrationError:  # shown by the status
             return
         self._advising = self._start(self._advise, problem, self._session.estimate)
 
@@ -128,7 +128,7 @@ class Guide:
         self._start(self._show, calibration)
 
     def _start(self, work: Callable[..., None], *arguments: Any) -> Future[None]:
-        with self._lock:  # an identification calls from a thread of its own
+        with self._lock:  # identifications call from their own thread
             future = self._pool.submit(self._guarded(work), *arguments)
             self._pending = {each for each in self._pending if not each.done()} | {future}
         return future
@@ -136,7 +136,7 @@ class Guide:
     def _advise(self, problem: Problem, estimate: Estimate | None) -> None:
         try:
             design = Design.of(problem, estimate)
-        except InputError:  # distances: there is nothing to plan with
+        except InputError:  # distances cannot be planned
             return
         taken = np.concatenate([each.joints for each in problem.sets])
         if estimate is None:
@@ -171,7 +171,7 @@ class Guide:
             self._start(self._correct, data, self._session.calibration)
 
     def _correct(self, data: bytes, calibration: Calibration | None) -> None:
-        """Publish a corrected trajectory, or nothing at all and log why."""
+        """Publish a corrected trajectory, or log why not."""
         try:
             message = deserialize_message(data, JointTrajectory)
             corrected, self._last_trajectory = self._corrected_by(message, calibration)
@@ -223,9 +223,9 @@ def _compensator(nominal: Chain, calibration: Calibration) -> Compensator:
 
 
 def _too_large(data: bytes) -> str:
-    """Return in words what a serialised trajectory has too much of; empty when it can be decoded.
+    """Return what exceeds the limits in a serialised trajectory; empty if it can be decoded.
 
-    To decode a million points takes many seconds, and no other thread runs meanwhile.
+    Decoding a million points takes many seconds, during which no other thread runs.
     """
     names, points = trajectory_size(data, MOST_ENTRIES)
     for count, most, what in (

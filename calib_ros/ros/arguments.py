@@ -2,9 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node's parameters, and the launch arguments made from them.
 
-Launch arguments are strings. `ros_arguments` makes command line arguments of a node of them, each
-by the type of its parameter: `serial:=0012` stays text. No ROS is imported here: the launch files
-and the node read the same list.
+Launch arguments are strings. `ros_arguments` converts them to command line arguments of a node by
+the type of each parameter: `serial:=0012` stays text. No ROS is imported here, so that launch
+files and node share one list.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NODE = 'calibration_node'
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter: its default, what it is for, whether it can change, its smallest value."""
+    """A parameter: default, description, whether it can change, smallest value."""
 
     name: str
     default: Any
@@ -107,7 +107,7 @@ PARAMETERS = {
         Parameter('use_sim_time', False, 'use the time of /clock', False),
     )
 }
-"""All parameters of the node by name, in the order in which they are declared."""
+"""All parameters of the node by name, in order of declaration."""
 REMAPPED = {
     'joint_states': 'joint state topic; default: joint_states',
     'measured_pose': 'measured pose topic; default: measured_pose',
@@ -122,15 +122,15 @@ PLACED = {
 def launch_arguments() -> dict[str, str]:
     """Return the launch arguments of the node with their descriptions.
 
-    All are empty by default: what is not given is not passed, so that the parameter file, and
-    the node's own defaults, hold.
+    All are empty by default, and then not passed, so that the parameter file and the node's
+    defaults apply.
     """
     texts = {each.name: _described(each) for each in PARAMETERS.values()}
     return {**texts, **PLACED, **REMAPPED}
 
 
 def usage(program: str) -> argparse.ArgumentParser:
-    """Return a parser of the arguments not for ROS: only --help, which lists the parameters."""
+    """Return a parser of the non-ROS arguments: only --help, which lists the parameters."""
     lines = ['parameters:']
     for each in PARAMETERS.values():
         text = textwrap.fill(
@@ -149,10 +149,10 @@ def usage(program: str) -> argparse.ArgumentParser:
 
 
 def ros_arguments(given: Mapping[str, str]) -> list[str]:
-    """Return ROS arguments of the node for launch arguments; those that are empty are not passed.
+    """Return ROS arguments of the node for the non-empty launch arguments.
 
-    The parameter file comes first: of a parameter that is set twice, ROS takes the later one. A
-    value that is not of the type of its parameter is a ConfigError.
+    The parameter file comes first, because ROS takes the later of two values. A value of the wrong
+    type raises ConfigError.
     """
     words = []
     if given.get('params_file'):
@@ -171,7 +171,7 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
 
 
 def node_options(given: Mapping[str, str]) -> dict[str, Any]:
-    """Return with what launch makes the node, for launch arguments."""
+    """Return the node options of launch arguments."""
     return {
         'package': 'calib_ros',
         'executable': NODE,
@@ -183,9 +183,9 @@ def node_options(given: Mapping[str, str]) -> dict[str, Any]:
 
 
 def typed(command: Sequence[str]) -> list[str]:
-    """Return a command line of the node on which ROS takes text as it was typed.
+    """Return a command line of the node on which ROS keeps text as typed.
 
-    ROS makes the number 10 of `-p serial:=0012`, and true of `-p serial:=yes`.
+    ROS reads `-p serial:=0012` as the number 10, and `-p serial:=yes` as true.
     """
     words = list(command)
     for k in range(1, len(words)):
@@ -199,10 +199,9 @@ def typed(command: Sequence[str]) -> list[str]:
 
 
 def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str]) -> None:
-    """Refuse launch arguments that do not exist: `ros2 launch` takes them and does nothing.
+    """Refuse unknown launch arguments, which `ros2 launch` ignores.
 
-    Where the command line names another launch file, which includes this one, its arguments are
-    not looked at.
+    Arguments of another launch file that includes this one are not checked.
     """
     names = [Path(word).name for word in command]
     if launch_file not in names:
@@ -214,14 +213,14 @@ def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str
 
 
 def switched(given: Mapping[str, str], name: str) -> bool:
-    """Return the value of a launch argument that switches something on or off."""
+    """Return the value of a boolean launch argument."""
     import yaml
 
     return bool(parse_like(False, yaml.safe_load(given[name]), f'launch argument "{name}"'))
 
 
 def rviz_config(text: str, namespace: str, fixed_frame: str = '') -> str:
-    """Return a configuration of RViz for the node in a namespace, and for another fixed frame."""
+    """Return an RViz configuration for the node in a namespace, and another fixed frame."""
     import yaml
 
     document = yaml.safe_load(text)
@@ -247,7 +246,7 @@ def _described(parameter: Parameter) -> str:
 
 
 def _as_yaml(parameter: Parameter, text: str) -> str:
-    """Return the text of a launch argument as YAML of the type of its parameter."""
+    """Return a launch argument as YAML of its parameter's type."""
     import yaml
 
     given: object = text
@@ -262,7 +261,7 @@ def _as_yaml(parameter: Parameter, text: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a YAML scalar in double quotes, on one line."""
+    """Return a text as a double-quoted YAML scalar on one line."""
     import yaml
 
     quoted: str = yaml.safe_dump(text, default_style='"', allow_unicode=True, width=2**31)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where errors end: around every callback, every service, and the node as a whole.
+"""Error boundaries: around every callback, every service, and the node as a whole.
 
 An exception in a callback would end the spinning.
 """
@@ -38,15 +38,15 @@ class Boundary:
         self._logger = logger
         self._logged: dict[str, str] = {}
         self.failed: dict[str, str] = {}
-        """What has failed since somebody has emptied it, in words."""
+        """Failures since it was last emptied."""
 
     def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """Return a callback that logs what it raises."""
+        """Return a callback that logs its exceptions."""
 
         def guarded(*arguments: Any) -> None:
             try:
                 callback(*arguments)
-            except InvalidHandle:  # the node was ended meanwhile: nobody hears any more
+            except InvalidHandle:  # the node has ended
                 return
             except Exception:
                 self._log()
@@ -54,7 +54,7 @@ class Boundary:
         return guarded
 
     def tried(self, what: str, work: Callable[[], Any]) -> Any:
-        """Return the result of a part of the work; report a failure and return None."""
+        """Return the result of some work, or report a failure and return None."""
         try:
             return work()
         except Exception as err:
@@ -65,7 +65,7 @@ class Boundary:
             return None
 
     def answer(self, name: str, work: Callable[[], Answer]) -> Answer:
-        """Run the work of a service; an error is its answer. Who reads the log sees it, too."""
+        """Run the work of a service; an error becomes its answer and is logged."""
         try:
             success, text = work()
         except CalibrationError as err:
@@ -75,7 +75,7 @@ class Boundary:
         except Exception as err:
             self._log()
             success, text = False, f'internal error, see the log: {err!r}'
-        if not success:  # rclpy knows calls by their line, and takes one severity for each
+        if not success:  # rclpy allows one severity per line of code
             self._logger.warning(f'{name}: {text}')
         elif text:
             self._logger.info(f'{name}: {text}')
@@ -86,17 +86,16 @@ class Boundary:
 
 
 class DeferredTrigger:
-    """A Trigger service whose work runs on a thread of its own.
+    """A Trigger service whose work runs on a separate thread.
 
     Jazzy's executors send the answer through the service's `send_response` right after the
-    callback, on the same thread. It is replaced here by one that holds the answer of an accepted
-    call back until its work has ended. An async callback starves the node's timers in rclpy's
-    single-threaded executor. Several threads, one for each such service and one for the rest,
-    would need a lock around all that the session holds, and cost an idle node 13 % more. A call
-    that comes meanwhile is refused at once.
+    callback, on the same thread. It is replaced here by one that holds the answer back until the
+    work has ended. An async callback starves the node's timers in rclpy's single-threaded
+    executor. Several threads, one for each such service and one for the rest, would need a lock
+    around the session, and cost an idle node 13 % more. A call during the work is refused at once.
 
-    `prepare` returns a snapshot, on the executor's thread, and `work` answers with it. `answer`
-    takes the name and either, and makes an answer of what it returns or raises.
+    `prepare` returns a snapshot on the executor's thread, `work` answers from it. `answer` takes
+    the name and either of them, and converts its result or exception to an answer.
     """
 
     def __init__(
@@ -145,15 +144,15 @@ class DeferredTrigger:
 
     def _run(self, snapshot: Any, response: Any, header: Any) -> None:
         response.success, response.message = self._answer(lambda: self._work(snapshot))
-        self._running.clear()  # before the answer: the caller may call again at once
+        self._running.clear()  # before the answer, since the caller may call again at once
         try:
             self._send(response, header)
-        except Exception:  # the node is gone meanwhile, and with it the one who asked
+        except Exception:  # the node has ended
             return
 
 
 def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
-    """Run the node that is made until SIGINT or SIGTERM; return the exit status.
+    """Run a node until SIGINT or SIGTERM; return the exit status.
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
     """
@@ -182,7 +181,7 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
     except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
         print(f'calibration_node: {err}', file=sys.stderr)
         status = 1
-    except OSError as err:  # a journal of another user, say
+    except OSError as err:  # such as a journal of another user
         print(f'calibration_node: {trouble(err)}', file=sys.stderr)
         status = 1
     finally:
@@ -193,7 +192,7 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
         if executor is not None:
             executor.shutdown()
         rclpy.try_shutdown()
-    if not finished:  # the interpreter cannot end while a thread computes
+    if not finished:  # a computing thread blocks the interpreter's exit
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)

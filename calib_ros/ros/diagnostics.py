@@ -36,9 +36,9 @@ class Diagnostics:
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
     def publish(self, status: str, answers: Callable[[], Mapping[str, Any]]) -> None:
-        """Publish the state, with the status in words, and failures since the last time.
+        """Publish the state, the status and failures since the last time.
 
-        `answers` returns what came of calls and requests.
+        `answers` returns the results of calls and requests.
         """
         tried = self._boundary.tried
         tried('the rates', self._inputs.look)

@@ -51,9 +51,9 @@ from calib_ros.settings import Settings
 
 
 class Filer:
-    """Files results of one robot, by its serial number, in a folder or URL; without one nothing.
+    """Files results of one robot, by serial number, in a folder or URL, or nowhere without one.
 
-    Identifications begin with the `nominal` chain.
+    Identifications start from the `nominal` chain.
     """
 
     def __init__(self, place: str, serial: str, nominal: Chain) -> None:
@@ -63,15 +63,15 @@ class Filer:
             raise ConfigError('a history needs the serial number of the robot: set serial as well')
 
     def identified(self, problem: Problem, result: Identification, settings: Settings) -> str:
-        """File an identification; return in words why that was not possible."""
+        """File an identification; return why that was not possible, or empty text."""
         return self._file(lambda: identified(result, self._about(problem, settings)))
 
     def validated(
         self, session: CalibrationSession, figures: tuple[ErrorFigures, ErrorFigures], holds: bool
     ) -> str:
-        """File how a session's calibration does on its samples, as `identified` does."""
+        """File the validation of a session's calibration, as `identified`."""
         calibration = session.calibration
-        assert calibration is not None  # else there were no figures
+        assert calibration is not None  # required for the figures
         chain, verdict = calibration.chain, 'holds' if holds else 'does not hold'
 
         def row() -> Row:
@@ -95,7 +95,7 @@ class Filer:
 
 
 ANSWER_LENGTH = LONGEST // 2
-"""Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
+"""Characters of an answer: a few terminal lines; the rest is in a file and the log."""
 
 
 class Snapshot(NamedTuple):
@@ -111,7 +111,7 @@ class Snapshot(NamedTuple):
     came: str = ''
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
-        """Return the numbers by which the operator knows the samples that are outliers."""
+        """Return the operator's numbers of outlier samples."""
         frames = named(self.samples)
         known = {(each.stamp_ns, *frames.of(each)): self.numbers[each] for each in self.samples}
         sets = self.problem.sets
@@ -122,9 +122,9 @@ class Snapshot(NamedTuple):
 
 
 class Identifying:
-    """Identify, report the result in words, and hand over an `accepted` one.
+    """Identifies, reports the result, and hands over an `accepted` one.
 
-    `configuration` returns what the node is set to as a parameter file.
+    `configuration` returns the node's settings as a parameter file.
     """
 
     def __init__(
@@ -141,13 +141,13 @@ class Identifying:
         self._residuals = node.create_publisher(MarkerArray, '~/residuals', to_ros.LATCHED)
         self.progress = Progress('identifying')
         self.last = 'nothing identified yet'
-        """What came of the last identification or ~/load, in words."""
+        """Result of the last identification or ~/load."""
         self.observability = ''
-        self._advice = ''  # of the last identification, that on what is graver first
+        self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused
 
     def snapshot(self, topics: Sequence[str]) -> Snapshot:
-        """Return the problem and all that goes with it, as they are now."""
+        """Return the current problem and its context."""
         session, self._advice, self._report = self._session, '', None
         problem = session.problem()
         samples = tuple(session.usable)
@@ -167,7 +167,7 @@ class Identifying:
         return found
 
     def run(self, given: Snapshot) -> Answer:
-        """Identify; publish only what is accepted."""
+        """Identify; publish only an accepted result."""
         try:
             with self.progress.running():
                 result = identify_model(given.problem, given.model, self.progress)
@@ -203,11 +203,11 @@ class Identifying:
         return result.accepted, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:
-        """Write the report of a refusal beside the journal: nobody will save it."""
+        """Write the report of a refusal beside the journal."""
         try:
             text = page()
             self._report = (text and self._archive.note(text, '.html')) or None
-        except Exception as err:  # whatever is wrong with the page, the answer is sent
+        except Exception as err:  # the answer is sent without the page
             self._node.get_logger().warning(f'the report of the refusal is not written: {err}')
         if self._report:
             self.last += f'; report: {self._report}'
@@ -215,7 +215,7 @@ class Identifying:
     def shortened(self, answer: Answer) -> Answer:
         """Return an answer cut to a few lines: the verdict, and what to do first.
 
-        All of it is in the log, and beside the journal.
+        The whole is in the log, and beside the journal.
         """
         success, text = answer
         if len(text) > ANSWER_LENGTH:
@@ -228,7 +228,7 @@ class Identifying:
 
 
 def _without_middle(text: str, longest: int) -> str:
-    """Return a text with its last clause, the advice, whole; the text before it is cut."""
+    """Return a text without its middle; the last clause, the advice, stays whole."""
     end = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
     room = longest - len(text) + end - 1
     if len(text) <= longest or not longest // 4 < room < end:
@@ -237,7 +237,7 @@ def _without_middle(text: str, longest: int) -> str:
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:
-    """Return the report of an identification, None where its extra is missing."""
+    """Return the report of an identification, or None without its packages."""
     from calib_ros.report.page import Origin, inputs_of, render
     from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report

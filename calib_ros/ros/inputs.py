@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's subscriptions, and how well they work.
+"""The node's subscriptions, and their health.
 
-Messages wait in the queues of their subscriptions, serialised, until they are taken by the batch:
-no executor may serve these subscriptions. Nor may it wait for their events, of lost messages say:
-Fast DDS wakes it for these as long as any message waits, and it would never rest.
+Messages wait serialised in the queues of their subscriptions until they are taken in batches. No
+executor may serve these subscriptions, nor wait for their events (such as lost messages): Fast DDS
+wakes it for these as long as any message waits, so it would never rest.
 """
 
 from __future__ import annotations
@@ -30,44 +30,44 @@ from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.slices import SILENCE
 
 IMAGE_QUEUE = BATCH // 100
-"""Images of a topic that may wait, as a BATCH of other messages, while the node is busy."""
+"""Images of a topic that may wait while the node is busy, as a BATCH of other messages."""
 
 
 @dataclass
 class Hearing:
-    """What has been heard on one topic; times [s] are those of the monotonic clock."""
+    """State of one topic; times [s] are monotonic."""
 
     count: int = 0
     before: int = 0
     rate: float = 0.0
     last: float | None = None
     deaf: str = ''
-    """The publisher's QoS that does not match the requested one, in words."""
+    """The publisher's QoS that does not match the requested one."""
     latched: bool = False
-    """True if it comes only once."""
+    """True if it is published only once."""
     lost: int = 0
-    """Messages lost in transit, as DDS counts them."""
-    told: int = 0
+    """Messages lost in transit, by DDS."""
+    reported: int = 0
     """The last total reported by DDS."""
     full: int = 0
-    """How often the queue was full, so that messages may be lost."""
+    """How often the queue was full."""
     lost_before: int = 0
     losing: bool = False
-    """True when either has grown between the last two looks."""
+    """True if either grew between the last two looks."""
 
     def note_lost(self, total: int) -> None:
-        """Count up to a total of lost messages; the change told with it leaves some out.
+        """Count up to a total of lost messages; its change omits some.
 
-        DDS counts with 32 bits, signed, and sometimes tells nonsense: a total that falls, or grows
-        by too many messages to be meant, is where it goes on from.
+        DDS counts in signed 32 bits, and sometimes reports nonsense: a total that falls, or grows
+        implausibly, is taken as the new start.
         """
-        more = (total - self.told) % 2**32
-        self.told = total
+        more = (total - self.reported) % 2**32
+        self.reported = total
         if more < 2**30:  # two weeks of 1 kHz
             self.lost += more
 
     def look(self, now: float, span: float) -> None:
-        """Note how many messages came in the last `span`."""
+        """Note how many messages arrived in the last `span`."""
         fresh, self.before = self.count - self.before, self.count
         self.rate = fresh / span
         lost, before = self.lost + self.full, self.lost_before
@@ -77,21 +77,21 @@ class Hearing:
 
     @property
     def silent(self) -> bool:
-        """Tell whether it has been heard before and is not any more."""
+        """Tell whether it has become silent."""
         if self.last is None or self.latched:
             return False
         return time.monotonic() - self.last > SILENCE
 
 
 class _Due:
-    """The wait set of one event that is polled."""
+    """The wait set of one polled event."""
 
     def add_event(self, event: object) -> int:
         """Take the event; return its number."""
         return 0
 
     def is_ready(self, kind: str, number: int) -> bool:
-        """Tell that it may be looked at."""
+        """Return True, so that it is looked at."""
         return True
 
 
@@ -111,7 +111,7 @@ class Inputs:
         self._events = dict.fromkeys((e for each in self._inputs for e in each.event_handlers), 0)
 
     def __contains__(self, entity: object) -> bool:
-        """Tell whether something is one of these subscriptions, or their events."""
+        """Tell whether an entity is one of these subscriptions or their events."""
         return entity in self._inputs or entity in self._events
 
     def take(self) -> list[tuple[Stream, bytes]]:
@@ -127,7 +127,7 @@ class Inputs:
 
     @property
     def topics(self) -> list[str]:
-        """Return the topics on which something has been heard."""
+        """Return the topics that have received something."""
         return [topic for topic, heard in self._heard.items() if heard.count]
 
     def look(self) -> None:
@@ -145,7 +145,7 @@ class Inputs:
             heard.look(now, span)
 
     def troubles(self) -> list[str]:
-        """Return in words which topics are not heard as they should be."""
+        """Return problems of topics as text."""
         wrong = [
             f'no more messages on {topic}' for topic, heard in self._heard.items() if heard.silent
         ]
@@ -190,7 +190,7 @@ class Inputs:
                 event_callbacks=self._noting(heard),
                 raw=True,
             )
-        except RuntimeError as err:  # what rclpy raises for a policy that there is not
+        except RuntimeError as err:  # unknown policy
             raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
         if subscription.qos_profile.depth < 1:
             raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
@@ -207,11 +207,11 @@ class Inputs:
         return SubscriptionEventCallbacks(
             incompatible_qos=self._guarded(note_deaf),
             message_lost=self._guarded(note_lost),
-            use_default_callbacks=False,  # `_of_other_types` tells
+            use_default_callbacks=False,  # reported by `_of_other_types`
         )
 
     def _of_other_types(self) -> list[str]:
-        """Return in words the topics published with another type, and so not heard."""
+        """Return topics that are published with another type."""
         found = {}
         for subscription, (stream, heard) in self._inputs.items():
             topic = subscription.topic_name
@@ -222,12 +222,12 @@ class Inputs:
 
 
 def deserialised(data: bytes, name: str) -> Any:
-    """Return the message of a type in its bytes."""
+    """Return a message from its bytes."""
     return deserialize_message(data, _message_type(name))
 
 
 def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
-    """Return the messages that wait, with the times at which they were received [ns]."""
+    """Return the waiting messages, with their times of receipt [ns]."""
     found = []
     with subscription.handle:
         for _ in range(BATCH):
@@ -239,7 +239,7 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
 
 
 def _qos(stream: Stream) -> QoSProfile:
-    """Return how a topic is asked for; a new one each time, because overriding changes it."""
+    """Return the QoS of a topic; a new one each time, because overriding changes it."""
     return QoSProfile(
         depth=IMAGE_QUEUE if stream.type in PICTURES else BATCH,
         reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,

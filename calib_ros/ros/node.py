@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node: topics in, services, corrected parameters out. `docs/node.md` describes it.
+"""The node (docs/node.md): topics in, services, corrected parameters out.
 
-A timer takes the messages that wait (`inputs.py`) by the batch: the executor does not wake for
-each of them. An identification runs on a thread of its own, on a snapshot of the samples, and its
-answer is sent when it has ended.
+A timer takes waiting messages (`inputs.py`) in batches, so the executor does not wake for each. An
+identification runs on a separate thread, on a snapshot of the samples, and answers when it ends.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-# Small matrices only: a second BLAS thread costs more than it gives, on a busy cell above all.
+# matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from rcl_interfaces.msg import SetParametersResult
@@ -52,14 +51,14 @@ from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0
-"""Time [s] between two reports on /diagnostics, as is usual there."""
+"""Time [s] between two reports on /diagnostics, the usual one."""
 TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
-"""Time [s] between two times at which the messages that have come are taken, all at once: one at
-a time, each in a cold cache, they cost three times as much."""
+"""Time [s] between two batches of messages: taken one by one, each in a cold cache, they cost
+three times as much."""
 JOIN_TIMEOUT = DIAGNOSTICS_PERIOD
 """Time [s] for which the shutdown waits for running work."""
 STATUS_LENGTH = 120
-"""Most characters of the status: `ros2 topic echo` cuts texts at 128."""
+"""Characters of the status: `ros2 topic echo` cuts texts at 128."""
 
 
 class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
@@ -89,7 +88,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         filer = Filer(given.history, given.serial, chain)
         self._filer, self._status_text = filer, ''
         self.lost = ''
-        """What samples were not kept in data_dir at the end, and why; empty when all were."""
+        """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
             self._resume()
         self._inputs = Inputs(self, self._streams(), self._boundary.guarded)
@@ -109,7 +108,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             candidates = read_joints(Path(given.candidates).expanduser(), chain)
         self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._working = self._serve()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time stands still, and jumps
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may stop and jump
         for period, work in (
             (DIAGNOSTICS_PERIOD, self._on_second),
             (TAKING_PERIOD, self._on_tick),
@@ -118,7 +117,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._load_at_start()
 
     def _serve(self) -> list[DeferredTrigger]:
-        """Create the services; return those that work on a thread of their own."""
+        """Create the services; return the deferred ones."""
         for kind, name, callback in (
             (Trigger, '~/cancel', lambda request: self._identifying.progress.cancel()),
             (Trigger, '~/capture', self._on_capture),
@@ -142,14 +141,14 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         ]
 
     def announce(self) -> None:
-        """Say that the node is ready, once an executor serves it."""
+        """Log that the node is ready, once an executor serves it."""
         self.get_logger().info(
             f'ready to calibrate {self.session.chain.name}: joints '
             f'{", ".join(self.session.joint_names)}; poses are kept in {self._archive.folder}'
         )
 
     def close(self) -> bool:
-        """Stop; return False when an identification still runs and must not be waited for."""
+        """Stop; return False if an identification still runs and must not be waited for."""
         ended = [each.join(JOIN_TIMEOUT) for each in self._working]
         ended.append(self._guide.join(JOIN_TIMEOUT))
         self._take_messages()
@@ -169,7 +168,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return words.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
-        """Refuse settings that no identification could use, and files of others."""
+        """Refuse settings that no identification could use, and forbidden files."""
         try:
             for each in changes:
                 if each.name in FILENAMES:
@@ -199,20 +198,20 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Return the subscriptions that an executor serves: not the inputs, which a timer does."""
-        inputs = getattr(self, '_inputs', ())  # rclpy asks while it makes the node
+        """Return the subscriptions that an executor serves, without the inputs."""
+        inputs = getattr(self, '_inputs', ())  # rclpy asks during construction
         return (each for each in super().subscriptions if each not in inputs)
 
     @property
     def waitables(self) -> Iterator[Waitable]:
-        """Return the events and others that an executor serves: not those of the inputs."""
+        """Return the waitables that an executor serves, without those of the inputs."""
         inputs = getattr(self, '_inputs', ())
         return (each for each in super().waitables if each not in inputs)
 
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Callable[..., None], *args: Any, **more: Any
     ) -> Subscription:
-        """Subscribe; a time that cannot be must not end the node."""
+        """Subscribe, so that an invalid time does not end the node."""
 
         def of_times(message: Any) -> None:
             if message.clock.sec >= 0:
@@ -251,7 +250,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         if wanted:
             try:
                 log.info(f'{self._on_load(None)[1]}: it is published')
-            except Exception as err:  # whatever is wrong with a file, samples can be taken
+            except Exception as err:  # samples can be taken without it
                 self._identifying.last = f'no calibration is published at startup: {err}'
                 log.error(self._identifying.last)
         elif path is not None:
@@ -265,7 +264,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     # Services
 
     def _up_to_now(self, begin: Callable[..., Any], *arguments: Any) -> Any:
-        """Begin the work of a call, with all messages received before it."""
+        """Start the work of a call after all messages received before it."""
         self._take_messages()
         return begin(*arguments)
 
@@ -293,7 +292,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     def _on_validate(self, request: Any) -> Answer:
         figures = self.session.validate()
         calibration = self.session.calibration
-        assert calibration is not None  # else there was nothing to judge
+        assert calibration is not None  # required to judge
         holds, text = words.verdict(calibration, *figures, self.session.reused())
         return holds, text + self._filer.validated(self.session, figures, holds)
 
@@ -338,7 +337,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._diagnostics.publish(status, self._answers)
 
     def _publish_status(self) -> str:
-        """Return how the session goes; its first words are published when they have changed."""
+        """Return the status; publish its first words when they change."""
         words = self.session.status(str(self._identifying.progress))
         trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
         text = textwrap.shorten(f'{trouble} {words}', STATUS_LENGTH, placeholder=' ...')

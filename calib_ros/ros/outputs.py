@@ -34,11 +34,11 @@ from calib_ros.sampling.session import CalibrationSession
 
 
 class Broadcast:
-    """Publishes where the arm stands, and where on its flange the target is.
+    """Publishes the frames of the arm's base and of the target on its flange.
 
-    The arm's base and flange are the links of the URDF that the chain lies between, if the chain
-    is that of a URDF; else the frames before and behind the DH table. Where the device is on the
-    flange (`in_hand`) the base leads to the target that stands, and the tool to the camera.
+    Base and flange are the links of the URDF that the chain connects, if it is from a URDF; else
+    the frames before and after the DH table. With the device on the flange (`in_hand`) the base
+    leads to the fixed target, and the tool to the camera.
     """
 
     def __init__(self, node: Node, given: Given, in_hand: bool, urdf: str) -> None:
@@ -62,7 +62,7 @@ class Broadcast:
             self._tool = described.frame('tool').matrix
 
     def publish(self, chain: Chain, world: str) -> None:
-        """Publish the frames of a calibrated chain whose measurements are in a frame `world`."""
+        """Publish the frames of a calibrated chain measured in the frame `world`."""
         if self._publisher is None:
             return
         given, transforms = self._given, []
@@ -90,10 +90,10 @@ FILENAMES = ('target_filename', 'calibration_filename')
 
 
 class Published(NamedTuple):
-    """A calibration as the text of a file, and how it was made, if that is known.
+    """A calibration as the text of a file, with its settings, if known.
 
-    `page` makes the report of its identification, which takes a while; it returns None where
-    that cannot be made.
+    `page` makes the report of its identification, which takes a while; it returns None if that is
+    not possible.
     """
 
     text: str
@@ -110,12 +110,12 @@ class Keeper:
         self._node, self._session, self._archive = node, session, archive
         self._given, self._urdf = given, urdf
         self._published = Published('', '')
-        self._lock = threading.Lock()  # identifications end on a thread of their own
+        self._lock = threading.Lock()  # identifications end on their own thread
         self._posed: tuple[int, Sequence[float]] | None = None
         self._dh_parameters = node.create_publisher(Float64MultiArray, '~/dh_parameters', LATCHED)
         self._calibration = node.create_publisher(String, '~/calibration', LATCHED)
         for name in FILENAMES:
-            self._named(name)  # refused now rather than after a day's work
+            self._named(name)  # refuse bad names at the start
         sources = parse_sources(given.settings.sources)
         in_hand = bool(sources) and all(source.eye_in_hand for source in sources)
         self._broadcast = Broadcast(node, given, in_hand, urdf)
@@ -127,7 +127,7 @@ class Keeper:
         published: Published,
         samples: Sequence[Sample] | None = None,
     ) -> None:
-        """Take a calibration as the one in use (`CalibrationSession.adopt`)."""
+        """Use a calibration (`CalibrationSession.adopt`)."""
         with self._lock:
             self._session.adopt(calibration, samples)
             self._published = published
@@ -144,7 +144,7 @@ class Keeper:
     def save(self, published: Published) -> list[Path]:
         """Write a calibration to `target_filename` or a new file, and its report beside it.
 
-        Returns the paths. Without the report the calibration is saved all the same.
+        Returns the paths. The calibration is saved even without the report.
         """
         path = self._archive.save(
             published.text, published.configuration, self._named('target_filename')
@@ -156,18 +156,18 @@ class Keeper:
                 report = path.with_suffix('.html')
                 write_file(report, page)
                 written.append(report)
-        except Exception as err:  # whatever is wrong with the page, the calibration is saved
+        except Exception as err:  # the calibration is saved without the page
             self._node.get_logger().warning(f'the report of {path} is not written: {err}')
         return written
 
     def at_start(self) -> tuple[Path | None, bool]:
-        """Return the calibration to load, and whether to load it at startup."""
+        """Return the calibration file found at startup, and whether to load it."""
         named = self._named('calibration_filename')
         path = named or self._archive.newest_calibration()
         return path, path is not None and (named is not None or self._given.autoload)
 
     def load(self) -> Path:
-        """Take the calibration in `calibration_filename` or the newest one; return its path."""
+        """Load the calibration in `calibration_filename` or the newest one; return its path."""
         path, _ = self.at_start()
         session = self._session
         if path is None:
@@ -187,7 +187,7 @@ class Keeper:
         return path
 
     def exportable(self) -> tuple[Calibration, FloatArray | None]:
-        """Return the calibration, and the joint values (N, n) of the samples, as they are now."""
+        """Return the calibration, and the joint values (N, n) of the samples."""
         session = self._session
         if session.calibration is None:
             raise InputError('there is no calibration to export: call ~/identify or ~/load first')
@@ -196,9 +196,9 @@ class Keeper:
             return session.calibration, joints if len(joints) else None
 
     def export(self, found: tuple[Calibration, FloatArray | None]) -> tuple[bool, str]:
-        """Write a calibration in all forms, checked at joint values (N, n).
+        """Write a calibration in all formats, checked at joint values (N, n).
 
-        Return success, and where in words.
+        Returns success, and where.
         """
         (calibration, joints), nominal = found, self._session.chain
         chain, record = calibration.chain, calibration.record
@@ -223,11 +223,11 @@ class Keeper:
         )
 
     def _named(self, parameter: str) -> Path | None:
-        """Return the file that a parameter names, which any node may have set, if it does."""
+        """Return the file that a parameter names, if any; any node may have set it."""
         return self.file_of(parameter, self._node.get_parameter(parameter).value)
 
     def file_of(self, parameter: str, name: str) -> Path | None:
-        """Return the file of a name that a parameter has or shall have; None without a name."""
+        """Return the file for a parameter's name; None without one."""
         if not name:
             return None
         if not name.endswith(('.yaml', '.yml')):
@@ -241,13 +241,13 @@ class Keeper:
 
 
 def _calibration_text(path: Path) -> str:
-    """Return the text of a chain file; of any other file the answer must tell nothing."""
+    """Return the text of a chain file; the content of other files must not leak."""
     if not path.is_file():
         raise InputError(f'there is no file {path}')
     try:
         text = read_text(path)
         parse_chain(text)
-    except Exception as err:  # whatever it is, its words may quote the file
+    except Exception as err:  # its text may quote the file
         if isinstance(err.__cause__, OSError):
             raise
         raise InputError(

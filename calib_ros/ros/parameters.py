@@ -1,8 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node's settings: parameters with their ranges, and the robot they name.
+"""The node's parameters, and the robot they name.
 
-Every field of `Settings` is a parameter of the same name, with its text and its smallest value;
+Every field of `Settings` is a parameter of the same name, with its description and smallest value;
 `arguments.py` lists the others.
 """
 
@@ -31,28 +31,28 @@ from calib_ros.values import LARGEST_SETTING, parse_like
 
 QOS = 'qos_overrides.'
 OF_ROS = ('use_sim_time', 'start_type_description_service')
-"""Parameters that rclpy itself declares."""
+"""Parameters declared by rclpy."""
 DESCRIPTION_WAIT = 2.0 * SILENCE
-"""Time [s] for which the node waits for the robot's description."""
+"""Time [s] to wait for the robot's description."""
 
 
 class Given(SimpleNamespace):
-    """Parameters by their names, and the `settings`, with which a node was started.
+    """Parameters by name, and the `settings`, as given at the start.
 
-    What may change is read where it is used.
+    Those that can change are read where they are used.
     """
 
     @property
     def links(self) -> dict[str, Any]:
-        """Return the first and last link of the arm in a URDF; None for those to be found."""
+        """Return the first and last link of the arm in a URDF; None to find them."""
         return {'base_link': self.base_link or None, 'tip_link': self.tip_link or None}
 
 
 def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
-    """Declare all parameters of the node; return what they were set to, and the names that were.
+    """Declare all parameters of the node; return their values, and the names that were set.
 
-    The node declares all parameters that are set, because rclpy lists them in no other way. Each
-    is declared again here, with its description. An impossible value is a ConfigError.
+    The node declares whatever is set, because rclpy lists it in no other way. Each parameter is
+    declared again here with its description. Impossible values raise ConfigError.
     """
     overrides = {
         name: each.value
@@ -77,7 +77,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
 
 
 def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
-    """Return settings with changed parameters applied."""
+    """Return settings with changed parameters."""
     values = {
         each.name: parse_like(getattr(Settings, each.name), each.value, each.name)
         for each in changes
@@ -114,7 +114,7 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
 def refuse_unknown(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.') -> None:
     """Refuse names of parameters that were set but do not exist; ROS ignores them.
 
-    Names that begin with `later` are let pass: what they set comes into being later, or not.
+    Names that start with `later` are accepted: their parameters may be declared later.
     """
     known = [*node.get_parameters_by_prefix('')]
     for name in names:

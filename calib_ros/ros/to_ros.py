@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Results as ROS messages.
 
-Jazzy's messages do not check their fields, and an int or a numpy number where a float belongs
-arrives as garbage: everything is made a plain Python value here.
+Jazzy's messages do not check their fields, and an int or a numpy number instead of a float arrives
+as garbage: everything is converted to plain Python values here.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""For topics whose last message a late subscriber gets."""
+"""For topics whose last message late subscribers receive."""
 
 
 def dh_parameters(chain: Chain) -> Float64MultiArray:
@@ -47,7 +47,7 @@ def dh_parameters(chain: Chain) -> Float64MultiArray:
 
 
 def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) -> PoseStamped:
-    """Return the pose of the target at joint values (n) of a stamp."""
+    """Return the pose of the target at joint values (n)."""
     matrix = chain.forward(np.array([joints]))[0]
     message = PoseStamped()
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
@@ -59,7 +59,7 @@ def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) ->
 
 
 def transform(matrix: FloatArray) -> Transform:
-    """Return a matrix (4, 4)."""
+    """Return a matrix (4, 4) as a message."""
     x, y, z, w = to_quat(matrix[:3, :3]).tolist()
     shift = dict(zip('xyz', matrix[:3, 3].tolist(), strict=True))
     return Transform(translation=Vector3(**shift), rotation=Quaternion(x=x, y=y, z=z, w=w))
@@ -92,8 +92,8 @@ def residual_markers(
 ) -> MarkerArray:
     """Return the residual at each measured position, enlarged `scale` times.
 
-    A line from the measured position towards the predicted one: green for a small residual, red
-    for one of three times the RMS and beyond.
+    A line from the measured position towards the predicted one: green if small, red from three
+    times the RMS.
     """
     lines = Marker(ns='residuals', id=0, type=Marker.LINE_LIST, action=Marker.ADD)
     lines.header.stamp = stamp
