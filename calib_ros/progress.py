@@ -12,17 +12,17 @@ from typing import TypeAlias
 
 from calib_ros.errors import CalibrationError
 
-Told: TypeAlias = Callable[[str | float], None]
+Notify: TypeAlias = Callable[[str | float], None]
 """Called with each stage that begins (text), and with the share done."""
 
 
-def nobody(at: str | float) -> None:
+def quiet(at: str | float) -> None:
     """Ignore progress."""
 
 
-def share_of(told: Told, begin: float, end: float) -> Told:
+def share_of(progress: Notify, begin: float, end: float) -> Notify:
     """Return a progress function for a part of the work, between two shares of the whole."""
-    return lambda at: told(at if isinstance(at, str) else begin + at * (end - begin))
+    return lambda at: progress(at if isinstance(at, str) else begin + at * (end - begin))
 
 
 class CancelledError(CalibrationError):

@@ -26,7 +26,7 @@ from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
 
@@ -125,12 +125,12 @@ def compensate(
     compensator: Compensator,
     joints: FloatArray,
     approach: FloatArray | None = None,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Compensation:
     """Correct joint commands (N, n) [rad or m], given in their order of execution.
 
-    `approach` (N, n) holds the signs of the preceding velocities, for backlash; `told` receives
-    the share done.
+    `approach` (N, n) holds the signs of the preceding velocities, for backlash; `progress`
+    receives the share done.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def compensate(
     if approach is not None and np.shape(approach) != command.shape:
         raise InputError(f'approach must have the shape {command.shape} of the joint values')
     follower = compensator.follower
-    solution = follower.solve(command, approach, told=told)
+    solution = follower.solve(command, approach, progress=progress)
     joints = np.clip(command + solution.change, follower.lower, follower.upper)  # rounding
     result = Compensation(**vars(solution), command=command, joints=joints)
     result = refused(result, _outside(compensator, result))

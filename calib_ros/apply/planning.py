@@ -30,7 +30,7 @@ from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.identification.configurations import STILL
 from calib_ros.identification.identifiability import indices_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import CRITERIA, Criterion
 from calib_ros.shown import Shown, as_frame
 
@@ -46,7 +46,7 @@ def choose(
     criterion: Criterion = 'd',
     task: FloatArray | None = None,
     apart: float = STILL,
-    told: Told = nobody,
+    progress: Notify = quiet,
     start: Index | None = None,
     exchanged: bool = True,
 ) -> Index:
@@ -63,13 +63,13 @@ def choose(
     worth = _Worth(space, criterion, task)
     first = worth if criterion == 'task' else _Worth(space, 'd')
     pick = _Pick(space, apart)
-    told(f'{count} poses')
+    progress(f'{count} poses')
     for k in range(count):
         pick.add(pick.best(first) if start is None else int(start[k]))
     rounds = 1
     while exchanged and pick.exchange(worth):
         rounds += 1
-        told(f'{count} poses, exchange {rounds}')
+        progress(f'{count} poses, exchange {rounds}')
     return pick.in_order(first)
 
 
@@ -267,7 +267,7 @@ def plan(
     apart: float = STILL,
     velocities: FloatArray | None = None,
     draws: int = 25,
-    told: Told = nobody,
+    progress: Notify = quiet,
     chosen: Index | None = None,
 ) -> Plan:
     """Plan a number of measurements, and compare them with random draws.
@@ -278,7 +278,7 @@ def plan(
     """
     excited = design.determined_by(candidates)
     if chosen is None:
-        chosen = choose(excited, candidates, count, criterion, task, apart, told)
+        chosen = choose(excited, candidates, count, criterion, task, apart, progress)
     joints = candidates[chosen]
     speeds = np.ones(joints.shape[1]) if velocities is None else velocities
     visit = visit_order(joints, speeds)
@@ -308,7 +308,7 @@ def fewest(
     wanted: float,
     criterion: Criterion = 'd',
     apart: float = STILL,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Index:
     """Return the indices (K,) of the fewest poses with the accuracy `wanted`, best first.
 
@@ -325,7 +325,9 @@ def fewest(
     count = len(excited.names)  # poses determine several parameters each
     while True:
         count = min(count, len(candidates))
-        found = choose(excited, candidates, count, criterion, task, apart, told, exchanged=False)
+        found = choose(
+            excited, candidates, count, criterion, task, apart, progress, exchanged=False
+        )
         errors = accuracy(excited, candidates[found], task)
         if errors[-1] <= wanted:
             break
@@ -335,7 +337,9 @@ def fewest(
     while reached > 1:  # the first of many are not the best of few
         start = found[:reached] if reached < len(found) else found[: reached - 1]
         for begin in (start, None):  # quick first
-            fewer = choose(excited, candidates, len(start), criterion, task, apart, told, begin)
+            fewer = choose(
+                excited, candidates, len(start), criterion, task, apart, progress, begin
+            )
             errors = accuracy(excited, candidates[fewer], task)
             if errors[-1] <= wanted:
                 break

@@ -20,7 +20,7 @@ from calib_ros.apply.compensation import (
 )
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.shown import Shown
 
 NUDGE = HALF_THE_DIGITS**0.25
@@ -52,12 +52,12 @@ class Program(Shown):
 
 
 def compensate_program(
-    compensator: Compensator, program: Program, told: Told = nobody
+    compensator: Compensator, program: Program, progress: Notify = quiet
 ) -> tuple[Program, Compensation]:
     """Return a program with corrected joint values, and the outcome at each point.
 
     Velocities and accelerations follow the corrected path; times and other joints do not change.
-    Refused points are NaN; `told` receives the share done.
+    Refused points are NaN; `progress` receives the share done.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def compensate_program(
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]
     approach = approaches(positions) if program.approach is None else program.approach
-    result = compensate(compensator, positions, approach, told)
+    result = compensate(compensator, positions, approach, progress)
     if program.velocities is None:
         return replace(program, positions=_put(program.positions, columns, result.joints)), result
     given = program.accelerations

@@ -43,7 +43,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
 from calib_ros.values import SAME
@@ -151,7 +151,7 @@ def verify(
     new_base: bool = False,
     commanded: FloatArray | None = None,
     new_tool: bool = False,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
@@ -172,7 +172,7 @@ def verify(
     commanded : (M, n), optional
         Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
         poses there. Each measurement belongs to one of them (`commanded.py`).
-    told : Told
+    progress : Notify
         Receives the share done.
 
     Raises
@@ -184,7 +184,7 @@ def verify(
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm.chain, sets, tolerance, confidence, fitted)
     comparison, left = _compared(arm, sets, commanded, fitted)
-    told(2 / 3)
+    progress(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
     moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # simulated without noise

@@ -21,7 +21,7 @@ from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.se3 import Flags, FloatArray
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import AIMS, EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Aim, Model
 from calib_ros.shown import Shown
 
@@ -196,7 +196,7 @@ def place(
     refinements: int = 4,
     starts: int = 6,
     drawn: int = 20_000,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Placements:
     """Find the placement of a task with the smallest expected error, mean or worst of its poses.
 
@@ -207,7 +207,7 @@ def place(
     nearest `starts` of `drawn` random joint values. An arm with fewer than six freedoms reaches a
     pose at its position, with the orientation to 0.02 rad.
     """
-    search = _Search(arm, task, aim, model, starts, drawn, told)
+    search = _Search(arm, task, aim, model, starts, drawn, progress)
     corners = search.reach if region is None else region
     if not (corners[0] <= corners[1]).all():
         raise InputError(
@@ -252,12 +252,12 @@ class _Search:
         model: Model,
         starts: int,
         drawn: int,
-        told: Told,
+        progress: Notify,
     ) -> None:
         if aim not in AIMS:
             raise UnknownNameError('aim', aim, AIMS)
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
-        self._starts, self._told, self._solved = starts, told, 0
+        self._starts, self._progress, self._solved = starts, progress, 0
         self._chain = arm.commanded_by(model)
         self._complete = mobility(self._chain)[0] == 6
         self._base = self._chain.frame('base').matrix
@@ -303,7 +303,7 @@ class _Search:
             reached[placement, branch] = near
             self._solved += len(wanted)
             left = np.count_nonzero(reached) * (length - k - 1) + later * self._starts * length
-            self._told(self._solved / max(self._solved + left, 1))
+            self._progress(self._solved / max(self._solved + left, 1))
         return joints, reached
 
 

@@ -53,7 +53,7 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
     judging = np.arange(len(rows)) >= len(fitted)
     recording = Recording.of_dwells(chain.joint_names, rows, judging)
     with screen.work(f'writing {options.bag.name}') as work:
-        write_bag(options.bag, recording, options.storage, told=work)
+        write_bag(options.bag, recording, options.storage, progress=work)
     screen.say(f'wrote {options.bag}: {len(fitted)} poses to fit, {len(held_out)} held out')
     return 0
 

@@ -89,8 +89,8 @@ def origin_of(
     """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    told = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
-    return page.Origin(page.inputs_of(known), settings=settings, command=options.typed, **told)
+    people = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
+    return page.Origin(page.inputs_of(known), settings=settings, command=options.typed, **people)
 
 
 def page_of(

@@ -209,8 +209,8 @@ def _detected(
             f'{options.places} holds {"poses of the flange" if posed else "joint values"}: '
             + (f'give --chain {boards.POSED}' if posed else 'give the chain of the arm')
         )
-    seen, told = boards.observed(found, board, places, options.eye_in_hand)
-    warnings = (*left_out, *told)
+    seen, notes = boards.observed(found, board, places, options.eye_in_hand)
+    warnings = (*left_out, *notes)
     more: Sequence[Observations] = ()
     held_out: Sequence[Observations] = ()
     by_line = True

@@ -22,7 +22,7 @@ from calib_ros.files.programs import joints_csv, read_joints
 from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.progress import Told
+from calib_ros.progress import Notify
 from calib_ros.report.advice import ENOUGH
 from calib_ros.report.applied import plan_report
 
@@ -69,7 +69,7 @@ def _measurement(
     design: Design,
     visibility: Visibility,
     rng: np.random.Generator,
-    told: Told,
+    progress: Notify,
 ) -> tuple[FloatArray, str, Plan]:
     """Return the poses to measure in visiting order, their predicted accuracy, and the plan."""
     size = len(design.chain.joints)
@@ -88,7 +88,7 @@ def _measurement(
             raise InputError(
                 f'the device can measure the target at no pose of {options.candidates}'
             )
-    choice = {'criterion': options.criterion, 'apart': options.apart, 'told': told}
+    choice = {'criterion': options.criterion, 'apart': options.apart, 'progress': progress}
     needed = chosen = None
     if options.accuracy is not None:
         fewest = planning.fewest(design, candidates, task, 1e-3 * options.accuracy, **choice)

@@ -131,13 +131,16 @@ class Work(Progress):
             progress.SpinnerColumn(),
             progress.TextColumn('{task.description}', markup=False),
             progress.BarColumn(bar_width=20),
-            progress.TextColumn('{task.fields[told]}'),
+            progress.TextColumn('{task.fields[times]}'),
         )
         with progress.Progress(*columns, console=console, transient=True) as bar:
-            task = bar.add_task('', total=None, told='')
+            task = bar.add_task('', total=None, times='')
             while True:
                 total = 1.0 if 0.0 < self.share < 1.0 else None
-                shown: dict[str, Any] = {'description': _printable(self.words), 'told': self.times}
+                shown: dict[str, Any] = {
+                    'description': _printable(self.words),
+                    'times': self.times,
+                }
                 bar.update(task, total=total, completed=self.share, **shown)
                 if self.done.wait(FIRST_S / 5):
                     break

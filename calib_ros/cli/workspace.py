@@ -53,7 +53,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         region = None if options.region is None else np.reshape(options.region, (2, 3))
         with screen.work('placing the task') as work:
             where = (region, options.cells, options.turns)
-            found = workspace.place(arm, task, options.aim, options.model, *where, told=work)
+            found = workspace.place(arm, task, options.aim, options.model, *where, progress=work)
         screen.say(workspace.in_words(found, options.aim, options.model))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)

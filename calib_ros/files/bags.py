@@ -15,7 +15,7 @@ from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
 from calib_ros.identification.reasons import Reason, Rule
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.hints import LOST, Account, lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
@@ -63,7 +63,7 @@ class Replayed:
         )
 
 
-def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -> Replayed:
+def replay(path: Path | str, session: CalibrationSession, progress: Notify = quiet) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
     Parameters
@@ -72,7 +72,7 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
         Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
     session : CalibrationSession
         Receives the messages; its settings name topics if the types are ambiguous.
-    told : Told
+    progress : Notify
         Receives the share of messages read.
     """
     path = Path(path)
@@ -80,10 +80,10 @@ def replay(path: Path | str, session: CalibrationSession, told: Told = nobody) -
         raise InputError(f'there is no bag at {path}: give its folder or one of its files')
     session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
     with stored.unpacked_files(path) as folder:
-        return _replay(path, folder, session, told)
+        return _replay(path, folder, session, progress)
 
 
-def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -> Replayed:
+def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Notify) -> Replayed:
     """Feed the files of a bag, or those unpacked from it, in a folder."""
     rosbag2()  # required even for damaged files
     try:
@@ -100,7 +100,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, told: Told) -
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
         messages = stored.read(reader, streams)
-        count, problem = _feed(session, messages, deserialise, told, expected)
+        count, problem = _feed(session, messages, deserialise, progress, expected)
     if problem is not None and count == 0:
         found = stored.salvage(folder)
         if found is not None:
@@ -279,7 +279,7 @@ def _feed(
     session: CalibrationSession,
     messages: Iterator[tuple[Stream, bytes]],
     deserialise: Deserialise,
-    told: Told = nobody,
+    progress: Notify = quiet,
     expected: int = 0,
 ) -> tuple[int, str | None]:
     """Feed serialised messages and report their share; return their number, and any problem."""
@@ -295,6 +295,6 @@ def _feed(
                 f'messages without data, or of more than {stored.LARGEST_MESSAGE} bytes'
             )
         problem = (problem, *problems)[-1]
-        told(count / max(expected, count, 1))
+        progress(count / max(expected, count, 1))
     session.finish()
     return count, problem

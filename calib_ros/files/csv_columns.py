@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, Row, numbered, of_cells
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
 from calib_ros.values import MOST_NAMES
 
@@ -128,7 +128,7 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
     return found
 
 
-def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> Columns:
+def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0) -> Columns:
     """Return the columns of a CSV's content; refuse anything else, or too large.
 
     `above` is the number of lines of the file before it.
@@ -142,7 +142,7 @@ def columns_of(path: Path, data: bytes, told: Told = nobody, above: int = 0) -> 
     if not data.isascii():
         data = decoded(data, str(path), InputError).encode()
     found = regular(path, data, above=above)
-    return found or _irregular(path, data.decode(), told, above)
+    return found or _irregular(path, data.decode(), progress, above)
 
 
 def regular(
@@ -188,13 +188,13 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
     return ends if (flat[ends[width::width]] == ord('\n')).all() else None
 
 
-def _irregular(path: Path, text: str, told: Told, above: int) -> MadeColumns:
+def _irregular(path: Path, text: str, progress: Notify, above: int) -> MadeColumns:
     """Return the columns of a text with quotes, or with rows that end early."""
     header: list[str] = []
     rows: list[Row] = []
     most = text.count('\n') + 1
     for line, row in csv_rows(path, text, strict=True):
-        told(min(line / most, 1.0))
+        progress(min(line / most, 1.0))
         line += above
         if not (row and header):
             header = header or [name.strip() for name in row]

@@ -21,7 +21,7 @@ from calib_ros.identification.reasons import Reason
 from calib_ros.identification.records import Owner
 from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
@@ -44,10 +44,10 @@ class Loaded:
     instead: bool = False  # the refusals replace those of the result
     owners: Mapping[str, Owner] = field(default_factory=dict)  # of the frames, from a bag
 
-    def identified(self, model: str, told: Told = nobody) -> Identification:
+    def identified(self, model: str, progress: Notify = quiet) -> Identification:
         """Identify, and refuse the result if too much of the input is lost."""
         try:
-            result = identify_model(self.problem, model, told)
+            result = identify_model(self.problem, model, progress)
         except TooFewObservationsError as err:
             if self.read:
                 raise too_few(err, '; '.join((self.read, *self.warnings))) from err
@@ -57,11 +57,11 @@ class Loaded:
 
 
 def replayed(
-    path: Path, chain: Chain, settings: Settings, told: Told = nobody
+    path: Path, chain: Chain, settings: Settings, progress: Notify = quiet
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has replayed a bag."""
     session = CalibrationSession(chain, settings)
-    return session, replay(path, session, told)
+    return session, replay(path, session, progress)
 
 
 def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:
@@ -80,7 +80,7 @@ def table(
     sessions: Sequence[str] = (),
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Table:
     """Return a table of measurements of a chain.
 
@@ -90,11 +90,11 @@ def table(
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     given = path, len(chain.joints), sessions, sigmas, eye_in_hand
     try:
-        return read_table(*given, foreign, told)
+        return read_table(*given, foreign, progress)
     except ColumnsError:
         if foreign is None:
             with suppress(CalibrationError):  # keep the first error
-                return read_table(*given, Foreign(Layout(), chain), told)
+                return read_table(*given, Foreign(Layout(), chain), progress)
         raise
 
 

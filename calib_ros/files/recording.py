@@ -18,7 +18,7 @@ from calib_ros.atomic import whole_folder, write_file
 from calib_ros.files.bags import rosbag2, typestore
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray, to_quat
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.messages import JOINT_STATE, VALIDATION
 
 
@@ -52,7 +52,7 @@ def write_bag(
     recording: Recording,
     storage: str = 'mcap',
     beside: Mapping[Path, str] | None = None,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> None:
     """Write a recording as a rosbag2 folder, ordered by stamp, whole or not at all.
 
@@ -61,7 +61,7 @@ def write_bag(
     """
     with whole_folder(path) as folder:
         try:
-            _write_bag(folder, recording, storage, told)
+            _write_bag(folder, recording, storage, progress)
         except (OSError, sqlite3.Error) as err:
             full = errno.ENOSPC if 'full' in str(err) else None
             raise OSError(getattr(err, 'errno', None) or full, str(err), str(path)) from err
@@ -69,7 +69,7 @@ def write_bag(
             write_file(file, text, overwrite=True)
 
 
-def _write_bag(path: Path, recording: Recording, storage: str, told: Told) -> None:
+def _write_bag(path: Path, recording: Recording, storage: str, progress: Notify) -> None:
     library = rosbag2()
     store = typestore()
     types = store.types
@@ -102,7 +102,7 @@ def _write_bag(path: Path, recording: Recording, storage: str, told: Told) -> No
             for prefix in ('measured_', VALIDATION)[: 1 + int(recording.held_out.any())]
         ]
         for done, k in enumerate(np.argsort(stamps, kind='stable').tolist()):
-            told(done / len(stamps))
+            progress(done / len(stamps))
             stamp_ns = int(stamps[k])
             pose = k - len(recording.joints)
             if pose < 0:

@@ -39,7 +39,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.problems import Measured
 from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
 from calib_ros.settings import Settings
@@ -65,7 +65,7 @@ def read_table(
     sigmas: tuple[float, float] = USUAL_SIGMAS,
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Table:
     """Read a CSV table, or one in any other layout.
 
@@ -83,7 +83,7 @@ def read_table(
         All poses are of a fixed target in a camera on the flange.
     foreign : Foreign, optional
         How to read a table from another system.
-    told : Told
+    progress : Notify
         Receives the share read.
 
     Raises
@@ -97,12 +97,12 @@ def read_table(
         made, warnings = foreign.convert(path)
         return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
     if path.is_file() and path.stat().st_size > LARGEST_TABLE:
-        rows, warnings = _of_journal(path, joints, told) or (None, ())
+        rows, warnings = _of_journal(path, joints, progress) or (None, ())
         if rows is not None:
             chosen = rows.select(_rows_of(path, rows.session, sessions))
             return _table(chosen, sigmas, eye_in_hand, warnings)
     data, warnings = _read(path, columns(joints))
-    found = columns_of(path, data, told)
+    found = columns_of(path, data, progress)
     warnings = (*warnings, *_unread(found, joints))
     return table_of(found, joints, sessions, sigmas, eye_in_hand, warnings)
 
@@ -189,7 +189,7 @@ def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str
 
 
 def _of_journal(
-    path: Path, joints: int, told: Told = nobody
+    path: Path, joints: int, progress: Notify = quiet
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
     """Return the rows of a journal, None if empty, and warnings; None for other files.
 
@@ -212,7 +212,7 @@ def _of_journal(
                     lines += whole.count(b'\n') + 1
                 if len(rest) > LARGEST_TEXT:
                     raise InputError(f'{path}, line {lines + 1} is incomplete: is it a journal?')
-                told(min(file.tell() / size, 1.0))
+                progress(min(file.tell() / size, 1.0))
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
     made = joined(parts) if parts else None

@@ -23,7 +23,7 @@ from calib_ros.errors import CalibrationError, ConfigError, shortened, trouble
 from calib_ros.files.history import History, Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
 ANSWER_S = 60.0
@@ -76,7 +76,7 @@ def run(
     history: History,
     cluster: Cluster,
     out: Path | None = None,
-    told: Told = nobody,
+    progress: Notify = quiet,
 ) -> Run:
     """Identify all new sources, file results, and write the page of each robot's newest one.
 
@@ -93,11 +93,11 @@ def run(
                 continue
             if client is None:
                 client = stack.enter_context(_client(cluster))
-                told(f'dashboard: {client.dashboard_link}')
+                progress(f'dashboard: {client.dashboard_link}')
             for number, (task, outcome) in enumerate(_done(client, tasks), 1):
                 _keep(task, outcome, history, out, found)
-                told(f'{number} of {len(tasks)}: {task.robot.serial}')
-                told(number / len(tasks))
+                progress(f'{number} of {len(tasks)}: {task.robot.serial}')
+                progress(number / len(tasks))
     return found
 
 

@@ -161,9 +161,9 @@ def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
     terms = [np.ones(len(places)), *centred.T, *(one * other for one, other in pairs)]
     columns = weights * np.array(terms)
     basis, factor = np.linalg.qr(columns.T)
-    told = np.abs(np.diag(factor)) > DEGENERATE * np.linalg.norm(columns, axis=1)[: len(factor)]
-    told[0] = False
-    return np.asarray(basis.T[told] * np.sqrt(total / max(told.sum(), 1)))
+    used = np.abs(np.diag(factor)) > DEGENERATE * np.linalg.norm(columns, axis=1)[: len(factor)]
+    used[0] = False
+    return np.asarray(basis.T[used] * np.sqrt(total / max(used.sum(), 1)))
 
 
 def _rows(samples: Samples, waves: FloatArray) -> FloatArray:

@@ -102,7 +102,7 @@ def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ..
     structural = identifiability.structurally_independent(
         model, problem.free, problem.kinds, separations
     )
-    held = identifiability.untold_size(model, problem.free, problem.kinds, structural)
+    held = identifiability.undetermined_size(model, problem.free, problem.kinds, structural)
     if held is not None:
         structural = identifiability.structurally_independent(
             model, [n for n in problem.free if n != held], problem.kinds, separations

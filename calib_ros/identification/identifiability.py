@@ -127,14 +127,14 @@ def structurally_independent(
     return independent(np.asarray(np.linalg.qr(np.concatenate(rows), mode='r')), names)
 
 
-def untold_size(
-    chain: Chain, names: Sequence[str], kinds: Sequence[Kind], told: Sequence[str]
+def undetermined_size(
+    chain: Chain, names: Sequence[str], kinds: Sequence[Kind], structural: Sequence[str]
 ) -> Parameter | None:
     """Return the longest length of the arm if nothing measures its size, else None.
 
     Sockets and planes alone fit a larger arm in a larger cell as well: a gauge of what is
     measured, but not of positions elsewhere. Holding the longest length at nominal distorts the
-    size least. `told` are the structurally identifiable parameters.
+    size least. `structural` are the structurally identifiable parameters.
     """
     if not all(kind.socket or kind.plane for kind in kinds):
         return None
@@ -142,7 +142,7 @@ def untold_size(
     arm = {name for name in names if not chain.owns_frame(name)}
     every = [*parameters_of(base), *parameters_of(tool), *(name for name in names if name in arm)]
     seen = structurally_independent(chain, every, (Kind(False, base=base, tool=tool),))
-    if arm & {*seen} <= {*told}:
+    if arm & {*seen} <= {*structural}:
         return None
     lengths = [Parameter(name) for name in seen if name in arm and Parameter(name).is_length]
     return max(lengths, key=lambda name: abs(chain.value(name)), default=None)

@@ -32,13 +32,13 @@ from calib_ros.identification.rounding import may_be_rounding, rounded, rounding
 from calib_ros.identification.steps import find_step
 from calib_ros.identification.validation import ParameterRow, compare, validate
 from calib_ros.kinematics.chain import Chain
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXCEPTION
 
 
 @np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a diverging fit
 def identify(
-    problem: Problem, simpler: Identification | None = None, progress: Told = nobody
+    problem: Problem, simpler: Identification | None = None, progress: Notify = quiet
 ) -> Identification:
     """Identify the parameters of a chain from matched pairs.
 
@@ -64,7 +64,7 @@ def identify(
 
 
 def _identified(
-    problem: Problem, simpler: Identification | None, progress: Told
+    problem: Problem, simpler: Identification | None, progress: Notify
 ) -> Identification:
     known = Simpler(simpler.chain, simpler.distances, simpler.noise) if simpler else None
     structural, start, fitted = fit(problem, known)

@@ -29,7 +29,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint to search; 1 and 2 belong to the eccentricities."""
@@ -150,7 +150,7 @@ class LinearModel:
         return verdict
 
     def strongest_harmonic(
-        self, chosen: Sequence[str], progress: Told
+        self, chosen: Sequence[str], progress: Notify
     ) -> tuple[Sequence[Parameter], bool]:
         """Return sine and cosine of the harmonic that explains most, and if many explain
         something.
@@ -172,7 +172,7 @@ class LinearModel:
         self,
         chosen: Sequence[str],
         groups: Sequence[Sequence[str]],
-        progress: Told = nobody,
+        progress: Notify = quiet,
     ) -> FloatArray:
         """Return the shares (G, S) of shifted residuals explained by groups of effects.
 
@@ -197,7 +197,7 @@ class LinearModel:
             [[numbers[name] for name in group] for group in groups],
         )
 
-    def _lots(self, lots: Sequence[Sequence[str]], progress: Told) -> Iterator[list[FloatArray]]:
+    def _lots(self, lots: Sequence[Sequence[str]], progress: Notify) -> Iterator[list[FloatArray]]:
         for number, names in enumerate(lots):
             if number:
                 progress(f'harmonics of {Parameter(names[0]).owner}')

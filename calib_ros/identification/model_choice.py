@@ -17,10 +17,10 @@ from calib_ros.identification.problem import Problem
 from calib_ros.identification.result import Identification
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
-from calib_ros.progress import Told, nobody, share_of
+from calib_ros.progress import Notify, quiet, share_of
 
 
-def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Identification:
+def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Identification:
     """Identify with the errors named by `model`; `auto` chooses them by cross-validation.
 
     If the chosen model cannot be fitted, or is refused although the geometric one is not, the
@@ -54,7 +54,7 @@ def identify_model(problem: Problem, model: str, progress: Told = nobody) -> Ide
 
 
 def _chosen(
-    problem: Problem, geometric: Identification, progress: Told
+    problem: Problem, geometric: Identification, progress: Notify
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     progress('effects')
     model = LinearModel(problem, geometric)
@@ -81,7 +81,7 @@ def _chosen(
 
 
 def _with_harmonics(
-    model: LinearModel, chosen: list[str], verdicts: list[Verdict], progress: Told
+    model: LinearModel, chosen: list[str], verdicts: list[Verdict], progress: Notify
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     """Add the strongest harmonics one by one, or all of them if that predicts better."""
 

@@ -44,7 +44,7 @@ from calib_ros.kinematics.se3 import (
     transform,
 )
 from calib_ros.kinematics.walk import BLOCK
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import LEVER, LEVER_IN_PART
 from calib_ros.shown import Shown
 from calib_ros.values import SAME
@@ -138,7 +138,7 @@ class Follower:
         joints: FloatArray,
         approach: FloatArray | None = None,
         bounded: bool = True,
-        told: Told = nobody,
+        progress: Notify = quiet,
     ) -> Solution:
         """Return the changes for commands (N, n), within the joint limits if `bounded`."""
         parts = []
@@ -146,7 +146,7 @@ class Follower:
             rows = slice(start, start + BLOCK)
             came = None if approach is None else np.ascontiguousarray(approach[rows].T)
             parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
-            told(min(1.0, rows.stop / len(joints)))
+            progress(min(1.0, rows.stop / len(joints)))
         names = [each.name for each in fields(Solution)]
         found = {name: [getattr(part, name) for part in parts] for name in names}
         iterations = max(found.pop('iterations'))

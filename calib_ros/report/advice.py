@@ -125,7 +125,7 @@ def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Ad
     found: dict[Rule, list[str]] = {}
     for each in reasons:
         found.setdefault(each.rule, []).append(str(each))
-    told: list[Advice] = []
+    advised: list[Advice] = []
     following: dict[Rule, list[str]] = {}
     for rule, texts in found.items():
         causes = (each for each, brought in BRINGS.items() if each in found and rule in brought)
@@ -133,8 +133,8 @@ def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Ad
             following.setdefault(cause, []).extend(texts)
             continue
         one = replace(rules()[rule], refusal='; '.join(texts))
-        told.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
+        advised.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'
-        told.append(Advice(heading, '', (), '; '.join(texts)))
-    return tuple(told)
+        advised.append(Advice(heading, '', (), '; '.join(texts)))
+    return tuple(advised)

@@ -214,9 +214,9 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
         if each.rows:
             head, rest = '|' + '---|' * len(each.head), map(_row, each.rows)
             lines += [_row(each.head), head, *rest, '']
-    told = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
-    told += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
-    identity = [f'{name}: {value}' for name, value in told]
+    pairs = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
+    pairs += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
+    identity = [f'{name}: {value}' for name, value in pairs]
     steps = () if report.advice else report.steps
     lists = {'What to do next': steps, 'Please note': report.remarks, 'Identity': identity}
     for title, points in lists.items():

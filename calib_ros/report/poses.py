@@ -27,7 +27,7 @@ from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.walk import BLOCK
-from calib_ros.progress import Told, nobody
+from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
 from calib_ros.texts import one_line
 
@@ -108,7 +108,7 @@ class Poses:
         names = (each.name for each in fields(self) if each.name not in of_all)
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
-    def table(self, told: Told = nobody) -> str:
+    def table(self, progress: Notify = quiet) -> str:
         """Return a CSV with a row for each pose, in metres and radians."""
         names = ['line' if self.lines else 'stamp_ns', 'set', 'role', 'outlier', 'size']
         names += [f'q{k + 1}' for k in range(self.joints.shape[1])]
@@ -127,7 +127,7 @@ class Poses:
             columns += np.column_stack([block[rows] for block in blocks]).T.tolist()
             text = '\n'.join(form % row for row in zip(*columns, strict=True))
             parts.append(text.replace('nan', ''))
-            told(min(1.0, rows.stop / len(self)))
+            progress(min(1.0, rows.stop / len(self)))
         return '\n'.join(parts) + '\n'
 
 

@@ -137,8 +137,8 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
         lower, _ = interval_of(judged, 0, INTERVAL)
         if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
-            told = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
-            good = GOOD_ARM if told else GOOD_HERE
+            known = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
+            good = GOOD_ARM if known else GOOD_HERE
             return (replace(good, refusal='; '.join(result.refusals)),)
     held_out = () if judged is None or judged.repeated is None else (judged,)
     numbers = (each.after.configurations for each in (result.fitted, *held_out))

@@ -161,8 +161,8 @@ class Identifying:
         }
         numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
         model, settings = session.settings.model, self._configuration()
-        told = session.warnings, session.came
-        found = Snapshot(problem, model, samples, numbers, origin, settings, *told)
+        texts = session.warnings, session.came
+        found = Snapshot(problem, model, samples, numbers, origin, settings, *texts)
         self.progress.begin()
         return found
 

@@ -135,10 +135,10 @@ class Inputs:
         for event, known in self._events.items():
             event.add_to_wait_set(_Due())
             event.is_ready(_Due())
-            told = event.take_data()
-            if told is not None and told.total_count != known:
-                self._events[event] = told.total_count
-                event.callback(told)
+            status = event.take_data()
+            if status is not None and status.total_count != known:
+                self._events[event] = status.total_count
+                event.callback(status)
         now = time.monotonic()
         span, self._looked_at = now - self._looked_at, now
         for heard in self._heard.values():

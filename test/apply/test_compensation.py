@@ -182,7 +182,7 @@ def test_a_command_beyond_a_limit_is_refused(side):
     q = regular(UR, 3)
     q[1, 2] = side * 3.2
     compensator, shares = Compensator(UR, UR_TRUE), []
-    refusal = only_refusal(compensate(compensator, q, told=shares.append))
+    refusal = only_refusal(compensate(compensator, q, progress=shares.append))
     assert shares
     assert refusal.sample == 1
     assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (

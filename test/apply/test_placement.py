@@ -111,7 +111,7 @@ def test_the_arm_goes_on_from_pose_to_pose():
 def test_placements_keep_to_the_region(placed):
     region = np.array([[0.3, -0.4, 0.1], [0.8, 0.4, 0.5]])
     told = []
-    found = place(calibrated(), TASK, 'mean', 'nominal', region, cells=4, told=told.append)
+    found = place(calibrated(), TASK, 'mean', 'nominal', region, cells=4, progress=told.append)
     assert told == sorted(told)  # how much of it is done never falls
     assert 0.0 < told[0] < 0.2
     assert told[-1] == 1.0

@@ -152,7 +152,7 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
 def test_pass_fail_and_undecided(cell, arm, program):
     true = cell[0]
     seen, shares = [measured(true, program)], []
-    rms = verify(arm, seen, 1.0, told=shares.append).rms
+    rms = verify(arm, seen, 1.0, progress=shares.append).rms
     assert all(0.0 < share < 1.0 for share in shares)
     assert shares
     found = {scale: verify(arm, seen, scale * rms) for scale in (0.4, 1.0, 3.0)}

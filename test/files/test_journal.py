@@ -182,7 +182,7 @@ def test_a_journal_longer_than_any_table_is_identified(tmp_path, monkeypatch, se
     monkeypatch.setattr(tables, 'LARGEST_TEXT', 700)
     monkeypatch.setattr(tables, 'LARGEST_TABLE', 1000)
     shares = []
-    by_parts = read_table(path, JOINTS, sessions, told=shares.append)
+    by_parts = read_table(path, JOINTS, sessions, progress=shares.append)
     assert shares[-1] == 1.0
     assert shares == sorted(shares)
     assert len(shares) >= 5

@@ -204,7 +204,7 @@ def test_where_nothing_tells_the_size_of_the_arm_a_length_is_held(held, monkeypa
         return tuple(names[:20])
 
     monkeypatch.setattr(fitting.identifiability, 'structurally_independent', independent)
-    monkeypatch.setattr(fitting.identifiability, 'untold_size', lambda *_: held)
+    monkeypatch.setattr(fitting.identifiability, 'undetermined_size', lambda *_: held)
     monkeypatch.setattr(fitting, 'start_frames', lambda *_: 'start')
     monkeypatch.setattr(fitting, '_excited_names', lambda *_: (('base.x',), np.eye(1)))
     monkeypatch.setattr(fitting, '_fit_all', lambda *_: 'fitted')

@@ -16,7 +16,7 @@ from calib_ros.identification.linear_model import LinearModel
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.validation import log_gain
 from calib_ros.kinematics import effects
-from calib_ros.progress import nobody
+from calib_ros.progress import quiet
 
 NAMES = (
     *(name for name in UR10E.parameter_names if UR10E.owns_frame(name)),
@@ -203,10 +203,10 @@ def test_the_strongest_harmonic_must_not_be_explained_by_chance(few, often, mode
         return shares
 
     monkeypatch.setattr(linear, '_shares', moved)
-    found, several = linear.strongest_harmonic(['elbow_joint.sin_5'], nobody)
+    found, several = linear.strongest_harmonic(['elbow_joint.sin_5'], quiet)
     assert found == (pairs[9] if often < 2 else ())
     assert several is not few
     shares[:, 20:28] = 0.1
-    assert linear.strongest_harmonic(['elbow_joint.sin_5'], nobody)[1] is False
+    assert linear.strongest_harmonic(['elbow_joint.sin_5'], quiet)[1] is False
     monkeypatch.setattr(linear, '_shifts', None)
-    assert linear.strongest_harmonic([], nobody) == ((), False)
+    assert linear.strongest_harmonic([], quiet) == ((), False)
