@@ -255,7 +255,6 @@ def _matching(folder: Path, patterns: Sequence[str]) -> set[Path]:
 
 
 def _sync(*paths: Path) -> None:
-    """Flush files and folders to disk."""
     for path in paths:
         if not (path.is_file() or path.is_dir()):
             continue

@@ -38,7 +38,6 @@ STARTUP = (
 
 
 def _setting(default: Any, text: str, lower: float | None = None) -> Any:
-    """Declare a setting with the data for a node parameter and a command line option."""
     return field(default=default, metadata={'text': text, 'lower': lower})
 
 

@@ -197,7 +197,6 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
 
 
 def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
-    """Return the samples outside the region of the calibration."""
     region = compensator.region
     if region is None or region.whole:
         return []
@@ -216,7 +215,6 @@ def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
 
 
 def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
-    """Return the samples that are not corrected as requested."""
     follower, names = compensator.follower, compensator.nominal.joint_names
     tolerated = compensator.largest_orientation_error
     if tolerated is None:

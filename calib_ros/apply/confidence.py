@@ -1,17 +1,15 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Confidence limits of an RMS error, and its growth from night to night.
+"""Confidence limits of an RMS error, and its growth from night to night (docs/verification.md).
 
-Limits of an RMS position error over poses like those measured: the sum of squares over K
-configurations with errors e_k is approximated by theta / nu chi2(nu) (Satterthwaite 1946) with
+The sum of squares over K configurations with errors e_k is approximated by theta / nu chi2(nu)
+(Satterthwaite 1946) with
 
     S = mean of e_k e_k^T        g = 2 tr S^2 / (tr S)^2        nu = 2 K / max(g, c^2)
 
-For Gaussian errors of equal size nu is between K (g = 2: all errors in one direction) and 3 K
-(isotropic). It is smaller if errors vary over the workspace: c^2 is the variance of the squared
-errors over their squared mean, estimated with g for one more configuration and raised by SAFETY
-standard deviations, because few configurations rarely include the worst places. Measurements of
-one configuration count as one. Limits are one-sided.
+c^2 is the variance of the squared errors over their squared mean, estimated with g for one more
+configuration and raised by SAFETY standard deviations, because few configurations rarely include
+the worst places.
 
 A chart of nights: the RMS error r of one, with nu degrees of freedom, is compared with the pooled
 square s^2 of earlier nights. If nothing has changed r^2 / s^2 has an F distribution, which makes
@@ -21,8 +19,7 @@ it a normal variable z, independent of earlier ones. Two cumulative sums (CUSUM;
 
 detect shifts of about 2 k: a small k slow changes, a large one jumps. S > h raises an alarm. The
 mean number of nights until a false alarm follows from a discretised Markov chain of S (Brook and
-Evans 1972); h is set from the wanted number of years between false alarms, half of which each
-chart gets. Both restart after an alarm.
+Evans 1972); each chart gets half of the wanted rate. Both restart after an alarm.
 """
 
 from __future__ import annotations

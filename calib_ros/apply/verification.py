@@ -255,7 +255,6 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
-    """Refuse invalid limits, and measurements unknown to the calibration."""
     if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
         raise ConfigError(
             'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
@@ -309,7 +308,6 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
 
 
 def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
-    """Return the chain with base frames fitted to positions."""
     for base in dict.fromkeys(each.base for each in sets):
         mine = [each for each in sets if each.base == base]
         found = np.concatenate(

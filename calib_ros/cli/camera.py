@@ -54,7 +54,6 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image | Refusal]]:
-    """Yield the images of a folder by name, or of a bag by stamp."""
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
     folder = options.images.is_dir()

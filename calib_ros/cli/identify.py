@@ -91,7 +91,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
-    """Update an earlier calibration with a few poses; return the exit status."""
     with common.results(options, ('calibration.yaml', 'result.json')) as contents:
         loaded, _ = _loaded(options, screen)
         common.at_least(options, growth=0)
@@ -120,7 +119,6 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _show_update(found: Recalibration, screen: Screen) -> None:
-    """Print the update of a calibration, and what has changed."""
     before, after = found.before, found.after
     if found.accepted:
         screen.title('accepted: the calibration is brought up to date', True)
@@ -157,7 +155,6 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
 
 
 def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settings]:
-    """Return the problem of a table or a bag, and the settings."""
     source = _source(options)
     posed = options.chain == boards.POSED
     chain = boards.posed_arm() if posed else load_chain(options.chain)
@@ -197,7 +194,6 @@ def _detected(
     touched: dict[str, Any],
     screen: Screen,
 ) -> Loaded:
-    """Return the problem of board corners, and of a table if given."""
     for name in ('board', 'places'):
         if getattr(options, name) is None:
             raise InputError(f'--detections needs --{name}')
@@ -274,7 +270,6 @@ def show(found: Identified, screen: Screen) -> None:
 
 
 def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) -> None:
-    """Print why a result was refused, or what to know about an accepted one."""
     if result.accepted:
         drift = words.drift_in_words(result.noise)
         for note in (*doubts(result), drift, *words.notes(result), f'{NOT_YET}: {BRING}'):
@@ -319,7 +314,6 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
 
 
 def _document(found: Identified) -> str:
-    """Return the content of result.json."""
     content = words.as_document(found.result, found.loaded.samples)
     content |= {'warnings': list(found.loaded.warnings), 'tolerance_mm': found.tolerance}
     return dump_json(content | {'origin': found.origin.document()})

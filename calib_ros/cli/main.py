@@ -104,7 +104,6 @@ def _failed(text: str, status: int = 1) -> int:
 
 
 def _options(given: Sequence[str]) -> argparse.Namespace:
-    """Return the given options, with the command to run."""
     name = given[0] if given else ''
     completed = os.environ.get('COMP_LINE', '') if '_ARGCOMPLETE' in os.environ else ''
     if completed:
@@ -136,7 +135,6 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
 
 
 def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
-    """Return what is wrong with an unknown word."""
     if not word.startswith('-'):
         return f'unexpected argument "{word}"'
     option = word.partition('=')[0]
@@ -236,7 +234,6 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 
 def _overview() -> str:
-    """Return the descriptions of all commands, and the first steps."""
     lines = [f'calib_ros {__version__}: kinematic calibration of industrial arms.']
     for group, entries in GROUPS.items():
         lines += ['', f'{group}:']

@@ -71,7 +71,6 @@ def _measurement(
     rng: np.random.Generator,
     progress: Notify,
 ) -> tuple[FloatArray, str, Plan]:
-    """Return the poses to measure in visiting order, their predicted accuracy, and the plan."""
     size = len(design.chain.joints)
     if len(options.velocity) not in (1, size):
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')

@@ -151,7 +151,6 @@ def _print(text: str, head: str) -> None:
 
 
 def _console(stream: TextIO) -> Any:
-    """Return a colour console, or None without a terminal or rich."""
     if not stream.isatty() or os.environ.get('TERM') == 'dumb':
         return None
     try:

@@ -57,7 +57,6 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
 def _write_simulation(
     chain: Chain, options: argparse.Namespace, bag: Path, screen: Screen
 ) -> Path:
-    """Write the bag of a simulated cell, and its true chain; return the path of the chain."""
     common.at_least(options, poses=1, seed=0)
     rng, cell = np.random.default_rng(options.seed), Cell()
     true = faulty(chain, cell, rng)

@@ -36,7 +36,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
-    """Judge, print, and fill in the files of --out; return the exit status."""
     history = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
@@ -99,7 +98,6 @@ def show(found: Verification, screen: Screen) -> None:
 def _sets(
     options: argparse.Namespace, nominal: Chain, screen: Screen
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
-    """Return the measurements, warnings, and whether stamps are lines of a table."""
     settings = common.settings_of(options)
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)

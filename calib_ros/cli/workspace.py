@@ -33,7 +33,6 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
-    """Map, place, print the results, and return their files."""
     from calib_ros.report import plots
 
     arm = given.calibration_of(options.result, 'workspace', load_chain(options.chain))
@@ -81,7 +80,6 @@ def _show(survey: Survey, screen: Screen) -> None:
 def _task(
     options: argparse.Namespace, arm: Calibration, rng: np.random.Generator
 ) -> FloatArray | None:
-    """Return the poses (K, 4, 4) of the task to place, if any."""
     if options.task is not None and options.joint_box is not None:
         raise InputError('give either --task or --joint-box')
     if options.task is not None:

@@ -115,7 +115,6 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
 
 
 def _opened(path: Path, folder: Path) -> Any:
-    """Return the library's reader of a folder with the files of the bag at a path."""
     library = rosbag2()
     try:
         stored.check(folder)
@@ -178,7 +177,6 @@ def _chosen(
     messages_on: Reading,
     definitions: Mapping[str, MessageDefinition],
 ) -> tuple[dict[str, Stream], Deserialise]:
-    """Return the streams to read, and the deserialiser."""
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
     deserialise = _deserialiser(defined)
     streams = choose(available, session.settings, _decodable(messages_on), deserialise)
@@ -204,7 +202,6 @@ def _check_joints(
 
 
 def _check_links(streams: Mapping[str, Stream]) -> None:
-    """Refuse sources that were not measured between their frames."""
     problems = [words for links in links_of(streams.values()) for words in links.problems()]
     if problems:
         raise InputError('; '.join(problems))
@@ -232,7 +229,6 @@ def typestore() -> Any:
 
 
 def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
-    """Return a function from bytes to messages, also for types defined in the bag."""
     if not defined:
         return lambda data, kind: _decoded(typestore(), data, kind)
     from rosbags.interfaces import MessageDefinitionFormat
@@ -252,10 +248,7 @@ def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
 
 
 def _decoded(store: Any, data: bytes, kind: str) -> Any:
-    """Return a message; up to 12 bytes may follow it, of which the library accepts 3.
-
-    rclpy writes them behind empty lists when it serialises for a bag writer.
-    """
+    """Return a message; rclpy may write up to 12 bytes behind it, the library accepts 3."""
     try:
         return store.deserialize_cdr(data, kind)
     except Exception:  # damaged bytes fail in many ways

@@ -248,7 +248,6 @@ def read_detections(path: Path, board: Board) -> Detections:
 
 
 def _size_of(found: Columns) -> tuple[int, int] | None:
-    """Return the size of all images, which must be equal."""
     if not {*SIZE} <= {*found.header}:
         return None
     pairs = zip(*(found.integers(name).tolist() for name in SIZE), strict=True)

@@ -189,7 +189,6 @@ def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int
 
 
 def _irregular(path: Path, text: str, progress: Notify, above: int) -> MadeColumns:
-    """Return the columns of a text with quotes, or with rows that end early."""
     header: list[str] = []
     rows: list[Row] = []
     most = text.count('\n') + 1

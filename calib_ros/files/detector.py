@@ -129,7 +129,6 @@ class Detector:
         return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:
-        """Return the markers of the board, with as few pixels and candidates as possible."""
         size = np.array(image.shape[1::-1])
         halvings = _halvings(image) if self._board.type == 'charuco' else 0
         steps = [(k, range(13, 14)) for k in range(halvings, -1, -1)]

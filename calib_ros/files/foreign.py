@@ -197,7 +197,6 @@ class _Table:
         return found
 
     def _units(self) -> tuple[float, float, float]:
-        """Return the factors of lengths, angles and joint values."""
         layout = self._layout
         length, angle = layout.length, layout.angle
         for cells in self._sheet.above:
@@ -249,7 +248,6 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
 
 
 def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
-    """Return measurements with the joint values `shift` rows below."""
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')

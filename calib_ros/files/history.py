@@ -302,7 +302,6 @@ class History:
             raise InputError(f'{path} is not a row of a history ({err}): {AWAY}') from err
 
     def _write(self, path: str, content: bytes) -> None:
-        """Write a file that others see whole or not at all."""
         if self._local:
             place = Path(path)
             place.parent.mkdir(parents=True, exist_ok=True)
@@ -315,7 +314,6 @@ class History:
         self._files.mv(partial, path)
 
     def _cached(self, serial: str) -> Any:
-        """Return the cached rows of a robot, if usable."""
         import pyarrow as pa
 
         with suppress(OSError, pa.ArrowException):

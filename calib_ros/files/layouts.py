@@ -104,7 +104,6 @@ class Expression:
 
 
 def _value(tree: ast.expr, terms: Sequence[FloatArray | float]) -> Any:
-    """Evaluate a tree of terms and operators only."""
     if isinstance(tree, ast.BinOp):
         return SIGNS[type(tree.op)](_value(tree.left, terms), _value(tree.right, terms))
     if isinstance(tree, ast.UnaryOp):

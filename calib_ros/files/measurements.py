@@ -273,7 +273,6 @@ class _Blocks:
 
 
 def _check_header(columns: Columns, joints: int) -> None:
-    """Refuse a table without needed columns, or with an incomplete block."""
     header = set(columns.header)
     needed = [*joint_columns(joints)]
     if not set(KINDS[1:]) & header:
@@ -314,7 +313,6 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
 
 
 def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
-    """Return the devices, including sockets, planes and sources of distances."""
     if not kind.any():
         return columns.labels('device')
     labels = [columns.labels(name) for name in ('device', 'plane', 'location', 'socket')]

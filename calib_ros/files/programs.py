@@ -66,7 +66,6 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
 
 
 def _header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of the joint values: q1 ... qn, or the joint names."""
     names = joint_columns(len(joints))
     if set(joints) <= set(found.header) and not set(names) <= set(found.header):
         names = tuple(joints)

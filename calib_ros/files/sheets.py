@@ -116,7 +116,6 @@ def _after(text: str, lines: int) -> int:
 
 
 def _text(path: Path) -> tuple[str, str]:
-    """Return the text of a file, and its encoding if guessed."""
     data = read_bytes(path, LARGEST_TABLE, InputError)
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
         try:
@@ -133,7 +132,6 @@ def _text(path: Path) -> tuple[str, str]:
 
 
 def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
-    """Return the numbered rows of a sheet, by default the first visible one."""
     try:
         import openpyxl
     except ImportError as err:

@@ -85,7 +85,6 @@ def unpacked_files(path: Path) -> Iterator[Path]:
 
 
 def _log(file: Path) -> Path:
-    """Return the path of a database's write-ahead log."""
     return file.with_name(f'{file.name}-wal')
 
 
@@ -199,7 +198,6 @@ def _check_layout(connection: sqlite3.Connection) -> None:
 
 
 def _growing(rows: Iterable[tuple[Any, ...]], name: str) -> Iterator[tuple[Any, ...]]:
-    """Yield rows whose first two cells increase."""
     before: tuple[Any, ...] | None = None
     for row in rows:
         if before is not None and row[:2] <= before:
@@ -293,7 +291,6 @@ def _wanted(storage: Any, streams: Mapping[str, Stream]) -> list[Any]:
 
 
 def _is_known(storage: Any) -> bool:
-    """Tell whether it is a database, or an mcap file with the needed index."""
     if hasattr(storage, 'dbconn'):
         return True
     if not all(hasattr(storage, name) for name in STORAGE):

@@ -327,7 +327,6 @@ def _cut_off(path: Path, line: int) -> str:
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:
-    """Return the rows of the chosen sessions, session by session."""
     numbers, known = labels
     if not sessions and len(known) > 1:
         raise InputError(

@@ -58,10 +58,7 @@ def finished(made: MadeColumns, layout: layouts.Layout) -> MadeColumns:
 def _rotations(
     values: dict[str, FloatArray], layout: layouts.Layout, made: MadeColumns
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return rotations (N, 3, 3), and the axes (N, 3, 3) in columns of their standard deviations.
-
-    None if there are none.
-    """
+    """Return rotations (N, 3, 3), and the axes (N, 3, 3) of their sigmas in columns, or None."""
     if set(layouts.QUATERNION) & set(values):
         return _from_quaternions(values, layout, made)
     three = [each for each in (layouts.TURNS, layouts.IN_TURN) if set(each) & set(values)]

@@ -128,7 +128,6 @@ def _robot(
 
 
 def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> Chain:
-    """Return the chain of a robot; shared ones are read once."""
     if not isinstance(name, str) or not name:
         raise ConfigError(f'{where}: give chain, a file or a robot by its name, or a group')
     if name not in chains:

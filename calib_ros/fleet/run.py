@@ -143,7 +143,6 @@ def too_late(row: Row) -> bool:
 
 
 def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
-    """Return the sources of a robot without a filed result; the last one gets a page."""
     try:
         rows = results(robot, history.rows(robot.serial))
     except CalibrationError as err:
@@ -169,7 +168,6 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
 
 
 def _without_page(robot: Robot, history: History, out: Path | None, found: Run) -> list[Task]:
-    """Return the source of a robot's newest result if it has no page yet."""
     names = found.errors.get(robot.serial, {})
     if out is None or '' in names:
         return []
@@ -181,7 +179,6 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
 
 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:
-    """File a result, and replace the page."""
     found.seconds += outcome.seconds
     row, serial, source, first = outcome.row, task.robot.serial, task.source.name, outcome.known
     if outcome.error:
@@ -209,7 +206,6 @@ def _write_page(path: Path, page: str) -> None:
 
 @contextmanager
 def _client(cluster: Cluster) -> Iterator[Any]:
-    """Yield a client of the workers; local ones end with it."""
     try:
         import dask
         from distributed import Client, LocalCluster

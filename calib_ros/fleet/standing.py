@@ -122,7 +122,6 @@ class Standing:
 
 
 def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
-    """Yield the number of nights in the history with other settings."""
     others = (row for row in rows if row.accepted and row.settings != robot.settings_hash)
     nights = {row.inputs for row in others if row.source and robot.compares(row.time)}
     if number := len(nights.difference(row.inputs for row in own)):
@@ -133,7 +132,6 @@ def _others(robot: Robot, rows: Sequence[Row], own: Sequence[Row]) -> Iterator[s
 
 
 def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
-    """Yield nights with impossible stamps."""
     if ahead := [row for row in rows if too_late(row)]:
         row = max(ahead, key=lambda each: each.filed)
         yield (
@@ -248,8 +246,6 @@ def _link(out: Path, standing: Standing) -> str:
 
 
 def _chart(standing: Standing) -> dict[str, Any]:
-    """Return the nights of a robot: errors, and the evidence for a change of each joint."""
-
     def times(of: Iterable[Row | Change]) -> list[str]:
         return [each.time.isoformat(timespec='seconds') for each in of]
 

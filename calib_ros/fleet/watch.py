@@ -1,30 +1,23 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Did the arm change between nights, when, and which joint?
+"""Did the arm change between nights, when, and which joint (docs/fleet.md)?
 
-Night k brings the arm's parameters x_k with covariance C_k, without base and tool, because the
-device may be moved every night. For each of the last m nights (LAGS) the mean of these m is
-compared with the mean of the earlier nights, both weighted by information:
+Night k brings the arm's parameters x_k with covariance C_k, without base and tool. For each of the
+last m nights (LAGS) the mean of these m is compared with the mean of the earlier nights, both
+weighted by information:
 
     d = x_after - x_before,   S = s^2 (C_after + C_before),   u = S^-1 d,   W = S^-1
 
-A bump changes one joint or two. That j alone, a joint or two, changed by
+That j alone, a joint or two, changed by d_j = W_jj^-1 u_j with covariance W_jj^-1 explains
+g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution if nothing changed: as many
+degrees of freedom as j has parameters, over those of the noise, or of s^2 if fewer: those of the
+earlier nights and of the rest. s^2 is the scatter of the nights beyond their covariances (warming
+up, model error), or of the rest beside j, where clearly larger than 1.
 
-    d_j = W_jj^-1 u_j,   covariance W_jj^-1,
-
-explains g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution if nothing changed:
-as many degrees of freedom as j has parameters, over those of the noise, or of s^2 if fewer: those
-of the earlier nights and of the rest. s^2 is the scatter of the nights beyond their covariances
-(warming up, model error), or of the rest beside j, where clearly larger than 1. `changes.py` names
-what changed, and the comparison restarts.
-
-Nights are compared by their common parameters. An effect that only some nights fitted is nominal
-in the others too: with the information matrix I of all parameters of the arm, a fit of the common
-ones c alone has I_cc and (I x)_c. That does not hold for DH parameters, which are far from
-nominal: nights that determine other ones are only compared among themselves.
-
-Neither warmth nor model error suddenly makes nights scatter CLEARLY more. If every joint and pair
-leaves more, several changed: a repaired arm, or another robot.
+An effect that only some nights fitted is nominal in the others too: with the information matrix I
+of all parameters of the arm, a fit of the common ones c alone has I_cc and (I x)_c. That does not
+hold for DH parameters, which are far from nominal. Neither warmth nor model error suddenly makes
+nights scatter CLEARLY more: if every joint and pair leaves more, several changed.
 """
 
 from __future__ import annotations
@@ -128,7 +121,6 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
 
 
 def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
-    """Return how the DH parameters of some nights differ from the newest."""
     differences = (
         ('they alone determine', names - newest),
         ('it alone determines', newest - names),
@@ -137,7 +129,6 @@ def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
 
 
 def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
-    """Look for changes in nights that determine the same DH parameters."""
     rows, arms = [row for row, _ in fitted], [arm for _, arm in fitted]
     strengths: list[dict[str, float]] = [{} for _ in rows]
     changes: list[Change] = []
@@ -177,10 +168,7 @@ def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
 def _cause(
     tests: _Tests, k: int, level: float, row: Row
 ) -> tuple[int, tuple[Explanation, ...], tuple[str, ...]]:
-    """Return the lag of an alarm in night k, and what changed: one joint, or two by name.
-
-    Neither if several did.
-    """
+    """Return the lag of an alarm in night k, and the one joint or the pair that changed, if so."""
     if tests.several[:, k].min() < level:
         return int(tests.several[:, k].argmin()), (), ()
     lag = int(tests.chances[:, k].min(axis=1).argmin())
@@ -209,7 +197,6 @@ class _Tests(NamedTuple):
 
 
 def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
-    """Return the tests of all nights against earlier ones, by common parameters."""
     information, pulls = _information(fitted, names)
     count, size = pulls.shape
     groups = _groups(names)
@@ -270,10 +257,7 @@ def _information(
 
 
 def _groups(names: Sequence[Parameter]) -> tuple[tuple[str, ...], ...]:
-    """Return what may change at once: joints, then pairs with at most half of all parameters.
-
-    The rest must show how nights scatter.
-    """
+    """Return joints, and pairs with at most half of all parameters: the rest shows the scatter."""
     known = Counter(name.owner for name in names)
     pairs = combinations(known, 2)
     few = (pair for pair in pairs if 2 * sum(known[joint] for joint in pair) <= len(names))

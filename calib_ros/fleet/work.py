@@ -166,7 +166,6 @@ def _is_folder(files: Any, path: str) -> bool:
 
 
 def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime | None]:
-    """Return the fingerprint of a file or folder, and its time of change."""
     parts = files.find(path, detail=True) if _is_folder(files, path) else {path: info}
     marks, times = [], []
     for name, part in sorted(parts.items()):

@@ -87,7 +87,6 @@ def _gain(
 def _of_the_gain(
     problem: Problem, result: Identification, validation: Comparison, sized: bool
 ) -> Iterator[Reason]:
-    """Yield why held-out poses do not show an improvement of the arm."""
     before, after = validation.figures
     if after.rms_mm > 1e3 * problem.largest_error:
         yield Reason(

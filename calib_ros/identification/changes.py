@@ -194,18 +194,11 @@ def _sizes(names: Sequence[Parameter]) -> FloatArray:
 
 
 class Columns:
-    """Effects of an arm's changes on the parameters with information.
+    """Effects of an arm's changes on the P parameters `names` with information.
 
-    Parameters
-    ----------
-    chain : Chain
-    names : sequence of Parameter
-        The P parameters with information. Changes of others show in these if they are gauge
-        freedoms beside them, otherwise not at all.
-    frames : sequence of str
-        Frames that may have moved; others are free and absorb what they can.
-    scaled : bool
-        Whether the scale of the device may have changed.
+    Changes of others show in these if they are gauge freedoms beside them, otherwise not at all.
+    `frames` may have moved; others are free and absorb what they can. `scaled` allows another
+    scale of the device.
     """
 
     def __init__(

@@ -225,6 +225,5 @@ def _information(
 
 
 def _chance(information: Information, freedom: float, explained: int = 0) -> float:
-    """Return the probability that noise alone changes the remaining parameters as much."""
     rank = max(1, len(information.names) - explained)
     return chance_of(information.explained(np.eye(len(information.names)))[0], rank, freedom)

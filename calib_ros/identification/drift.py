@@ -42,12 +42,8 @@ shift."""
 class Shifts:
     """Residuals shifted in time, every set by the same share of its length.
 
-    Parameters
-    ----------
-    system : System
-        Samples in the order in which they were taken; those of one stop move together.
-    residuals : sequence of (c, N)
-        Weighted residuals of each set, sample by sample.
+    The system's samples are in the order in which they were taken; those of one stop move
+    together. The residuals (c, N) of each set are weighted.
     """
 
     def __init__(self, system: System, residuals: Sequence[FloatArray]) -> None:
@@ -168,10 +164,7 @@ def _period(length: int) -> int:
 def _correlated(
     series: FloatArray, circle: NDArray[np.complex128], each: bool = False
 ) -> FloatArray:
-    """Return products (P, 2 n) of series (P, c, n) with the circle (c, K) at each shift.
-
-    Summed over the components c; (P, c, 2 n) if `each`.
-    """
+    """Return products (P[, c], 2 n) of series (P, c, n) with the circle (c, K) at each shift."""
     length = _period(series.shape[-1])
     spectrum = fft.rfft(series, length)
     np.conj(spectrum, out=spectrum)

@@ -327,7 +327,6 @@ class _Bare:
 
 
 def _polished(problem: Problem, trial: _Trial) -> _Trial:
-    """Return a trial with frames refined by least squares."""
     chain, sets = trial.chain, trial.sets
     sigmas = problem.sigma_position, problem.sigma_orientation
     system = System(tuple(Samples(each, *sigmas) for each in sets))

@@ -83,8 +83,6 @@ def _chosen(
 def _with_harmonics(
     model: LinearModel, chosen: list[str], verdicts: list[Verdict], progress: Notify
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
-    """Add the strongest harmonics one by one, or all of them if that predicts better."""
-
     def added(verdict: Verdict, names: Sequence[str]) -> bool:
         verdicts.append(verdict)
         chosen.extend(name for name in names if verdict.pays and name not in chosen)

@@ -50,15 +50,7 @@ class _Images:
 
 
 class PixelSamples(Samples):
-    """One set of pixels laid out for the solver.
-
-    Parameters
-    ----------
-    observations : Observations
-    sigma_pixel : float
-        Standard deviation [px] of each coordinate.
-
-    """
+    """One set of pixels laid out for the solver; `sigma_pixel` [px] of each coordinate."""
 
     def __init__(self, observations: Observations, sigma_pixel: float, *_: float) -> None:
         assert observations.pixels is not None

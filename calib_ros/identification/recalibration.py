@@ -296,7 +296,6 @@ class _Arm:
 
 
 def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
-    """Return the new poses with the noise found in the earlier ones."""
     if previous.noise is not None:
         problem = replace(problem, **_sigmas(problem.sigmas, previous.noise))
     return System(problem.system(sets).sets)

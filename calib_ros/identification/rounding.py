@@ -55,7 +55,6 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 
 
 def _step(values: FloatArray) -> float:
-    """Return the step that distinct values (N,) are multiples of; zero if none."""
     few = values[:3, np.newaxis] / STEPS
     likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
     step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)

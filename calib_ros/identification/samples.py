@@ -36,16 +36,8 @@ Both: TypeAlias = tuple[FloatArray, FloatArray]
 class Samples:
     """One set of observations laid out for the solver: component first, sample last.
 
-    Parameters
-    ----------
-    observations : Observations
-    sigma_position, sigma_orientation : float
-        Standard deviations [m, rad] of measurements without a covariance.
-
-    Attributes
-    ----------
-    moments : Observations
-        One per linearised joint values: the observations, or one of each image.
+    The sigmas [m, rad] are those of measurements without a covariance. `moments` has one row per
+    linearised joint values: the observations, or one of each image.
     """
 
     def __init__(
@@ -85,16 +77,9 @@ class Samples:
     def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
         """Yield weighted rows of Jacobian and residual in blocks.
 
-        Yields
-        ------
-        which : slice
-            The samples.
-        shift : (P + 1, c, B)
-            Weighted derivative of the residual; the last row is the residual.
-        turn : (P_rotational + 1, 3, B) or (0, 0, 0)
-            The same for a separate orientation: rotational parameters only.
-        model : ErrorModel
-            Holds the order of the parameters in the rows.
+        Each is a slice of samples; `shift` (P + 1, c, B), the derivative of the residual, which is
+        the last row; `turn` (P_rotational + 1, 3, B) of a separate orientation, else empty; and
+        the error model with the order of the parameters in the rows.
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         nothing = np.zeros((0, 0, 0))

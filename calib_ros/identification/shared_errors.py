@@ -53,14 +53,9 @@ ELSEWHERE = 4.0 * LARGEST
 class Shared:
     """Correlation of neighbours, and the noise by parts if they share errors.
 
-    Attributes
-    ----------
-    successive, near : float
-        Correlation of the residuals of neighbours, the larger one of the parts.
-    found : tuple of str
-        Kinds of neighbours that share errors by the test.
-    middles : dict of int to (P, P)
-        J^T V J of each part (0 position, 1 orientation) with shared errors.
+    `successive` and `near` are the larger correlation of residuals of both parts, `found` the
+    kinds of neighbours with shared errors by the test, `middles` J^T V J (P, P) of each part (0
+    position, 1 orientation) with shared errors.
     """
 
     successive: float

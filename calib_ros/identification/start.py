@@ -1,21 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Starting values for unknown base and tool frames, without a guess from the user.
+"""Starting values for unknown base and tool frames, in closed form (docs/model.md).
 
 With the nominal arm K_i = A_1 ... A_n, a measured pose is M_i = T_world_base K_i T_flange_target.
-
-Poses: the rotations R_M R_F^T = R_B R_K are linear in (R_F^T, R_B); the leading singular vectors
-of sum_i R_K^T (x) R_M^T solve them for all samples at once (Shah 2013). Positions: a point set
-registration of the flange positions (Umeyama 1991), which omits the tool, and the linear system
-p = (R_B (x) t^T) vec(R_K) + R_B p_K + b of 13 unknowns a row. Translations are linear once R_B is
-known. If orientations hardly vary, the tool's translation is the shortest one, the base takes the
-rest, and rotations come from the registration.
-Distances: their squares are linear in the base's position and its square. A touched plane:
-n p_K + n R_K t = d is linear in n, n t^T and d, or with a given tool it is the plane through the
-points. Pixels: the pose of the board in each image (`resection.py`).
-
-Every start is polished by least squares on the frames alone; the best one is used. If none fits
-(few or degenerate poses), the 24 rotations of a cube are tried as well.
+If orientations hardly vary, the tool's translation is the shortest one, the base takes the rest,
+and rotations come from a registration. A touched plane: n p_K + n R_K t = d is linear in n, n t^T
+and d, or with a given tool it is the plane through the points. Pixels: the pose of the board in
+each image (`resection.py`).
 """
 
 from __future__ import annotations
@@ -73,7 +64,6 @@ def start_frames(
 def _start_one(
     chain: Chain, observations: Observations, sigmas: tuple[float, float], loss: str
 ) -> Chain:
-    """Return the chain with frames for one set of observations; sigmas [m, rad]."""
     oriented = bool(observations.oriented.any()) and observations.distances is None
     every = movable(chain, ('base', 'tool'))
     names = [name for name in every if oriented or name.owner == 'base' or name.is_length]

@@ -309,7 +309,6 @@ class _Scan:
 
 
 def _thing(kind: str, seen: Observations) -> str:
-    """Return what the base or tool frame of a set belongs to, or the joint."""
     if kind == 'joint':
         return 'the joint'
     of_images = seen.pixels is not None

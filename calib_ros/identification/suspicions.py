@@ -165,7 +165,6 @@ def _percent(share: float) -> str:
 
 
 def _sister(problem: Problem, result: Identification) -> str:
-    """Return the shipped robot that is much nearer to the identified arm than the nominal."""
     far = SPREAD * TYPICAL['length'], SPREAD * TYPICAL['angle']
     if not any(each.beyond(*far) for each in result.parameters):
         return ''
@@ -190,7 +189,6 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
 
 
 def _gravity(problem: Problem, result: Identification) -> str:
-    """Return the direction of gravity that explains clearly more than the given one."""
     bent = [n for n, _ in result.chain.effects if effects.group_of(n) in ('gravity', 'compliance')]
     if not bent:
         return ''
@@ -212,7 +210,6 @@ def _gravity(problem: Problem, result: Identification) -> str:
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:
-    """Return sigmas far larger than the residuals, and orientation sigmas far smaller."""
     noise, found = result.noise, []
     if noise.consistent or any(each.pixels is not None for each in problem.sets):
         return ''
@@ -291,7 +288,6 @@ def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
 
 
 def _board(problem: Problem, result: Identification) -> str:
-    """Return that a board is wider or narrower for its height than stated."""
     for each, far in zip(problem.sets, result.distances, strict=True):
         kept = far < OUTLIER
         if each.points is None or distinct(each.images[kept]) < 2:

@@ -300,7 +300,6 @@ def _joined(
     configurations: NDArray[np.intp],
     index: NDArray[np.intp] | slice = slice(None),
 ) -> Residuals:
-    """Return the residuals of several parts as one, ordered by an index (N,)."""
     return Residuals(
         np.concatenate([piece.position for piece in pieces])[index],
         np.concatenate([piece.orientation for piece in pieces])[index],

@@ -297,7 +297,6 @@ class Chain(Shown):
         return rng.uniform(lower, upper, (count, len(self.joints)))
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
-        """Return the owner and the kind of a parameter."""
         if name not in self._all_parameters:
             raise UnknownNameError('parameter', name, self.parameter_names)
         owner, _, kind = name.partition('.')

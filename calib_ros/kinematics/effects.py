@@ -210,7 +210,6 @@ def moved(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> 
 
 @lru_cache(maxsize=256)
 def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> list[int]:
-    """Return the index of the joint of each effect."""
     return [joint_names.index(Parameter(name).owner) for name in names]
 
 
@@ -218,7 +217,6 @@ def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> list[int]:
 def _by_kind(
     names: tuple[str, ...], joint_names: tuple[str, ...]
 ) -> dict[str, tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]]:
-    """Return by kind of effect the rows, the joints, and the harmonics or other joints."""
     number = {name: i for i, name in enumerate(joint_names)}
     found: dict[str, list[tuple[int, int, float]]] = {}
     for row, name in enumerate(names):
@@ -237,10 +235,7 @@ def _by_kind(
 def _torques(
     chain: _Arm, q: FloatArray, joints: NDArray[np.intp], ends: FloatArray | None
 ) -> FloatArray:
-    """Return torques of gravity (E, B) on joints at joint values (n, B).
-
-    Of a unit weight [m] at the `ends` (E,) of links, or [N m] of all masses carried.
-    """
+    """Return torques (E, B) of unit weights [m] at the `ends` (E,) of links, or of all masses."""
     start = chain.frame('base').matrix
     frames, places = chain.walk.along(q, start)
     down = start[:3, :3] @ np.asarray(chain.gravity)

@@ -92,20 +92,8 @@ def mobility(chain: Chain) -> tuple[int, int, int]:
 class Follower:
     """Joint changes with which the `follower` arm reaches the poses of the `leader`.
 
-    `lower` and `upper` (n,) are the limits of the leader's joints. An arm is `complete` when it
-    can reach every position and orientation nearby, `anywhere` when every position.
-
-    Parameters
-    ----------
-    leader, follower : Chain
-        Arms with the same joints. Their base and tool frames are left aside.
-    tool : three floats
-        The point [m] in the flange frame whose position counts.
-    unit : (n,)
-        Largest change of each joint [rad or m].
-    weight : float, optional
-        Metres that a radian counts.
-
+    Of the `tool` point [m] in the flange frame; base and tool frames of the arms are ignored.
+    `unit` (n,) [rad or m] is the largest change of each joint, `weight` the metres per radian.
     """
 
     def __init__(
@@ -154,9 +142,8 @@ class Follower:
         return Solution(iterations=iterations, **joined)
 
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
-        """Solve for commands (n, B).
-
-        A joint that would exceed a limit is held there, and the others are solved again.
+        """Solve for commands (n, B); joints beyond a limit are held there, the others solved
+        again.
         """
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
         nothing = np.zeros_like(q)
@@ -206,10 +193,7 @@ class Follower:
     def _minimise(
         self, task: _Task, stiffness: FloatArray, weight: float, settle: bool = False
     ) -> Minimum:
-        """Minimise |e|^2 + x^T D x.
-
-        With `settle`, samples end when the cost stops falling; else when x is longer than 1.
-        """
+        """Minimise |e|^2 + x^T D x; without `settle`, samples with |x| > 1 are given up."""
         stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], len(task.q[0])))
 
         def linearise(x: FloatArray, which: Index) -> Normal:
@@ -258,9 +242,8 @@ class Follower:
         return stiffness + self._ridge, (added > 0.0).any(axis=1)
 
     def _errors(self, task: _Task, x: FloatArray) -> FloatArray:
-        """Return the lengths (B, 3) of position [m] and orientation error [rad].
-
-        The last is that of the reachable position error.
+        """Return the lengths (B, 3) of position [m], orientation [rad] and reachable position
+        error.
         """
         q = task.q + self._unit * x
         axes, origin = self._follower.trace(self._follower.effective(q, task.approach))

@@ -55,24 +55,10 @@ def solve(
     iterations: int = ROUNDS,
     lever: float = LEVER,
 ) -> Inverse:
-    """Return the joint values near a start that bring the target to wanted poses.
+    """Return the joint values near a start (N, n) that bring the target to poses (N, 4, 4).
 
-    Parameters
-    ----------
-    chain : Chain
-        The arm, with its frames.
-    poses : (N, 4, 4)
-        Wanted T_world_target.
-    start : (N, n)
-        Joint values [rad or m] to start from.
-    base, tool : str
-        Frames at the ends of the chain.
-    part : slice
-        Components to reach, of position and rotation in world axes, six in all.
-    iterations : int
-        Steps at most.
-    lever : float
-        Metres per radian, if not both can be reached.
+    `part` are the components to reach, of position and rotation in world axes, six in all; a
+    radian counts as `lever` [m], if not both can be reached.
     """
     aim = Aim(chain, base, tool)
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
@@ -125,16 +111,8 @@ class Aim:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the error (6, B), and the derivative of the pose by the joints (n, 6, B).
 
-        Parameters
-        ----------
-        q : (n, B)
-            Joint values [rad or m].
-        approach : (n, B), optional
-            Signs of the preceding velocities, for backlash.
-        positions, axes : (3, B), (3, 3, B)
-            Wanted positions [m], and wanted axes; the first index counts them.
-        lever : float
-            Metres per radian.
+        At joint values (n, B), approached with signs (n, B), for wanted positions (3, B) [m] and
+        axes (3, 3, B), whose first index counts them; a radian counts as `lever` [m].
         """
         model, turning = self._model, self._turning
         found, origin, shift, turn = model.linearise(q, approach)

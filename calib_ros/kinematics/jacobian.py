@@ -45,18 +45,10 @@ from calib_ros.kinematics.walk import Walk
 
 
 class ErrorModel:
-    """The pose and its derivatives with respect to named parameters of a chain.
+    """The pose and its derivatives with respect to named parameters of a `chain`.
 
-    Parameters
-    ----------
-    chain : Chain
-        The point of linearisation.
-    names : sequence of str
-        Parameters, one column each, in this order. Frames other than `base` and `tool` may be
-        among them; their columns are zero.
-    base, tool : str
-        Frames at the ends of the chain.
-
+    There is one column for each of the `names`, in order; it is zero for frames other than `base`
+    and `tool`, which are at the ends.
     """
 
     def __init__(
@@ -83,30 +75,14 @@ class ErrorModel:
         velocity: FloatArray | None = None,
         out: tuple[FloatArray, FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return pose and derivatives for one block of samples.
+        """Return axes (3, 3, B), origin (3, B) [m] and derivatives of the target for one block.
 
-        Parameters
-        ----------
-        q : (n, B)
-            Joint values [rad or m], a row per joint.
-        approach : (n, B), optional
-            Signs of the preceding velocities, for backlash.
-        velocity : (n, B), optional
-            Velocities of the joints, for the delay of the measuring device.
-        out : (P + 1, 3, B), (P_rotational + 1, 3, B), optional
-            Receives the derivatives, to reuse memory.
-
-        Returns
-        -------
-        axes : (3, 3, B)
-            The target's x, y and z axis; the first index counts them.
-        origin : (3, B)
-            Its position [m].
-        shift : (P + 1, 3, B)
-            Derivative of the position, rotational parameters first. The last row is free for the
-            residual.
-        turn : (P_rotational + 1, 3, B)
-            Derivative of the orientation as a rotation vector in the world. Likewise.
+        `q` (n, B) [rad or m] are joint values, `approach` (n, B) signs of the preceding
+        velocities, for backlash, `velocity` (n, B) those for the delay of the device. The first
+        index of the axes counts them. The derivatives are `shift` (P + 1, 3, B) of the position,
+        rotational parameters first, and `turn` (P_rotational + 1, 3, B) of the orientation as a
+        rotation vector in the world; their last row is free for the residual. They are written to
+        `out`, if given, to reuse memory.
         """
         layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
         names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
@@ -300,15 +276,9 @@ def _indices(numbers: Iterable[int]) -> NDArray[np.intp]:
 def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:
     """Return the rotation vector (3, B) in world axes from the model to the measurement.
 
-    Parameters
-    ----------
-    measured : (3, 3, B)
-        Measured rotation matrices; the first index counts their columns.
-    model : (3, 3, B)
-        The same of the model.
-
-    Notes ----- E = R_measured R^T is summed from its columns; its vector is log E, as long as
-    log(R^T R_measured): angle / sin(angle) times half the difference of E and its transpose.
+    Both are (3, 3, B) rotation matrices; the first index counts their columns. E = R_measured R^T
+    is summed from its columns; its vector is log E, as long as log(R^T R_measured): angle /
+    sin(angle) times half the difference of E and its transpose.
     """
     turn = np.einsum('kib,kjb->ijb', measured, model)
     sine_vector = 0.5 * (turn[[2, 0, 1], [1, 2, 0]] - turn[[1, 2, 0], [2, 0, 1]])

@@ -131,15 +131,10 @@ class Lens:
 class View:
     """Points of a board in a camera.
 
-    Attributes
-    ----------
-    points, arm : (3, C)
-        In the camera's frame [m], from the camera and from the chain's end.
-    pixels : (2, C)
-    by_shift : (2, 3, C)
-        Derivative by a shift [m] of the chain's end, along the camera's axes.
-    axes : (3, 3, C), optional
-        Those of a camera at the chain's end, in the world.
+    `points` and `arm` (3, C) [m] are in the camera's frame, from the camera and from the chain's
+    end; `pixels` (2, C); `by_shift` (2, 3, C) is the derivative by a shift [m] of the chain's end,
+    along the camera's axes; `axes` (3, 3, C) are those of a camera at the chain's end, in the
+    world.
     """
 
     points: FloatArray
@@ -180,22 +175,11 @@ def view(
     points: FloatArray,
     on_flange: bool,
 ) -> View:
-    """Return the view of points (3, C) of a board in some images.
+    """Return the view of points (3, C) [m] of a board in some images, `owner` (C,) of the points.
 
-    Parameters
-    ----------
-    lens : Lens
-        Of the camera.
-    axes, origin : (3, 3, M), (3, M)
-        Of the end of the chain, for each image: the board in a camera that is the world, or with
-        the camera `on_flange` the camera in a board that is the world. The first index counts the
-        axes.
-    owner : (C,)
-        The image of each point.
-    points : (3, C)
-        In the frame of the board [m].
-    on_flange : bool
-        Whether the camera is on the flange.
+    `axes` (3, 3, M) and `origin` (3, M) are those of the end of the chain, for each image: the
+    board in a camera that is the world, or with the camera `on_flange` the camera in a board that
+    is the world. The first index counts the axes.
     """
     placed = np.concatenate([axes.reshape(9, -1), origin]).take(owner, axis=1)
     turned = placed[:9].reshape(3, 3, -1)

@@ -164,7 +164,6 @@ def corrected_urdf(
 
 
 def _refuse_others(arm: Chain, nominal: Chain) -> None:
-    """Refuse a chain that is not a corrected one of the nominal arm."""
     kinds = [[f'{joint.name} ({joint.type})' for joint in c.joints] for c in (arm, nominal)]
     if kinds[0] != kinds[1]:
         raise ConfigError(
@@ -271,7 +270,6 @@ def _with_masses(
     moving: Sequence[DescribedJoint],
     poses: Mapping[str, FloatArray],
 ) -> tuple[Joint, ...]:
-    """Return rows with the mass carried by each joint but not the next, and its centre."""
     number = {joint.child: i for i, joint in enumerate(moving)}
     masses, moments = np.zeros(len(rows)), np.zeros((len(rows), 3))
     for joint in robot.joints:  # from the root outwards

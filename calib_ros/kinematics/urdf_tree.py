@@ -99,7 +99,6 @@ class Description:
         return tuple(path)
 
     def _usual_tip(self, base: str) -> str:
-        """Return the link at the end of the arm, if unambiguous."""
         behind, moved = {base}, set()
         for joint in self.joints:
             if joint.parent in behind:
@@ -173,7 +172,6 @@ def _robot(text: str) -> ET.Element:
 
 
 def _outwards(joints: Sequence[DescribedJoint], root: str) -> tuple[DescribedJoint, ...]:
-    """Return joints ordered from the root outwards."""
     behind: dict[str, list[DescribedJoint]] = {}
     for joint in joints:
         behind.setdefault(joint.parent, []).append(joint)
@@ -236,7 +234,6 @@ def _placed(origin: ET.Element, where: str) -> tuple[FloatArray, FloatArray]:
 
 
 def _child(element: ET.Element, tag: str) -> ET.Element:
-    """Return the first child with a tag, or an empty element."""
     found = element.find(tag)
     return ET.Element(tag) if found is None else found
 

@@ -26,16 +26,8 @@ BLOCK = 1024
 class Walk:
     """The parts of a chain's links that do not depend on the joint values.
 
-    Parameters
-    ----------
-    table : (n, 5)
-        DH table with columns a, alpha, d, theta, beta [m, rad].
-    signs : (n,)
-        Directions of the joint values.
-    turning : (n,) bool
-        True for revolute joints.
-    standard : bool
-        The convention; else the modified one.
+    From the DH table (n, 5) with columns a, alpha, d, theta, beta [m, rad], `signs` (n,) of the
+    joint values, `turning` (n,) for revolute joints, and the convention.
     """
 
     def __init__(
@@ -79,19 +71,12 @@ class Walk:
     def frames(
         self, q: FloatArray, base: FloatArray, found: FloatArray, ends: FloatArray | None = None
     ) -> FloatArray:
-        """Write the frame before each joint's motion and the flange's into (n + 1, 4, 3, B).
+        """Write the frame before each joint's motion and the flange's into `found` (n + 1, 4, 3,
+        B).
 
-        Parameters
-        ----------
-        q : (n, B)
-            Effective joint values.
-        base : (4, 4)
-            T_world_base.
-        found : (n + 1, 4, 3, B)
-            Receives the frames, and is returned.
-        ends : (n, 4, 3, B), optional
-            Receives the frames at the ends of the links of the modified convention; in the
-            standard one these are the following frames.
+        At effective joint values (n, B), from T_world_base (4, 4). `ends` (n, 4, 3, B) receives
+        the frames at the ends of the links of the modified convention; in the standard one these
+        are the following frames.
         """
         values = self.signs * q
         angles = self._theta + (values if self._all_turning else values * self._turns)

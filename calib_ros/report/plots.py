@@ -207,5 +207,4 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
 
 
 def _plain(names: Sequence[Any]) -> list[Any]:
-    """Return names without markup for plotly or matplotlib."""
     return [html.unescape(x).replace('$', r'\$') if isinstance(x, str) else x for x in names]

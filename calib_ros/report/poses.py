@@ -273,7 +273,6 @@ def _packed(values: NDArray[Any], kind: str) -> str:
 
 
 def _worst(poses: Poses) -> NDArray[np.intp]:
-    """Return the rows of the largest errors after, and of the largest outliers, in order."""
     error = np.linalg.norm(poses.after, axis=1)
     good = np.argsort(np.where(poses.outlier, -1.0, error))[-WORST:]
     gross = np.argsort(np.where(poses.outlier, error, -1.0))[-WORST:]
@@ -290,7 +289,6 @@ def _values(poses: Poses, kind: str, when: str) -> FloatArray:
 
 
 def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
-    """Return quantiles of each kind of error over the session and over each joint's values."""
     good = np.flatnonzero(~poses.outlier)
     good = good[:: 1 + len(good) // SINGLE]
     axes = {'session': good + 1.0}
@@ -325,7 +323,6 @@ def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
 
 
 def _cells(poses: Poses) -> dict[str, Any]:
-    """Return cubes of the workspace: number of poses, place, RMS and mean errors."""
     good = poses.select(~poses.outlier)
     low = good.position.min(axis=0)
     edge = max(float(np.ptp(good.position, axis=0).max()) / CELLS, 1e-9)

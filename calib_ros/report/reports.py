@@ -159,7 +159,6 @@ def _refused(reasons: Sequence[Advice]) -> Verdict:
 
 
 def _notes(result: Identification) -> Iterator[str]:
-    """Yield further remarks; doubts about an accepted result are in the verdict."""
     if not result.accepted:
         yield from words.remarks(result)
     elif drift := words.drift_in_words(result.noise):
@@ -273,7 +272,6 @@ def _outliers(poses: Poses) -> Section:
 
 
 def _offsets(problem: Problem, result: Identification) -> Iterator[Section]:
-    """Return the geometric offsets with their intervals, lengths and angles separately."""
     others = dict(result.chain.effects)
     own = [p for p in result.parameters if p.name.unit in ('m', 'rad') and p.name not in others]
     own = [p for p in own if not result.chain.owns_frame(p.name)]
@@ -322,7 +320,6 @@ def _parameters(result: Identification) -> Section:
 
 
 def _determined(result: Identification) -> Section:
-    """Return how well the arm is known, and what these poses cannot determine."""
     sigma, weak = words.sigma_over_range(result), ', '.join(words.weakly_determined(result))
     return section(
         'determined',

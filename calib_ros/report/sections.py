@@ -67,7 +67,6 @@ def accuracy_section(
 def _column(
     label: str, found: ErrorFigures, limits: tuple[float, float] | None = None
 ) -> tuple[str, ...]:
-    """Return a column of the accuracy table, with limits [m] of the RMS if known."""
     lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
     rest = (*lengths, found.rms_mrad, found.rms_px)
     between = '' if limits is None else _between(limits)

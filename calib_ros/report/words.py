@@ -99,7 +99,6 @@ def notes(result: Identification) -> list[str]:
 
 
 def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
-    """Return numbers and stamps [s] of outliers, the largest first."""
     seconds = {each: divmod(each.stamp_ns, 10**9) for each in outliers}
     largest = sorted(outliers, key=lambda each: -each.size)
     words = (

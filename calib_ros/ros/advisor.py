@@ -171,7 +171,6 @@ class Guide:
             self._start(self._correct, data, self._session.calibration)
 
     def _correct(self, data: bytes, calibration: Calibration | None) -> None:
-        """Publish a corrected trajectory, or log why not."""
         try:
             message = deserialize_message(data, JointTrajectory)
             corrected, self._last_trajectory = self._corrected_by(message, calibration)

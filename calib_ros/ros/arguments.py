@@ -246,7 +246,6 @@ def _described(parameter: Parameter) -> str:
 
 
 def _as_yaml(parameter: Parameter, text: str) -> str:
-    """Return a launch argument as YAML of its parameter's type."""
     import yaml
 
     given: object = text
@@ -261,7 +260,6 @@ def _as_yaml(parameter: Parameter, text: str) -> str:
 
 
 def _quoted(text: str) -> str:
-    """Return a text as a double-quoted YAML scalar on one line."""
     import yaml
 
     quoted: str = yaml.safe_dump(text, default_style='"', allow_unicode=True, width=2**31)

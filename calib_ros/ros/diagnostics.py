@@ -66,7 +66,6 @@ class Diagnostics:
         self._publisher.publish(message)
 
     def _judged(self, account: Account) -> tuple[bytes, str]:
-        """Return the diagnostic level and message."""
         wrong = [*self._namesakes(), *self._inputs.troubles()]
         fresh = {
             cause: count

@@ -203,7 +203,6 @@ class Identifying:
         return result.accepted, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:
-        """Write the report of a refusal beside the journal."""
         try:
             text = page()
             self._report = (text and self._archive.note(text, '.html')) or None
@@ -237,7 +236,6 @@ def _without_middle(text: str, longest: int) -> str:
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:
-    """Return the report of an identification, or None without its packages."""
     from calib_ros.report.page import Origin, inputs_of, render
     from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report

@@ -211,7 +211,6 @@ class Inputs:
         )
 
     def _of_other_types(self) -> list[str]:
-        """Return topics that are published with another type."""
         found = {}
         for subscription, (stream, heard) in self._inputs.items():
             topic = subscription.topic_name
@@ -227,7 +226,6 @@ def deserialised(data: bytes, name: str) -> Any:
 
 
 def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
-    """Return the waiting messages, with their times of receipt [ns]."""
     found = []
     with subscription.handle:
         for _ in range(BATCH):

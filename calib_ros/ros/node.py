@@ -117,7 +117,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._load_at_start()
 
     def _serve(self) -> list[DeferredTrigger]:
-        """Create the services; return the deferred ones."""
         for kind, name, callback in (
             (Trigger, '~/cancel', lambda request: self._identifying.progress.cancel()),
             (Trigger, '~/capture', self._on_capture),
@@ -264,7 +263,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     # Services
 
     def _up_to_now(self, begin: Callable[..., Any], *arguments: Any) -> Any:
-        """Start the work of a call after all messages received before it."""
         self._take_messages()
         return begin(*arguments)
 

@@ -223,7 +223,6 @@ class Keeper:
         )
 
     def _named(self, parameter: str) -> Path | None:
-        """Return the file that a parameter names, if any; any node may have set it."""
         return self.file_of(parameter, self._node.get_parameter(parameter).value)
 
     def file_of(self, parameter: str, name: str) -> Path | None:

@@ -276,10 +276,7 @@ class Collector:
         return self.track.newest_ns - self._late_ns
 
     def _round(self, until: int, rounds: Sequence[int] = (), ends_here: bool = False) -> None:
-        """Make samples of everything up to a joint stamp, as in several `rounds`.
-
-        With `ends_here` an ongoing stop ends.
-        """
+        """Make samples of everything up to a joint stamp; `ends_here` ends an ongoing stop."""
         self._sort()
         if until <= self._settled_ns:
             return
@@ -306,7 +303,6 @@ class Collector:
                     self.dropped[f'{kind}: {cause}'] += count
 
     def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
-        """Plan a sample of each stop that ends before a stamp, and note unseen ones."""
         settings = self.settings
         stands = self.track.standing(settings.still, REST_S)
         shortest = round(settings.shortest_stop * 1e9)

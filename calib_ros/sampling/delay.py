@@ -110,7 +110,6 @@ def find_delay(
 
 
 def _rivals(score: FloatArray, best: int) -> Index:
-    """Return the other correlation peaks that leave about as much of the speeds unexplained."""
     found = peaks(score, RISE)
     others = found[found != best]
     left, least = (np.sqrt(1.0 - np.maximum(score[k], 0.0) ** 2) for k in (others, best))
@@ -138,10 +137,7 @@ def peaks(score: FloatArray, rise: float) -> Index:
 def _speed(
     times: FloatArray, positions: FloatArray, rotations: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return times and speeds, angular if rotations (N, 3, 3) are given.
-
-    Over SMOOTHING, or between successive measurements.
-    """
+    """Return times and speeds over SMOOTHING, angular if rotations (N, 3, 3) are given."""
     behind = np.searchsorted(times, times + SMOOTHING)
     behind = np.minimum(np.maximum(behind, np.arange(len(times)) + 1), len(times) - 1)
     first = np.flatnonzero(times[behind] > times)

@@ -172,7 +172,6 @@ class Intake:
                 self._add(each.source, TRANSFORM, each.places, each.readings)
 
     def _read(self, groups: Mapping[tuple[str, int], Sequence[int]]) -> Iterator[Found]:
-        """Yield readings: those of a topic and length with the same layout at once."""
         single: list[int] = []
         for (_, size), group in groups.items():
             stream, places = self._batch[group[0]][0], np.array(group)
@@ -196,7 +195,6 @@ class Intake:
             self.parts.append(Part(places, source, found))
 
     def _keep(self, place: int, stream: Stream, data: Any) -> None:
-        """Add an image by its number, or take a CameraInfo."""
         source, pictures = stream.source, self._pictures
         if source is None or pictures is None:
             return
@@ -216,7 +214,6 @@ class Intake:
         self._add(source, stream.type, np.array([place]), found)
 
     def _decode(self, places: Sequence[int]) -> Iterator[Found]:
-        """Yield the readings of messages decoded one by one, grouped by names."""
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
             stream, data = self._batch[place]

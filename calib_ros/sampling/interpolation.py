@@ -95,11 +95,9 @@ def last_moves(
 
 
 def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatArray) -> Index:
-    """Return the index (N, n) of the last value (M, n) up to `last` (N,) beyond low or high, or
-    -1.
+    """Return the index (N, n) of the last value (M, n) up to `last` (N,) outside, or -1.
 
-    By the extremes of blocks of 1, 2, 4, ... values: over larger and larger blocks to the one that
-    holds it, then down into halves.
+    By the extremes of blocks of 1, 2, 4, ... values, up to the one that holds it and down again.
     """
     lows, highs = [values], [values]
     while len(lows[-1]) > 1:

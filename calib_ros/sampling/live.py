@@ -142,10 +142,7 @@ class LiveEstimate:
         return self._latest
 
     def _begin(self, fitted: Sequence[Sample]) -> bool:
-        """Choose the parameters, and fit them robustly.
-
-        Samples that the robust fit rejects are added if predicted within the given sigmas.
-        """
+        """Choose the parameters, fit robustly, and add rejected samples within the sigmas."""
         self.restart()
         try:
             problem = self._problem_of(fitted)
@@ -180,14 +177,12 @@ class LiveEstimate:
         return True
 
     def _settle(self) -> None:
-        """Relinearise at the estimate while it is far away."""
         for _ in range(ROUNDS):
             if np.abs(self._step()).max() < SMALL_STEP or len(self._added) > SOME:
                 break
             self._linearise(self._estimate())
 
     def _linearise(self, chain: Chain) -> None:
-        """Restart the information at a chain, with the samples so far."""
         inverse, residual = self._prior.rows(chain, self._names)
         self._chain = chain
         self._information = np.diag(inverse**2)
@@ -209,11 +204,9 @@ class LiveEstimate:
         self._added += samples
 
     def _enough(self, rows: int) -> bool:
-        """Tell whether there are enough equations to detect a gross error."""
         return rows > 2 * len(self._names)
 
     def _groups(self, samples: Sequence[Sample]) -> list[tuple[list[Sample], Observations]]:
-        """Return samples of one kind and pair of frames, with their observations."""
         groups: dict[tuple[Any, ...], list[Sample]] = {}
         for sample in samples:
             key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
@@ -230,7 +223,6 @@ class LiveEstimate:
         return System(tuple(Samples(each, *self._sigmas) for _, each in groups), prior)
 
     def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
-        """Return the samples close to the prediction of the others."""
         chain = self._estimate()
         covariance, noise = self._uncertainty()
         # samples of one place may agree better than the model holds elsewhere
@@ -252,7 +244,6 @@ class LiveEstimate:
         return good
 
     def _scaled(self) -> tuple[FloatArray, FloatArray]:
-        """Return scales (P,), and the information matrix scaled to unit diagonal."""
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
         matrix = self._information * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
         return scale, matrix

@@ -105,7 +105,6 @@ class Maker:
     def _of_images(
         self, found: Piece, motion: Motion, begins: Index, came: FloatArray, delay: float
     ) -> Iterator[Numbered]:
-        """Yield a sample of the images of each stop, one of which will be processed."""
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
         ends = np.append(begins[1:], len(values))

@@ -141,7 +141,6 @@ class Pictures:
             return Refusal('that cannot be decoded', f'it cannot be decoded: {err!r}')
 
     def _posed(self, sample: Sample, view: View) -> Sample | Refusal:
-        """Return a sample with the corners and the pose of the board."""
         index = np.zeros(len(view.pixels), dtype=np.intp)
         joints = np.repeat(sample.joints[np.newaxis], len(index), axis=0)
         seen = Observations.from_pixels(joints, view.pixels, view.points, index)

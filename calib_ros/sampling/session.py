@@ -353,7 +353,6 @@ class CalibrationSession:
         self.pictures.keep_only(self._collector.waiting.images)
 
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
-        """Keep new samples; return their total number."""
         self.pictures.through(made)
         usual = self._frames.usual  # before it is known, nothing is strange
         fresh = [

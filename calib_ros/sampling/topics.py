@@ -90,7 +90,6 @@ def _links(
 
 
 def _learn(messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise) -> None:
-    """Pass all messages to the links of their streams; errors are reported in the replay."""
     for batch, _ in batches(messages):
         Intake(batch, deserialise)
 
@@ -154,7 +153,6 @@ def _joint_values(
 def _apart(
     a: str, b: str, first: Mapping[str, Series], second: Mapping[str, Series], names: Sequence[str]
 ) -> str:
-    """Return by how much the joint values on two topics differ at the same time."""
     largest: tuple[float, str] | None = None
     for name in names:
         dense, sparse = sorted((first[name], second[name]), key=lambda each: -len(each[0]))

@@ -133,7 +133,6 @@ class Links:
         return found, faults
 
     def _fix(self, come: Linked) -> None:
-        """Learn a static link; it may have no stamp."""
         found = come.read()
         good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(come.places)))
         for numbers in found.numbers[good]:
@@ -203,7 +202,6 @@ class Links:
     # Details
 
     def _of(self, link: Pair) -> list[tuple[Source, Route]]:
-        """Return the sources measured by a link."""
         routes = self._routes.items()
         return [(s, r) for s, r in routes if isinstance(r, Route) and r.link == link]
 
@@ -246,7 +244,6 @@ class Links:
         return Route(*path[k], self._composed(path[:k]), self._composed(path[k + 1 :]))
 
     def _path(self, parent: str, child: str) -> list[tuple[Pair, bool]] | str:
-        """Return the links from one frame to another, and which of them to invert."""
         for link, inverse in (((parent, child), False), ((child, parent), True)):
             if link in self._moving:  # a direct measurement takes precedence
                 return [(link, inverse)]
