@@ -148,17 +148,13 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         lacking += whole
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
-    information = _information(names, change, square)
-    chance, beyond = (
-        _chance(information, freedom),
-        _chance(_information(names, change, lacking), freedom),
-    )
+    left_over = _information(names, change, square)
+    chance = _chance(left_over, freedom)
+    beyond = _chance(_information(names, change, lacking), freedom)
     changed: list[tuple[Explanation, ...]] = []
-    while len(changed) < SEVERAL and (
-        reasons := changes.reasons_of(information, columns, freedom)
-    ):
+    while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
         changed.append(reasons)
-        information = information.marginalised(columns.spread(reasons))
+        left_over = left_over.marginalised(columns.spread(reasons))
     predicted = changes.predicted(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
@@ -173,7 +169,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         float(np.sqrt(np.quantile(squares, CONFIDENT))),
         left,
         tuple(changed),
-        _chance(information, freedom, sum(len(each[0].names) for each in changed)),
+        _chance(left_over, freedom, sum(len(each[0].names) for each in changed)),
     )
 
 

@@ -193,9 +193,8 @@ def posterior_of(
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
-    moments = offsets[arm], mean - offsets[arm], covariance
-    sizes = evidence.named(size)
-    return Posterior(chain, every, *moments, device, priors, sizes, doubted, rival)
+    found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
+    return Posterior(chain, every, *found, doubted, rival)
 
 
 def _rival(

@@ -184,7 +184,10 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) ->
         found = _tried(chain, (part.spread(),))
         return None if found is None else _polished(problem, found).chain
 
-    found = lost(_moved(problem, sets[0], 0), framed, _errors, _largest(problem))
+    def errors(arm: Chain, each: Observations) -> FloatArray:
+        return _away(arm, each, flange(arm, each))
+
+    found = lost(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
     if found is None or found.error > NEARER * given.error:
         return None
     remedy = 'is a row missing or duplicated in one of two tables? Correct it'
@@ -337,10 +340,6 @@ def _polished(problem: Problem, trial: _Trial) -> _Trial:
     fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
     polished = _Trial(fitted, sets, trial.arms, trial.spread)
     return min(trial, polished, key=lambda one: one.error)
-
-
-def _errors(chain: Chain, each: Observations) -> FloatArray:
-    return _away(chain, each, flange(chain, each))
 
 
 def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:

@@ -218,12 +218,11 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
             length = norms(part) / np.sqrt(share)
             known = ~np.isnan(length)
             if known.any():
-                scale = np.median(length[known]) / _median_length(part.shape[1])
+                usual = np.sqrt(
+                    special.chdtri(part.shape[1], 0.5)
+                )  # median length of standard normals
+                scale = np.median(length[known]) / usual
                 size = np.where(known, length, 0.0) / max(scale, STEP_TOLERANCE)  # else rounding
                 largest = np.maximum(largest, size[row])
         found.append(largest)
     return tuple(found)
-
-
-def _median_length(dimensions: int) -> float:  # of a standard normal vector
-    return float(np.sqrt(special.chdtri(dimensions, 0.5)))
