@@ -126,15 +126,15 @@ def verifications(rows: Sequence[Row]) -> tuple[Row, ...]:
     return _unique(own, lambda row: (row.inputs, row.chain))
 
 
-def _unique(rows: Sequence[Row], of: Callable[[Row], object]) -> tuple[Row, ...]:
-    """Return rows ordered by time, one for each key `of`.
+def _unique(rows: Sequence[Row], key: Callable[[Row], object]) -> tuple[Row, ...]:
+    """Return rows ordered by time, one for each key.
 
     Rows filed before their stamps count as measured when filed.
     """
     dated = [replace(row, time=row.filed) if too_late(row) else row for row in rows]
     newest = sorted(dated, key=lambda row: (row.software == calib_ros.__version__, row.filed))
-    kept = {of(row): row for row in newest}
-    return tuple(sorted(kept.values(), key=lambda row: (row.time, row.source, row.key)))
+    unique = {key(row): row for row in newest}
+    return tuple(sorted(unique.values(), key=lambda row: (row.time, row.source, row.key)))
 
 
 def too_late(row: Row) -> bool:

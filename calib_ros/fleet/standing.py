@@ -69,7 +69,9 @@ class Standing:
         known = tuple(r for r in verifications(rows) if robot.compares(r.time))
         found = drift([r.rms_mm or 0 for r in known], [r.rms_freedom or 0 for r in known], years)
         watched = watch(compared, years)
-        errors, copies = (of.get(robot.serial, {}) for of in (done.errors, done.copies))
+        errors, copies = (
+            by_robot.get(robot.serial, {}) for by_robot in (done.errors, done.copies)
+        )
         remarks = [
             f'{copy} has the content of {source}: one night' for copy, source in copies.items()
         ]
@@ -246,8 +248,8 @@ def _link(out: Path, standing: Standing) -> str:
 
 
 def _chart(standing: Standing) -> dict[str, Any]:
-    def times(of: Iterable[Row | Change]) -> list[str]:
-        return [each.time.isoformat(timespec='seconds') for each in of]
+    def times(rows: Iterable[Row | Change]) -> list[str]:
+        return [each.time.isoformat(timespec='seconds') for each in rows]
 
     nights = standing.watched.nights[-MOST_NIGHTS:]
     joints = dict.fromkeys(joint for night in nights for joint in night.strength)

@@ -109,10 +109,10 @@ def structurally_independent(
             shift = dict(zip(parameters_of(kind.base)[:3], -place, strict=True))
             anywhere = anywhere.with_offsets({n: x for n, x in shift.items() if n in names})
         model = ErrorModel(anywhere, names, kind.base, kind.tool)
-        came, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
-        jacobian = model.jacobian(posed, came, rates)
+        signs, rates = approach[: len(posed)], velocity[: len(posed)] if kind.moving else None
+        jacobian = model.jacobian(posed, signs, rates)
         if kind.distance:
-            line = anywhere.forward(posed, came, kind.base, kind.tool)[:, :3, 3]
+            line = anywhere.forward(posed, signs, kind.base, kind.tool)[:, :3, 3]
             if kind.plane:
                 line[:] = [0.0, 0.0, 1.0]
             line /= np.linalg.norm(line, axis=1, keepdims=True)

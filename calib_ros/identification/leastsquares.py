@@ -142,7 +142,7 @@ def owners(rows: Sequence[FloatArray]) -> NDArray[np.intp]:
     ends = np.cumsum([each.shape[2] for each in rows]).tolist()
     numbers = [np.arange(end - each.shape[2], end) for end, each in zip(ends, rows, strict=True)]
     return np.concatenate(
-        [np.tile(each, of.shape[1]) for each, of in zip(numbers, rows, strict=True)]
+        [np.tile(each, part.shape[1]) for each, part in zip(numbers, rows, strict=True)]
     )
 
 

@@ -84,9 +84,9 @@ class PixelSamples(Samples):
             twist = np.ascontiguousarray(block.twist.T)
             outer = inner[:, :, :6] @ twist
             own = np.array([*block.lens, size])
-            of = np.zeros(len(block.owner), dtype=np.intp) if folds is None else folds[block.part]
+            fold = np.zeros(len(block.owner), np.intp) if folds is None else folds[block.part]
             for k, (matrix, _) in enumerate(found):
-                these, here = of[block.begins] == k, of == k
+                these, here = fold[block.begins] == k, fold == k
                 turned = twist[these].reshape(-1, size).T
                 mixed = turned @ inner[these, :, 6:].reshape(-1, len(own))
                 alone = block.columns[6:, :, here].reshape(len(own), -1)

@@ -265,9 +265,9 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
     for start in range(0, len(then), BLOCK):
         part = slice(start, start + BLOCK)
         q = np.ascontiguousarray(then.joints[part].T)
-        came = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
+        signs = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
         axes, origin = chain.trace(
-            chain.effective(q, came), base=observations.base, tool=observations.tool
+            chain.effective(q, signs), base=observations.base, tool=observations.tool
         )
         if distances is not None:
             length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
@@ -294,8 +294,8 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
     assert then.pixels is not None
     assert then.points is not None
     q = np.ascontiguousarray(then.joints[first].T)
-    came = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
-    axes, origin = chain.trace(chain.effective(q, came), base=then.base, tool=then.tool)
+    signs = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
+    axes, origin = chain.trace(chain.effective(q, signs), base=then.base, tool=then.tool)
     pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
     for start in range(0, len(then), 4 * BLOCK):
         part = slice(start, start + 4 * BLOCK)

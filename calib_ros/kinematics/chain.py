@@ -251,8 +251,8 @@ class Chain(Shown):
         `tool` select frames.
         """
         rows = np.ascontiguousarray(self.joint_values(q).T)
-        came = None if approach is None else np.ascontiguousarray(approach.T)
-        axes, origin = self.trace(self.effective(rows, came), base=base, tool=tool)
+        signs = None if approach is None else np.ascontiguousarray(approach.T)
+        axes, origin = self.trace(self.effective(rows, signs), base=base, tool=tool)
         return se3.transform(axes.transpose(2, 1, 0), origin.T)
 
     def joint_values(self, q: FloatArray) -> FloatArray:

@@ -132,8 +132,8 @@ class Follower:
         parts = []
         for start in range(0, len(joints), BLOCK):
             rows = slice(start, start + BLOCK)
-            came = None if approach is None else np.ascontiguousarray(approach[rows].T)
-            parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), came, bounded))
+            signs = None if approach is None else np.ascontiguousarray(approach[rows].T)
+            parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), signs, bounded))
             progress(min(1.0, rows.stop / len(joints)))
         names = [each.name for each in fields(Solution)]
         found = {name: [getattr(part, name) for part in parts] for name in names}

@@ -129,8 +129,8 @@ class Aim:
         count, step = len(q), 1e-6  # accurate to 1e-9 of the effects
         moved = np.repeat(q[:, np.newaxis], count + 1, axis=1)  # the last unchanged
         moved[np.arange(count), np.arange(count)] += step
-        came = None if approach is None else np.tile(approach, count + 1)
-        found = self._chain.effective(moved.reshape(count, -1), came).reshape(moved.shape)
+        signs = None if approach is None else np.tile(approach, count + 1)
+        found = self._chain.effective(moved.reshape(count, -1), signs).reshape(moved.shape)
         return np.asarray((found[:, :-1] - found[:, -1:]) / step)
 
 

@@ -144,9 +144,9 @@ class ErrorModel:
         axes: the orientation becomes exp(J[3:] dx) R.
         """
         rows = np.ascontiguousarray(self.chain.joint_values(q).T)
-        came = None if approach is None else np.ascontiguousarray(approach.T)
+        signs = None if approach is None else np.ascontiguousarray(approach.T)
         moving = None if velocity is None else np.ascontiguousarray(velocity.T)
-        _, _, shift, turn = self.linearise(rows, came, moving)
+        _, _, shift, turn = self.linearise(rows, signs, moving)
         full = np.zeros((len(q), 6, len(self.names)))
         full[:, :3] = shift[self.order].transpose(2, 1, 0)
         rotational = self.order < self.rotations

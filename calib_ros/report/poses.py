@@ -134,13 +134,13 @@ class Poses:
 def _poses(
     chain: Chain,
     sigmas: tuple[float, float],
-    of: Sequence[tuple[Sequence[Observations], Comparison, NDArray[np.str_], FloatArray]],
+    groups: Sequence[tuple[Sequence[Observations], Comparison, NDArray[np.str_], FloatArray]],
     lines: bool,
     images: Mapping[int, str],
 ) -> Poses:
     """Return the poses of sets with residuals, roles (N,) and sizes (N,), in stamp order."""
     parts: list[dict[str, NDArray[Any]]] = []
-    for sets, comparison, role, sizes in of:
+    for sets, comparison, role, sizes in groups:
         first, before, after = 0, comparison.before, comparison.after
         for each in sets:
             rows = slice(first, first + len(each))
@@ -187,14 +187,14 @@ def poses_of(
     sizes = np.concatenate(result.distances)
     judged = result.validation
     if judged is None or judged.repeated is not None:
-        of = [(problem.sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
+        groups = [(problem.sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
     else:  # each was held out once
-        of = [(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
+        groups = [(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
     if judged is not None and judged.repeated is not None:
         role = np.where(judged.repeated, REPEATED, JUDGED)
-        of.append((problem.judging, judged, role, np.full(len(role), np.nan)))
+        groups.append((problem.judging, judged, role, np.full(len(role), np.nan)))
     sigmas = (problem.sigma_position, problem.sigma_orientation)
-    return _poses(result.chain, sigmas, of, lines, images)
+    return _poses(result.chain, sigmas, groups, lines, images)
 
 
 def poses_to_verify(
@@ -202,9 +202,9 @@ def poses_to_verify(
 ) -> Poses:
     """Return the poses of new measurements, all judged."""
     count = len(comparison.judged)
-    of = [(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
+    groups = [(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
-    return _poses(chain, sigmas, of, lines, NAMELESS)
+    return _poses(chain, sigmas, groups, lines, NAMELESS)
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:

@@ -108,7 +108,7 @@ class Snapshot(NamedTuple):
     origin: dict[str, Any]
     configuration: str
     warnings: tuple[str, ...]
-    came: str = ''
+    summary: str = ''
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the operator's numbers of outlier samples."""
@@ -161,7 +161,7 @@ class Identifying:
         }
         numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
         model, settings = session.settings.model, self._configuration()
-        texts = session.warnings, session.came
+        texts = session.warnings, session.summary
         found = Snapshot(problem, model, samples, numbers, origin, settings, *texts)
         self.progress.begin()
         return found
@@ -173,7 +173,7 @@ class Identifying:
                 result = identify_model(given.problem, given.model, self.progress)
         except TooFewObservationsError as err:
             self._advice = next(iter(given.warnings), '')
-            raise too_few(err, given.came) from err
+            raise too_few(err, given.summary) from err
         steps = (step for reason in reasons_of(result) for step in reason.steps)
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)

@@ -105,7 +105,7 @@ class Inputs:
         guarded: Callable[[Callable[..., None]], Callable[..., None]],
     ) -> None:
         self._node, self._guarded = node, guarded
-        self._heard: dict[str, Hearing] = {}
+        self._topics: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
         self._inputs = dict(self._subscribe(stream) for stream in streams)
         self._events = dict.fromkeys((e for each in self._inputs for e in each.event_handlers), 0)
@@ -117,10 +117,10 @@ class Inputs:
     def take(self) -> list[tuple[Stream, bytes]]:
         """Return the messages since the last call, in order of arrival."""
         come = []
-        for subscription, (stream, heard) in self._inputs.items():
+        for subscription, (stream, hearing) in self._inputs.items():
             found = _waiting(subscription)
-            heard.count += len(found)
-            heard.full += len(found) >= subscription.qos_profile.depth
+            hearing.count += len(found)
+            hearing.full += len(found) >= subscription.qos_profile.depth
             come += [(stamp, stream, data) for stamp, data in found]
         come.sort(key=itemgetter(0))
         return [(stream, data) for _, stream, data in come]
@@ -128,7 +128,7 @@ class Inputs:
     @property
     def topics(self) -> list[str]:
         """Return the topics that have received something."""
-        return [topic for topic, heard in self._heard.items() if heard.count]
+        return [topic for topic, hearing in self._topics.items() if hearing.count]
 
     def look(self) -> None:
         """Note losses, silence and rates since the last look."""
@@ -141,23 +141,25 @@ class Inputs:
                 event.callback(status)
         now = time.monotonic()
         span, self._looked_at = now - self._looked_at, now
-        for heard in self._heard.values():
-            heard.look(now, span)
+        for hearing in self._topics.values():
+            hearing.look(now, span)
 
     def troubles(self) -> list[str]:
         """Return problems of topics as text."""
         wrong = [
-            f'no more messages on {topic}' for topic, heard in self._heard.items() if heard.silent
+            f'no more messages on {topic}'
+            for topic, hearing in self._topics.items()
+            if hearing.silent
         ]
         wrong += [
-            f'{topic} is published {heard.deaf} is asked for'
-            for topic, heard in self._heard.items()
-            if heard.deaf and not heard.count
+            f'{topic} is published {hearing.deaf} is asked for'
+            for topic, hearing in self._topics.items()
+            if hearing.deaf and not hearing.count
         ]
         wrong += self._of_other_types()
         streams = [stream for stream, _ in self._inputs.values()]
         wrong += [words for links in links_of(streams) for words in links.problems()]
-        losing = [topic for topic, heard in self._heard.items() if heard.losing]
+        losing = [topic for topic, hearing in self._topics.items() if hearing.losing]
         if losing:
             wrong.append(f'messages are lost on {", ".join(losing)}')
         return wrong
@@ -166,7 +168,7 @@ class Inputs:
         """Return the diagnostics of each topic."""
         now = time.monotonic()
         found: dict[str, Any] = {}
-        for topic, each in self._heard.items():
+        for topic, each in self._topics.items():
             if each.last is not None:
                 found[f'rate of {topic} [Hz]'] = f'{each.rate:.1f}'
                 found[f'age of {topic} [s]'] = f'{now - each.last:.1f}'
@@ -178,8 +180,8 @@ class Inputs:
         overriding = QoSOverridingOptions(
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
-        heard = self._heard.setdefault(self._node.resolve_topic_name(stream.topic), Hearing())
-        heard.latched = stream.still
+        hearing = self._topics.setdefault(self._node.resolve_topic_name(stream.topic), Hearing())
+        hearing.latched = stream.still
         try:
             subscription = self._node.create_subscription(
                 _message_type(stream.type),
@@ -187,22 +189,22 @@ class Inputs:
                 lambda data: None,  # no executor serves it
                 _qos(stream),
                 qos_overriding_options=overriding,
-                event_callbacks=self._noting(heard),
+                event_callbacks=self._noting(hearing),
                 raw=True,
             )
         except RuntimeError as err:  # unknown policy
             raise ConfigError(f'qos_overrides for "{stream.topic}" cannot be: {err}') from err
         if subscription.qos_profile.depth < 1:
             raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
-        return subscription, (stream, heard)
+        return subscription, (stream, hearing)
 
-    def _noting(self, heard: Hearing) -> SubscriptionEventCallbacks:
+    def _noting(self, hearing: Hearing) -> SubscriptionEventCallbacks:
         def note_deaf(event: Any) -> None:
             latched = event.last_policy_kind == QoSPolicyKind.DURABILITY
-            heard.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
+            hearing.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
 
         def note_lost(event: Any) -> None:
-            heard.note_lost(event.total_count)
+            hearing.note_lost(event.total_count)
 
         return SubscriptionEventCallbacks(
             incompatible_qos=self._guarded(note_deaf),
@@ -212,9 +214,9 @@ class Inputs:
 
     def _of_other_types(self) -> list[str]:
         found = {}
-        for subscription, (stream, heard) in self._inputs.items():
+        for subscription, (stream, hearing) in self._inputs.items():
             topic = subscription.topic_name
-            infos = [] if heard.count else self._node.get_publishers_info_by_topic(topic)
+            infos = [] if hearing.count else self._node.get_publishers_info_by_topic(topic)
             for kind in {info.topic_type for info in infos} - {stream.type}:
                 found[topic, kind] = f'{topic} is published as {kind}, not as {stream.type}'
         return [found[key] for key in sorted(found)]

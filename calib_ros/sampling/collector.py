@@ -251,8 +251,8 @@ class Collector:
             stamps = self.track.samples()[0]
             stamps = stamps[stamps >= begin]
             joints = self.track.at(stamps, standing=True).joints
-            came = self.track.approach(stamps[:1], joints[:1])[0]
-            self.maker.in_socket(place, int(stamps[-1]), joints, came)
+            approach = self.track.approach(stamps[:1], joints[:1])[0]
+            self.maker.in_socket(place, int(stamps[-1]), joints, approach)
             return 1, ''
         self._round(begin)  # end earlier stops
         before, dropped = len(self.maker.fresh), self.dropped.copy()
@@ -350,9 +350,9 @@ class Collector:
                 piece = Piece(key, numbers[good], rows.stamps[good], rows.values[good])
                 begins = np.flatnonzero(np.diff(piece.places, prepend=-1))
                 begins = np.arange(len(good)) if moving else begins
-                came = self.track.approach(stamps[good[begins]], motion.joints[begins])
+                approach = self.track.approach(stamps[good[begins]], motion.joints[begins])
                 delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
-                found += self.maker.samples(piece, motion, begins, came, delay, sigma)
+                found += self.maker.samples(piece, motion, begins, approach, delay, sigma)
             rows.release(due)
         self.maker.add(found)
 

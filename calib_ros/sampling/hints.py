@@ -125,7 +125,7 @@ def unsettled(refused: int, stops: int) -> list[Hint]:
     return [Hint(f'{refused} of {stops} stops still move where measured: set settle', words)]
 
 
-def lost(kind: str, came: int, dropped: Mapping[str, int]) -> tuple[float, str]:
+def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]:
     """Return the share of messages of a kind that was lost, and the main cause.
 
     Lost messages were dropped for their stamp or a full buffer; not those that the device did not
@@ -137,16 +137,16 @@ def lost(kind: str, came: int, dropped: Mapping[str, int]) -> tuple[float, str]:
         if cause.startswith(kind) and _LOSS.search(cause) and not _TWICE.search(cause)
     }
     most = max(causes, key=causes.__getitem__, default='')
-    return sum(causes.values()) / came if came else 0.0, most.removeprefix(f'{kind}: ')
+    return sum(causes.values()) / total if total else 0.0, most.removeprefix(f'{kind}: ')
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:
     """Report a large share of lost messages, and the main cause."""
     found = []
     for kind in (JOINTS, POSES):
-        came = received[kind]
-        share, cause = lost(kind, came, dropped)
-        if share > EXCEPTION and share * came >= NO_ACCIDENT:
+        total = received[kind]
+        share, cause = lost(kind, total, dropped)
+        if share > EXCEPTION and share * total >= NO_ACCIDENT:
             words = f'{share:.0%} of the {kind} {LOST}: {cause}'
             found.append(Hint(f'{share:.0%} of the {kind} are dropped: {cause}', words))
     return found

@@ -78,20 +78,20 @@ def continuous(values: FloatArray, revolute: Flags) -> FloatArray:
 
 
 def last_moves(
-    values: FloatArray, first: Index, now: FloatArray, came: FloatArray, revolute: Flags
+    values: FloatArray, first: Index, now: FloatArray, earlier: FloatArray, revolute: Flags
 ) -> FloatArray:
     """Return the signs (N, n) of the last move of each joint before its present value.
 
     Relative to the last of the samples (M, n) up to index `first` (N,) that differs; without one,
-    `came` (n,) holds earlier signs.
+    `earlier` (n,) holds earlier signs.
     """
     if len(values) == 0:
-        return np.tile(came, (len(now), 1))
+        return np.tile(earlier, (len(now), 1))
     path = continuous(values, revolute)
     now = path[first] + unwrapped(now - path[first], revolute)
     there = _last_outside(path, first, now - MOVED, now + MOVED)
     signs = np.sign(now - np.take_along_axis(path, there, axis=0))
-    return np.asarray(np.where(there >= 0, signs, came))
+    return np.asarray(np.where(there >= 0, signs, earlier))
 
 
 def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatArray) -> Index:

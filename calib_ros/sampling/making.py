@@ -47,21 +47,21 @@ class Maker:
         found: Piece,
         motion: Motion,
         begins: Index,
-        came: FloatArray,
+        approach: FloatArray,
         delay: float,
         sigma: float,
     ) -> Iterator[Numbered]:
         """Yield a sample of the measurements of each stop, unless they spread too much.
 
         Stops, or single measurements of a moving arm, begin at `begins` (S,), approached with the
-        signs `came` (S, n). Places hold their numbers. Measurements are late by `delay` [s] and
-        scatter by `sigma` [m].
+        signs `approach` (S, n). Places are their numbers. Measurements are late by `delay` [s]
+        and scatter by `sigma` [m].
         """
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
         counts = np.diff(begins, append=len(values))
         if key.images:
-            yield from self._of_images(found, motion, begins, came, delay)
+            yield from self._of_images(found, motion, begins, approach, delay)
             return
         turned = ~np.isnan(values[:, QUAT]).any(axis=1)
         positions = values[:, DISTANCE if key.distance else POSITION]
@@ -95,7 +95,7 @@ class Maker:
                 position=means.values[k],
                 rotation=rotations[k] if oriented[k] else None,
                 joints=joints[k],
-                approach=came[k],
+                approach=approach[k],
                 velocity=None if motion.velocity is None else motion.velocity[k],
                 acceleration=None if motion.acceleration is None else motion.acceleration[k],
                 delay=delay,
@@ -103,7 +103,7 @@ class Maker:
             )
 
     def _of_images(
-        self, found: Piece, motion: Motion, begins: Index, came: FloatArray, delay: float
+        self, found: Piece, motion: Motion, begins: Index, approach: FloatArray, delay: float
     ) -> Iterator[Numbered]:
         key, numbers, stamps, values = found
         assert isinstance(key, StreamKey)
@@ -118,7 +118,7 @@ class Maker:
                 values[middle : middle + 1],
                 position=np.full(3, np.nan),
                 joints=joints[k],
-                approach=came[k],
+                approach=approach[k],
                 delay=delay,
                 images=tuple(values[begin:end, 0].astype(int).tolist()),
             )
@@ -130,15 +130,17 @@ class Maker:
         steps = unwrapped(joints - np.repeat(first, counts, axis=0), self._revolute)
         return np.asarray(first + mean_of_each(steps, begins, used))
 
-    def in_socket(self, place: str, stamp_ns: int, joints: FloatArray, came: FloatArray) -> None:
+    def in_socket(
+        self, place: str, stamp_ns: int, joints: FloatArray, approach: FloatArray
+    ) -> None:
         """Make a sample of a ball in a socket, at joint values (N, n) while the arm stands.
 
-        Approached with the signs `came` (n,).
+        Approached with the signs `approach` (n,).
         """
         sample = Sample(
             stamp_ns=stamp_ns,
             joints=joints[0] + unwrapped(joints - joints[0], self._revolute).mean(axis=0),
-            approach=came,
+            approach=approach,
             device=place,
             socket=True,
         )

@@ -248,7 +248,7 @@ class CalibrationSession:
         return self._clocks.delay
 
     @property
-    def came(self) -> str:
+    def summary(self) -> str:
         """Return the account of the messages and the warnings as text."""
         return '; '.join((str(self.account()), *self.warnings))
 
@@ -292,7 +292,7 @@ class CalibrationSession:
         """Return samples as a problem; with `posed` boards as poses, not corners."""
         found = problem_of(self.chain, samples, self.settings, posed)
         if found is None:
-            raise InputError(f'no poses to fit: {self.came}')
+            raise InputError(f'no poses to fit: {self.summary}')
         return found
 
     def identify(self) -> Identification:
@@ -301,7 +301,7 @@ class CalibrationSession:
         try:
             result = identify_model(problem, self.settings.model)
         except TooFewObservationsError as err:
-            raise too_few(err, self.came) from err
+            raise too_few(err, self.summary) from err
         if result.accepted:
             owners = named(self.samples).owners
             self.adopt(Calibration.of(result, owners=owners, fitted=problem.sets), self.samples)
@@ -366,7 +366,7 @@ class CalibrationSession:
         return len(self.samples)
 
 
-def too_few(err: TooFewObservationsError, came: str) -> InputError:
-    """Return an error of too few samples with the account of messages `came`."""
+def too_few(err: TooFewObservationsError, summary: str) -> InputError:
+    """Return an error of too few samples with the account of messages `summary`."""
     few, _, advice = str(err).rpartition('; ')
-    return InputError(f'{few} ({came}); {advice}')
+    return InputError(f'{few} ({summary}); {advice}')

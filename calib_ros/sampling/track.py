@@ -103,7 +103,7 @@ class Track:
         self._max_gap_ns = round(max_gap * 1e9)
         self._capacity = capacity
         self._parts: dict[tuple[int, ...], Rows] = {}
-        self._came = np.zeros(len(revolute))  # signs of last moves before the samples
+        self._earlier = np.zeros(len(revolute))  # signs of last moves before the samples
         self.contrary = 0
         """Samples dropped for different values of the same stamp."""
         self.horizon_ns = 0
@@ -112,17 +112,17 @@ class Track:
     @property
     def newest_ns(self) -> int:
         """Return the stamp up to which all named joints have been received."""
-        heard = self._newest()
-        return int(heard[heard > 0].min(initial=np.iinfo(np.int64).max)) if heard.any() else 0
+        newest = self._newest()
+        return int(newest[newest > 0].min(initial=np.iinfo(np.int64).max)) if newest.any() else 0
 
     def _newest(self) -> Stamps:
         """Return the newest stamp of each joint (n,), zero if never named."""
-        heard = np.zeros(len(self._revolute), dtype=np.int64)
+        newest = np.zeros(len(self._revolute), dtype=np.int64)
         for columns, rows in self._parts.items():
             if rows.count:
                 index = list(columns)
-                heard[index] = np.maximum(heard[index], rows.stamps.max())
-        return heard
+                newest[index] = np.maximum(newest[index], rows.stamps.max())
+        return newest
 
     def room(self, columns: tuple[int, ...]) -> int:
         """Return how many more samples of some joints fit."""
@@ -142,8 +142,8 @@ class Track:
 
     def silent(self, time_ns: int) -> tuple[int, ...]:
         """Return the joints last received so much earlier than others."""
-        heard = self._newest()
-        return tuple(np.flatnonzero((heard > 0) & (heard < heard.max() - time_ns)).tolist())
+        newest = self._newest()
+        return tuple(np.flatnonzero((newest > 0) & (newest < newest.max() - time_ns)).tolist())
 
     def extend(self, columns: tuple[int, ...], stamps: Stamps, values: FloatArray) -> None:
         """Take values (M, k) of some joints at stamps (M,)."""
@@ -176,8 +176,8 @@ class Track:
         """Return the signs (N, n) of the last moves before joint values (N, n) at stamps (N,)."""
         found = np.zeros(joints.shape)
         for index, rows, (why, first, _) in self._around(stamps):
-            revolute, came = self._revolute[index], self._came[index]
-            signs = last_moves(rows.values, first, joints[:, index], came, revolute)
+            revolute, earlier = self._revolute[index], self._earlier[index]
+            signs = last_moves(rows.values, first, joints[:, index], earlier, revolute)
             found[np.ix_(why == 0, index)] = signs[why == 0]
         return found
 
@@ -263,11 +263,11 @@ class Track:
         The last one is kept, unless others name the joints of a publisher that has become silent.
         """
         dropped = 0
-        heard = self._newest()
+        newest = self._newest()
         for columns, rows in tuple(self._parts.items()):
             index = list(columns)
             cut = int(np.searchsorted(rows.stamps, before_ns))
-            if 0 < cut == rows.count and (heard[index] > rows.stamps[-1]).all():
+            if 0 < cut == rows.count and (newest[index] > rows.stamps[-1]).all():
                 del self._parts[columns]
                 dropped += cut
                 continue
@@ -275,10 +275,10 @@ class Track:
             if cut <= 0:
                 continue
             here = np.array([cut])
-            came = last_moves(
-                rows.values, here, rows.values[here], self._came[index], self._revolute[index]
+            earlier = last_moves(
+                rows.values, here, rows.values[here], self._earlier[index], self._revolute[index]
             )
-            self._came[index] = came[0]
+            self._earlier[index] = earlier[0]
             rows.release(cut)
             dropped += cut
         self.horizon_ns = max(self.horizon_ns, before_ns)
