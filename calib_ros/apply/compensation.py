@@ -268,8 +268,8 @@ def too_fast(
 ) -> list[Refusal]:
     """Return the samples, from `first` on, whose correction changes too much.
 
-    `changes` (N, n) of it are compared with `moves` (N, n) of the joints, both positive; `words`
-    have places for change and move.
+    `changes` (N, n) of the correction are compared with `moves` (N, n) of the joints, both
+    positive; `words` have places for change and move.
     """
     shares = (changes - EXACT) / compensator.largest
     allowed = compensator.largest_change * (moves / compensator.largest).max(axis=1)

@@ -93,8 +93,9 @@ class Verification(Shown):
         RMS position error [m] over poses like these, and its limits.
     freedom : float
         Degrees of freedom of that error.
-    verdict : 'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds' or 'does not hold'
-        'no verdict' if neither is known.
+    verdict : str
+        'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds', 'does not hold', or
+        'no verdict' if unknown.
     needed : int or None
         Number of configurations that would decide with the same RMS error, if undecided; None if
         even DECIDING would not.

@@ -60,8 +60,7 @@ class Columns:
         values: FloatArray | None = None,
         needed: NDArray[np.bool_] | bool = True,
     ) -> FloatArray:
-        """Return numbers (N, len(names)) that each row has completely or, if not `needed`, not at
-        all.
+        """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none.
 
         `values` are the numbers if already read.
         """

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import CalibrationError
 from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.start import likened
+from calib_ros.identification.start import fit_to_arm
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
@@ -281,4 +281,4 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         names -= {Parameter(joint, 'd') for joint in replace(start, parallel=None).parallel or ()}
     ordered = [name for name in start.parameter_names if name in names]
     joints = joints[:: max(1, len(joints) // SOME_POSES)]  # fitted on some, judged on all
-    return likened(start, ordered, chain, joints, 1e-3)[0]
+    return fit_to_arm(start, ordered, chain, joints, 1e-3)[0]

@@ -177,9 +177,7 @@ def explanations(
 def reasons_of(
     information: Information, columns: Columns, freedom: float
 ) -> tuple[Explanation, ...]:
-    """Return the best explanation and those indistinguishable from it; none if chance may explain
-    it.
-    """
+    """Return the likely explanations; none if the change may be chance."""
     found = explanations(information, columns, freedom)
     return likely(found) if any(each.chance <= FALSE for each in found) else ()
 

@@ -33,7 +33,7 @@ from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import TYPICAL
-from calib_ros.identification.start import likened
+from calib_ros.identification.start import fit_to_arm
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
@@ -192,7 +192,7 @@ def _in_parameters_of(
     names = tuple(Parameter(name) for name in independent if name in arm)
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
     start = replace(chain, base=other.base, tool=other.tool)
-    fitted, left = likened(start, independent, other, joints)
+    fitted, left = fit_to_arm(start, independent, other, joints)
     return names, chain, np.array([fitted.offset(name, chain) for name in names]), left
 
 

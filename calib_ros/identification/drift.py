@@ -185,9 +185,7 @@ def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
 
 
 def chance(shares: FloatArray) -> float:
-    """Return the share of shifted residuals explained as well as those in place, the first of
-    (S,).
-    """
+    """Return the share of shifted residuals explained as well as the unshifted, first of (S,)."""
     return float(np.mean(shares[1:] >= shares[0]))
 
 

@@ -128,9 +128,7 @@ class Posterior(Shown):
         )
 
     def held(self, name: str) -> float:
-        """Return the share of a parameter's variance that its prior accounts for, 1 if
-        undetermined.
-        """
+        """Return the share of a parameter's variance due to its prior, 1 if undetermined."""
         variance = float(self.covariance[self.names.index(name), self.names.index(name)])
         return variance / self.priors[name] ** 2 if name in self.priors else 0.0
 

@@ -95,9 +95,7 @@ class Fitted:
 
 
 def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
-    """Return the structurally identifiable names, the nominal chain with start frames, and the
-    fit.
-    """
+    """Return the structurally identifiable names, the chain with start frames, and the fit."""
     model, separations = problem.model, problem.system(problem.sets).separation_rows
     structural = identifiability.structurally_independent(
         model, problem.free, problem.kinds, separations

@@ -95,9 +95,7 @@ class System(Shown):
         return rows / SEPARATION_SIGMA, residual
 
     def select(self, chosen: Sequence[NDArray[np.generic]]) -> System:
-        """Return the samples chosen by masks (N,) or indices (K,) for each set, with their
-        weights.
-        """
+        """Return chosen samples and their weights, by masks (N,) or indices (K,) for each set."""
         pairs = zip(self.sets, chosen, strict=True)
         return replace(self, sets=tuple(samples.select(index) for samples, index in pairs))
 

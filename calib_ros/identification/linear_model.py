@@ -152,8 +152,7 @@ class LinearModel:
     def strongest_harmonic(
         self, chosen: Sequence[str], progress: Notify
     ) -> tuple[Sequence[Parameter], bool]:
-        """Return sine and cosine of the harmonic that explains most, and if many explain
-        something.
+        """Return sine and cosine of the strongest harmonic, and whether many explain something.
 
         None if the strongest one explains time-shifted residuals as well. Many do if the sum of
         their shares is larger than for shifted residuals.

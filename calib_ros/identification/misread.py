@@ -28,9 +28,7 @@ VECTOR = ''
 
 
 def misread() -> Iterator[tuple[str, str, Turn]]:
-    """Yield mistakes, remedies, and functions from the rotations (N, 3, 3) read to the intended
-    ones.
-    """
+    """Yield mistakes, remedies, and functions from rotations (N, 3, 3) as read to those meant."""
     in_radians = '--angle rad, with --joint-angle for the joints'
     for read in ORDERS:
         now = ', '.join(f'r{axis.lower()}' for axis in read)
@@ -41,35 +39,37 @@ def misread() -> Iterator[tuple[str, str, Turn]]:
             yield (
                 f'{what}, not {_order(read)}',
                 f'--euler {meant}, or convert them so',
-                _meant(read, meant, meant),
+                _reinterpret(read, meant, meant),
             )
             yield (
                 f'{what} in the order of their columns, not {_order(read)}',
                 f'--euler {meant} with r1, r2, r3 (now {now}), or convert them so',
-                _meant(read, meant, read),
+                _reinterpret(read, meant, read),
             )
         yield (
             f'the angles are rotation vectors, not Euler angles {_order(read)}',
             '--rotation-vector, or convert them so',
-            _meant(read, VECTOR, 'XYZ'),
+            _reinterpret(read, VECTOR, 'XYZ'),
         )
         for longer in (False, True):
             yield (
                 f'the angles are Euler angles {_order(read)}, not rotation vectors',
                 f'--euler {read}, or convert them so',
-                _meant(VECTOR, read, read, longer=longer),
+                _reinterpret(VECTOR, read, read, longer=longer),
             )
         what = 'the Euler angles are in radians, not degrees'
-        yield what, in_radians, _meant(read, read, read, np.degrees(1.0))
+        yield what, in_radians, _reinterpret(read, read, read, np.degrees(1.0))
     what = 'the rotation vectors are in radians, not degrees'
-    yield what, in_radians, _meant(VECTOR, VECTOR, 'XYZ', np.degrees(1.0))
+    yield what, in_radians, _reinterpret(VECTOR, VECTOR, 'XYZ', np.degrees(1.0))
 
 
 def _order(letters: str) -> str:
     return f'{letters} ({letters[::-1].lower()} about fixed axes)'
 
 
-def _meant(read: str, meant: str, axes: str, size: float = 1.0, longer: bool = False) -> Turn:
+def _reinterpret(
+    read: str, meant: str, axes: str, size: float = 1.0, longer: bool = False
+) -> Turn:
     """Return a function from the rotations read to those meant.
 
     Angles about `axes`, as read, become turns in the intended order or a rotation vector. With

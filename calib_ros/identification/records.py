@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import ConfigError
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.start import likened, movable
+from calib_ros.identification.start import fit_to_arm, movable
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
     calibration_record,
@@ -248,7 +248,7 @@ class Record:
         base, tool = chain.frame('base'), chain.frame('tool')
         start = replace(nominal, base=base, tool=tool, frames=chain.frames)
         names = movable(start, ('base', 'tool'))
-        return likened(start, names, chain, joints)[0] if names else start
+        return fit_to_arm(start, names, chain, joints)[0] if names else start
 
     def covariance(self, chain: Chain) -> tuple[tuple[str, ...], FloatArray | None, float]:
         """Return the fitted parameters, their covariance (P, P) and its degrees of freedom."""

@@ -107,10 +107,9 @@ class Identification(Shown):
         return tuple(p.name for p in self.parameters if p.status == 'not excited')
 
     def pose_covariance(self, q: FloatArray) -> FloatArray:
-        """Return the expected squares (N, 6, 6) [m, rad] of pose errors at q (N, n), in world
-        axes.
+        """Return the expected squares (N, 6, 6) [m, rad] of pose errors at q (N, n).
 
-        They include the uncertainty of parameters and unmodelled effects.
+        In world axes; due to the uncertainty of parameters and to unmodelled effects.
         """
         return self.posterior.expected(q)
 

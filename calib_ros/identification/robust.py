@@ -173,7 +173,7 @@ def reweighted(
         )
         if settled:
             break
-        last, weights = weights, _steadied(found, weights, last)
+        last, weights = weights, _damp_oscillation(found, weights, last)
         system = system.weighted(weights)
         fit = minimise(chain, names, system, tolerance)
         chain, iterations = fit.chain, iterations + fit.iterations
@@ -186,13 +186,13 @@ def reweighted(
     return Robust(fit, system, distances, settled, iterations, loss)
 
 
-def _steadied(
+def _damp_oscillation(
     found: list[FloatArray], last: list[FloatArray], before: list[FloatArray]
 ) -> list[FloatArray]:
     """Return the weights found (N,), set by set, averaged with the last ones if they oscillate.
 
-    A sample at the edge may lose weight and come nearer for that, for ever. Empty lists are
-    weights not found yet.
+    A sample at the edge may lose weight, come nearer, regain it, and so on for ever. Empty lists
+    are weights not found yet.
     """
     steps = zip(found, last, before, strict=True) if before else ()
     swings = sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0

@@ -142,9 +142,7 @@ class Samples:
     def sums(
         self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
     ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
-        """Yield group numbers (n,) of successive samples (N,), and sums of rows (P + 1, c, n) by
-        part.
-        """
+        """Yield numbers (n,) of successive groups, and summed rows (P + 1, c, n) by part."""
         first = 0
         for block in self.parts(chain, names):
             index = groups[first : first + block[0].shape[2]]
@@ -228,9 +226,7 @@ class Samples:
         return position / self.sigmas[0], orientation / self.sigmas[1]
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
-        """Yield residuals (M, c) in sigma for gross errors, NaN if not measured, and each sample's
-        row (N,).
-        """
+        """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
         for part in self.whitened_residuals(chain):
             yield part, slice(None)
 

@@ -201,9 +201,7 @@ class _Forms:
         return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
 
     def test(self, part: int, links: csr_array) -> tuple[float, float]:
-        """Return the excess correlation of linked residuals, and its score, N(0, 1) if none is
-        shared.
-        """
+        """Return the excess correlation of linked residuals and its score, N(0, 1) for none."""
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
         product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
         product *= known[:, :, np.newaxis]
@@ -293,9 +291,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
 
 
 def _near(units: _Stops, part: int, length: float, share: int) -> FloatArray:
-    """Return J^T K J of errors fading in joint space, from every `share`-th stop: pairs are
-    quadratic.
-    """
+    """Return J^T K J of errors fading in joint space, by every `share`-th stop: pairs are many."""
     kernel = units.kernel('near', length)
     own = np.diag(kernel) * (share - share**2)
     kernel = share**2 * kernel + np.diag(own)
@@ -319,14 +315,14 @@ def _successive(
                     continue
                 rows = sums[part][:-1]
                 own = rows.reshape(len(rows), -1)
-                earlier, states[part] = _faded(
+                earlier, states[part] = _faded_sums(
                     rows.reshape(-1, rows.shape[2]), states.get(part), own_kernels
                 )
                 found[part] += own @ earlier.reshape(own.shape).T
     return {part: cross + cross.T for part, cross in found.items()}
 
 
-def _faded(
+def _faded_sums(
     rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the faded sum (R, n) of the columns before each of (R, n), and half of itself.

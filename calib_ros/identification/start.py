@@ -120,7 +120,7 @@ def movable(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
     return [n for each in frames if not chain.frame(each).fixed for n in parameters_of(each)]
 
 
-def likened(
+def fit_to_arm(
     chain: Chain,
     names: Sequence[str],
     arm: Chain,

@@ -39,7 +39,7 @@ from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import OUTLIER, SUSPICIOUS
 from calib_ros.identification.samples import seen_residuals
 from calib_ros.identification.sizes import SPREAD, TYPICAL
-from calib_ros.identification.start import likened
+from calib_ros.identification.start import fit_to_arm
 from calib_ros.identification.steps import EXPLAINED
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -57,7 +57,7 @@ HARMFUL = 0.15
 are; of 1,890 arms with such an error 64 are accepted and get worse (benchmarks/scale.py)."""
 LEAST_NOISE = NEARER * EXCEPTION
 """Residuals in units of the given sigmas below which these are wrong: clearly less than a
-tenth, by which devices repeat better than they measure, while mm are thousandths."""
+tenth, the ratio of a device's repeatability to its accuracy; mm would be thousandths."""
 SIMULATED = EXACT
 """Residuals [m or rad] too small for any device."""
 COUPLED = (
@@ -185,7 +185,7 @@ def _sister(problem: Problem, result: Identification) -> str:
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     """Return the RMS distance [m] of two arms at (N, n), in the best base and tool."""
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
-    return likened(start, [*parameters_of('base'), *parameters_of('tool')], found, joints)[1]
+    return fit_to_arm(start, [*parameters_of('base'), *parameters_of('tool')], found, joints)[1]
 
 
 def _gravity(problem: Problem, result: Identification) -> str:

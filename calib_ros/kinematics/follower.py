@@ -142,9 +142,7 @@ class Follower:
         return Solution(iterations=iterations, **joined)
 
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
-        """Solve for commands (n, B); joints beyond a limit are held there, the others solved
-        again.
-        """
+        """Solve for commands (n, B); hold joints beyond a limit there and solve the rest again."""
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
         nothing = np.zeros_like(q)
         ways = self._ways(q, approach, origin, axes)
@@ -242,9 +240,7 @@ class Follower:
         return stiffness + self._ridge, (added > 0.0).any(axis=1)
 
     def _errors(self, task: _Task, x: FloatArray) -> FloatArray:
-        """Return the lengths (B, 3) of position [m], orientation [rad] and reachable position
-        error.
-        """
+        """Return position [m], orientation [rad] and reachable position errors (B, 3)."""
         q = task.q + self._unit * x
         axes, origin = self._follower.trace(self._follower.effective(q, task.approach))
         away = near = task.origin - origin

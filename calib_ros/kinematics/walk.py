@@ -71,8 +71,7 @@ class Walk:
     def frames(
         self, q: FloatArray, base: FloatArray, found: FloatArray, ends: FloatArray | None = None
     ) -> FloatArray:
-        """Write the frame before each joint's motion and the flange's into `found` (n + 1, 4, 3,
-        B).
+        """Write the frames of joints (before their motion) and flange to `found` (n + 1, 4, 3, B).
 
         At effective joint values (n, B), from T_world_base (4, 4). `ends` (n, 4, 3, B) receives
         the frames at the ends of the links of the modified convention; in the standard one these

@@ -210,7 +210,7 @@ class Collector:
                 rows.release(rows.count)
 
     def state(self) -> str:
-        """Return the state of the arm as far as sampling is concerned."""
+        """Return the state of sampling, for display."""
         self._sort()
         newest = self.track.newest_ns
         if not newest or self.track.missing:

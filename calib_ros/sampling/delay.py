@@ -60,8 +60,7 @@ def find_delay(
     rotations: FloatArray | None,
     max_gap: float = Settings.lateness,
 ) -> Delay | None:
-    """Return the delay of measurements (N) to joint samples (M), up to the lateness; None if
-    unclear.
+    """Return the delay of measurements (N) to joint samples (M), None if unclear or too long.
 
     Stamps are in order, joints (M, n), positions (N, 3), rotations (N, 3, 3). Between joint
     samples further apart than `max_gap` [s] their motion is unknown.

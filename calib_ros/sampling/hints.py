@@ -128,8 +128,8 @@ def unsettled(refused: int, stops: int) -> list[Hint]:
 def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]:
     """Return the share of messages of a kind that was lost, and the main cause.
 
-    Lost messages were dropped for their stamp or a full buffer; not those that the device did not
-    see, nor duplicates.
+    Lost messages were dropped for their stamp or a full buffer; duplicates, and what the device
+    did not see, do not count.
     """
     causes = {
         cause: count

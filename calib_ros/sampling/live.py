@@ -59,8 +59,8 @@ EXCEPTION."""
 MOST_AT_ONCE = 4 * SOME
 """Samples per update at most."""
 LITTLE = 0.35
-"""Range [rad] of a joint over all samples that is too little: 20 degrees; a tenth of it [m].
-A convention."""
+"""Range [rad] of a joint over all samples that is too little: 20 degrees (or 0.035 m). A
+convention."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,9 +49,7 @@ class Camera(Protocol):
 
 
 class Pictures:
-    """Keeps images, and makes samples of the processed ones; `sigma` returns that of a corner
-    [px].
-    """
+    """Images waiting to become samples; `sigma` returns that of a corner [px]."""
 
     def __init__(self, sigma: Callable[[], float]) -> None:
         self._sigma = sigma

@@ -185,7 +185,7 @@ class CalibrationSession:
 
     @property
     def state(self) -> str:
-        """Return the state of the arm as far as sampling is concerned."""
+        """Return the state of sampling, for display."""
         if not self.recording:
             return NOT_RECORDING
         track = self._collector.track

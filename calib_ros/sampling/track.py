@@ -190,9 +190,7 @@ class Track:
         return np.asarray(cause.max(axis=1, initial=0))
 
     def _around(self, stamps: Stamps) -> Iterator[tuple[list[int], Rows, Brackets]]:
-        """Yield joints, samples and brackets of stamps (N,) of each part; the last takes
-        precedence.
-        """
+        """Yield joints, samples and brackets of stamps (N,) by part, the last one overriding."""
         for columns, rows in sorted(self._parts.items(), key=lambda item: len(item[0])):
             yield list(columns), rows, self._brackets(rows.stamps, stamps)
 
