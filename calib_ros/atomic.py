@@ -222,11 +222,11 @@ def _check_place(path: Path, place: Path, own: Sequence[str] | None, overwrite: 
             f'{path} is the current folder or a mount point, which cannot be replaced: choose a '
             f'folder in it, such as {path / "result"}'
         )
-    there = sorted(str(each.relative_to(place)) for each in _matching(place, own))
-    if there and not overwrite:
+    existing = sorted(str(each.relative_to(place)) for each in _matching(place, own))
+    if existing and not overwrite:
         from calib_ros.shown import some  # loads numpy, not needed by --help
 
-        held = ', '.join(some(there))
+        held = ', '.join(some(existing))
         raise InputError(f'{path} already holds {held}: choose another folder or --force')
 
 

@@ -92,11 +92,11 @@ def near(name: str, alternatives: Iterable[str], least: float = 0.5) -> str:
 
 def unreadable(path: Path, err: OSError, what: str = '') -> str:
     """Return why a file, described by `what`, is not read, and a similar name."""
-    said = f'cannot read {what}{path}: {err.strerror or err}'
+    text = f'cannot read {what}{path}: {err.strerror or err}'
     if not isinstance(err, FileNotFoundError) or not path.parent.is_dir():
-        return said
+        return text
     hint = near(path.name, (each.name for each in path.parent.iterdir()), 0.7)
-    return f'{said}: {hint}' if hint else said
+    return f'{text}: {hint}' if hint else text
 
 
 def trouble(err: OSError) -> str:

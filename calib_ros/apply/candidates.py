@@ -112,10 +112,10 @@ def visit_order(joints: FloatArray, velocities: FloatArray) -> Index:
     path = np.array(order)
     while True:
         # reversing i ... j joins i - 1 to j and i to j + 1; ends of the path join nothing
-        there = np.zeros((count + 2, count + 2))
-        there[1:-1, 1:-1] = travel[np.ix_(path, path)]
-        legs = np.diagonal(there, 1)
-        change = there[:-2, 1:-1] + there[1:-1, 2:] - legs[:-1, None] - legs[None, 1:]
+        padded = np.zeros((count + 2, count + 2))
+        padded[1:-1, 1:-1] = travel[np.ix_(path, path)]
+        legs = np.diagonal(padded, 1)
+        change = padded[:-2, 1:-1] + padded[1:-1, 2:] - legs[:-1, None] - legs[None, 1:]
         change = np.triu(change, 1)
         i, j = np.unravel_index(change.argmin(), change.shape)
         if change[i, j] > -1e-9:

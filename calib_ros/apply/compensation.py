@@ -276,8 +276,8 @@ def too_fast(
     names, found = compensator.nominal.joint_names, []
     for k in np.flatnonzero(shares.max(axis=1) > allowed).tolist():
         i = int(shares[k].argmax())
-        said = words.format(changes[k, i], moves[k].max())
-        found.append(Refusal(first + k, f'the correction of {names[i]} {said}'))
+        excess = words.format(changes[k, i], moves[k].max())
+        found.append(Refusal(first + k, f'the correction of {names[i]} {excess}'))
     return found
 
 

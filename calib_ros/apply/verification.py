@@ -310,11 +310,11 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
 
 def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
     for base in dict.fromkeys(each.base for each in sets):
-        mine = [each for each in sets if each.base == base]
+        own = [each for each in sets if each.base == base]
         found = np.concatenate(
-            [chain.forward(e.joints, e.approach, e.base, e.tool)[:, :3, 3] for e in mine]
+            [chain.forward(e.joints, e.approach, e.base, e.tool)[:, :3, 3] for e in own]
         )
-        wanted = np.concatenate([each.positions for each in mine])
+        wanted = np.concatenate([each.positions for each in own])
         middle, goal = found.mean(axis=0), wanted.mean(axis=0)
         turn = se3.nearest_rotation((wanted - goal).T @ (found - middle))
         motion = se3.transform(turn, goal - turn @ middle)

@@ -285,5 +285,5 @@ class Archive:
         return [(match[1] + match[2], match[3], path) for match, path in found if match]
 
     def _files(self, ending: str) -> list[Path]:
-        mine = (path for _, ends, path in sorted(self._dated()) if ends == ending)
-        return [path for path in mine if path.stat().st_size]
+        found = (path for _, ends, path in sorted(self._dated()) if ends == ending)
+        return [path for path in found if path.stat().st_size]

@@ -67,10 +67,10 @@ class Columns:
         found = self.numbers(names) if values is None else values
         highest = max(found.max(initial=0.0), -found.min(initial=0.0))
         if np.isnan(highest):
-            nothing = np.isnan(found)
-            lacking = nothing.any(axis=1) & (needed | ~nothing.all(axis=1))
+            blank = np.isnan(found)
+            lacking = blank.any(axis=1) & (needed | ~blank.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
-                raise self._no_number(row, names[int(nothing[row].argmax())])
+                raise self._no_number(row, names[int(blank[row].argmax())])
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()

@@ -251,7 +251,7 @@ def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')
-    here = made.select(slice(max(0, -shift), count - max(0, shift)))
-    there = slice(max(0, shift), count - max(0, -shift))
-    moved = {name: made.values[name][there] for name in made.values if JOINT.fullmatch(name)}
-    return replace(here, values={**here.values, **moved})
+    measured = made.select(slice(max(0, -shift), count - max(0, shift)))
+    partners = slice(max(0, shift), count - max(0, -shift))
+    moved = {name: made.values[name][partners] for name in made.values if JOINT.fullmatch(name)}
+    return replace(measured, values={**measured.values, **moved})

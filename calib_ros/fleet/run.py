@@ -148,18 +148,18 @@ def _new(robot: Robot, history: History, out: Path | None, found: Run) -> list[T
     except CalibrationError as err:
         found.note(robot.serial, '', str(err))
         return []
-    there, wrong = sources(robot)
+    present, wrong = sources(robot)
     for pattern, words in wrong.items():
         found.note(robot.serial, pattern, words)
-    if not there:
+    if not present:
         return []
     rows = tuple(row for row in rows if row.software == calib_ros.__version__)
     done = {(row.source, row.fingerprint) for row in rows if row.fingerprint}
-    names = {each.name for each in there}
+    names = {each.name for each in present}
     known = {row.inputs: row.source if row.source in names else '' for row in rows}
-    last = max(there, key=lambda each: (each.modified or NEVER, each.name))
+    last = max(present, key=lambda each: (each.modified or NEVER, each.name))
     tasks = []
-    for source in there:
+    for source in present:
         if (source.name, source.fingerprint) not in done:
             own = {inputs: name for inputs, name in known.items() if name == source.name}
             page = out is not None and source == last
@@ -174,8 +174,8 @@ def _without_page(robot: Robot, history: History, out: Path | None, found: Run) 
     rows = results(robot, history.rows(robot.serial))
     if not rows or rows[-1].source in names or page_path(out, rows[-1]).exists():
         return []
-    there, _ = sources(robot)
-    return [Task(robot, each, page=True) for each in there if each.name == rows[-1].source]
+    present, _ = sources(robot)
+    return [Task(robot, each, page=True) for each in present if each.name == rows[-1].source]
 
 
 def _keep(task: Task, outcome: Outcome, history: History, out: Path | None, found: Run) -> None:

@@ -138,12 +138,12 @@ def bends(sets: Sequence[Samples]) -> list[FloatArray]:
             by_device.setdefault(seen.tool if seen.inverse else seen.base, []).append(number)
     found = [np.zeros((0, samples.width, samples.count)) for samples in sets]
     for own in by_device.values():
-        mine = [sets[number] for number in own]
-        weights = [np.ones(s.count) if s.weights is None else s.weights for s in mine]
-        shown = [samples.observations for samples in mine]
+        device = [sets[number] for number in own]
+        weights = [np.ones(s.count) if s.weights is None else s.weights for s in device]
+        shown = [samples.observations for samples in device]
         places = [(each.inverted() if each.inverse else each).positions for each in shown]
         waves = _polynomials(np.concatenate(places), np.concatenate(weights))
-        ends = np.cumsum([samples.count for samples in mine])[:-1]
+        ends = np.cumsum([samples.count for samples in device])[:-1]
         parts = dict(zip(own, np.split(waves, ends, axis=1), strict=True))
         for k, samples in enumerate(sets):
             none = np.zeros((3 * len(waves), samples.width, samples.count))

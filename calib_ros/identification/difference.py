@@ -201,11 +201,13 @@ def _in_names(
 ) -> FloatArray:
     """Return the covariance of the names; parameters that were not fitted have typical sizes."""
     chain = chain.with_effects([n for n in names if not (n.of_dh or chain.owns_frame(n))])
-    mine = [Parameter(name) for name in own]
-    change = np.array([[float(name == other) for other in mine] for name in names])
-    others = [k for k, name in enumerate(mine) if name.of_dh and name not in names]
+    parameters = [Parameter(name) for name in own]
+    change = np.array([[float(name == other) for other in parameters] for name in names])
+    others = [k for k, name in enumerate(parameters) if name.of_dh and name not in names]
     if others:
-        change[:, others] = changes.gauged(chain, names, [mine[k] for k in others], free=True)[0]
+        change[:, others] = changes.gauged(
+            chain, names, [parameters[k] for k in others], free=True
+        )[0]
     whole = change @ square @ change.T
     unknown = np.abs(change).max(axis=1) < HALF_THE_DIGITS
     sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]

@@ -190,7 +190,7 @@ def posterior_of(
     device = _device(alone, cross[:-1], doubtful, evidence.precision(size), len(every))
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
-    doubted = tuple((w, there[arm], root[arm] @ root[arm].T) for w, (there, root) in parts)
+    doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
     return Posterior(chain, every, *found, doubted, rival)
 

@@ -241,17 +241,16 @@ class LinearModel:
         folds = self._problem.folds
         parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
         rest = parts.sum(axis=0) + _square(extra)
-        scale = 1.0 / np.sqrt(
-            np.maximum(np.diag(rest)[:-1], 1e-300)
-        )  # a fold may hold all of a column
+        # a fold may hold all of a column
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))
         weights = np.zeros((len(parts), len(self._columns)))
         for fold, part in enumerate(parts):
             left = (rest - part)[:-1]
             scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
             factor = linalg.cho_factor(scaled)
             weights[fold, which] = scale * linalg.cho_solve(factor, scale * left[:, -1])
-        here = self._folds[dealing][np.newaxis]
-        predicted = np.take_along_axis(weights @ self._columns, here, axis=0)[0]
+        fold_of = self._folds[dealing][np.newaxis]
+        predicted = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
         pieces = np.split(self._residual - predicted, self._ends[:-1])
         sets = self._system.sets
         errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]

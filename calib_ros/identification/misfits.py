@@ -81,11 +81,11 @@ def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
         row = list(targets).index(each.tool)
         seen[row] += np.bincount(numbers, minlength=count)
         off[row] += np.bincount(numbers, far > OUTLIER, count)
-    there, wrong = seen > 0, off > 0.5 * seen
-    several = there.sum(axis=0) > 1
-    both = several & (wrong == there).all(axis=0)
-    rates = wrong.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-    expected = np.prod(np.where(there, rates[:, np.newaxis], 1.0), axis=0)[several].sum()
+    present, wrong = seen > 0, off > 0.5 * seen
+    several = present.sum(axis=0) > 1
+    both = several & (wrong == present).all(axis=0)
+    rates = wrong.sum(axis=1) / np.maximum(present.sum(axis=1), 1)
+    expected = np.prod(np.where(present, rates[:, np.newaxis], 1.0), axis=0)[several].sum()
     found = int(both.sum())
     return found, float(special.gammainc(found, expected)) if found else 1.0
 

@@ -357,9 +357,9 @@ def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
     same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
     parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
     order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
-    here, there = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
+    measured, reported = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
     joined: dict[str, Any] = {}
     for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented'):
         ordered = np.concatenate([getattr(e, name) for e in parts])[order]
-        joined[name] = ordered[there if name == 'joints' else here]
+        joined[name] = ordered[reported if name == 'joints' else measured]
     return Observations(**joined, base=each.base, tool=each.tool, socket=each.socket)

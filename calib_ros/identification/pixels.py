@@ -86,11 +86,11 @@ class PixelSamples(Samples):
             own = np.array([*block.lens, size])
             fold = np.zeros(len(block.owner), np.intp) if folds is None else folds[block.part]
             for k, (matrix, _) in enumerate(found):
-                these, here = fold[block.begins] == k, fold == k
-                turned = twist[these].reshape(-1, size).T
-                mixed = turned @ inner[these, :, 6:].reshape(-1, len(own))
-                alone = block.columns[6:, :, here].reshape(len(own), -1)
-                matrix[:-1, :-1] += turned @ outer[these].reshape(-1, size)
+                images, points = fold[block.begins] == k, fold == k
+                turned = twist[images].reshape(-1, size).T
+                mixed = turned @ inner[images, :, 6:].reshape(-1, len(own))
+                alone = block.columns[6:, :, points].reshape(len(own), -1)
+                matrix[:-1, :-1] += turned @ outer[images].reshape(-1, size)
                 matrix[:-1, own] += mixed
                 matrix[own, :-1] += mixed.T
                 matrix[own[:, np.newaxis], own] += alone @ alone.T

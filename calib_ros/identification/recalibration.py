@@ -346,11 +346,11 @@ def _updated(
     previous, chain = arm.previous, arm.changed(found.change)
     before = previous.before
     for name in before.frame_names:
-        old, new, here = (each.frame(name) for each in (previous.chain, chain, before))
-        moved = new.matrix @ se3.invert(old.matrix) @ here.matrix
+        old, new, current = (each.frame(name) for each in (previous.chain, chain, before))
+        moved = new.matrix @ se3.invert(old.matrix) @ current.matrix
         if name.startswith('tool'):
-            moved = here.matrix @ se3.invert(old.matrix) @ new.matrix
-        before = before.with_frame(name, replace(here, matrix=moved))
+            moved = current.matrix @ se3.invert(old.matrix) @ new.matrix
+        before = before.with_frame(name, replace(current, matrix=moved))
     own, region = arm.own, previous.region
     if region is not None:
         left = found.change.copy()

@@ -173,18 +173,20 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     judge, count = _Judge(posterior, *ends, freedom), len(posterior.names)
-    here, there = (judge.rows(each) for each in (measured, drawn))
-    near, far = (_sizes(rows[..., :count], posterior.square) for rows in (here, there))
+    measured_rows, drawn_rows = (judge.rows(each) for each in (measured, drawn))
+    near, far = (
+        _sizes(rows[..., :count], posterior.square) for rows in (measured_rows, drawn_rows)
+    )
     order, limit = np.argsort(far), float(near.max())
-    own, inside = judge.products(here), far[order] <= limit
-    inner = own + judge.products(there[order[inside]])
+    own, inside = judge.products(measured_rows), far[order] <= limit
+    inner = own + judge.products(drawn_rows[order[inside]])
     doubts = judge.of_the_arm(posterior.doubted)
     if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
         return None
     shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
-        added = judge.products(there[shell])
+        added = judge.products(drawn_rows[shell])
         if not judge.risk(added, inner + added, doubts) < RISK:
             break
         inner, limit = inner + added, float(far[shell[-1]])

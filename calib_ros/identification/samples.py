@@ -82,7 +82,7 @@ class Samples:
         the error model with the order of the parameters in the rows.
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
-        nothing = np.zeros((0, 0, 0))
+        empty = np.zeros((0, 0, 0))
         joints, velocity = self.moving(chain)
         out = None
         for start in range(0, self.count, BLOCK):
@@ -105,8 +105,8 @@ class Samples:
             if self.oriented:
                 turn *= weights / sigmas[1]
             if self.whitening is not None:
-                shift, turn = self._whitened(shift, turn, part), nothing
-            yield part, shift, turn if self.oriented else nothing, model
+                shift, turn = self._whitened(shift, turn, part), empty
+            yield part, shift, turn if self.oriented else empty, model
 
     def products(
         self,

@@ -170,13 +170,13 @@ class _Forms:
         first = 0
         for part, each in enumerate(units.parts):
             shape = each.shape[1:]
-            here = slice(first, first + shape[0] * shape[1])
-            first = here.stop
+            block = slice(first, first + shape[0] * shape[1])
+            first = block.stop
             if not each.any():
                 continue
-            turned = basis[here].reshape(*shape, -1).transpose(1, 0, 2)
+            turned = basis[block].reshape(*shape, -1).transpose(1, 0, 2)
             self._basis[part] = np.ascontiguousarray(turned)
-            self._residual[part] = left[here].reshape(shape).T
+            self._residual[part] = left[block].reshape(shape).T
             self._known[part] = each.any(axis=0).T.astype(float)
             self.parts.append(part)
 

@@ -91,8 +91,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     found = (scale, sister, lens, board, gravity, COUPLED if result.coupled else '', sigmas)
-    said = (*result.remarks, *(each for each in found if each))
-    return replace(result, remarks=said, refusals=tuple(refusals))
+    remarks = (*result.remarks, *(each for each in found if each))
+    return replace(result, remarks=remarks, refusals=tuple(refusals))
 
 
 def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:

@@ -209,8 +209,8 @@ def validate(
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
-    said = ', because all held-out poses were fitted too' if len(repeated) else ''
-    return _cross_validate(problem, before, after, names, robust, said)
+    note = ', because all held-out poses were fitted too' if len(repeated) else ''
+    return _cross_validate(problem, before, after, names, robust, note)
 
 
 def _cross_validate(

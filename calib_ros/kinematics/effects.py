@@ -171,9 +171,9 @@ def basis(
             phi[rows] = q[others.astype(int)]
         elif kind in WAVES:
             for joint in np.unique(joints).tolist():
-                here = np.flatnonzero(joints == joint)
-                wave = _wave(q[joint], others[here], circles, joint)
-                phi[rows[here]] = wave.imag if kind == 'sin' else wave.real
+                own = np.flatnonzero(joints == joint)
+                wave = _wave(q[joint], others[own], circles, joint)
+                phi[rows[own]] = wave.imag if kind == 'sin' else wave.real
         elif kind == 'backlash' and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):
@@ -248,9 +248,9 @@ def _torques(
         torques = np.empty((len(joints), q.shape[1]))
         turned /= np.linalg.norm(down)
         for i, axis in enumerate(turned):
-            here = np.flatnonzero(joints == i)
-            arms = places[ends[here].astype(int), 3] - points[i]
-            torques[here] = np.einsum('ecb,cb->eb', arms, axis)
+            own = np.flatnonzero(joints == i)
+            arms = places[ends[own].astype(int), 3] - points[i]
+            torques[own] = np.einsum('ecb,cb->eb', arms, axis)
         return torques
     masses = np.array([joint.mass for joint in chain.joints])
     centres = np.einsum('ik,ikcb->icb', [(*joint.com, 1.0) for joint in chain.joints], places)

@@ -144,9 +144,9 @@ class Follower:
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
         """Solve for commands (n, B); hold joints beyond a limit there and solve the rest again."""
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
-        nothing = np.zeros_like(q)
+        zeros = np.zeros_like(q)
         ways = self._ways(q, approach, origin, axes)
-        task = _Task(q, approach, axes, origin, ways, nothing.astype(bool), nothing)
+        task = _Task(q, approach, axes, origin, ways, zeros.astype(bool), zeros)
         before = self._errors(task, task.start)
         x, errors, converged, damped, iterations = self._attempt(task)
         lower, upper = (((end - q.T).T / self._unit) for end in (self.lower, self.upper))

@@ -201,8 +201,8 @@ def _lines(
     along = {'a': 0, 'alpha': 0, 'beta': 1}
     for joint, i in joints.items():
         for name in parameters_of(joint, DH_KINDS):
-            here = i + 1 if standard and name.kind in along else i
-            found[name] = (here, along.get(name.kind, 2), name.kind in ANGLES)
+            frame_row = i + 1 if standard and name.kind in along else i
+            found[name] = (frame_row, along.get(name.kind, 2), name.kind in ANGLES)
     return found
 
 

@@ -80,27 +80,27 @@ class Walk:
         values = self.signs * q
         angles = self._theta + (values if self._all_turning else values * self._turns)
         cos, sin = cos_sin(angles)
-        here, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
-        here[:] = base[:3].T[..., np.newaxis]
+        frame, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
+        frame[:] = base[:3].T[..., np.newaxis]
         if self.standard:
-            found[0] = here
+            found[0] = frame
         for i, link in enumerate(self._links):
             before, after = found[i], found[i + 1]
             if not self.standard:
-                np.matmul(link, here.reshape(4, -1), out=before.reshape(4, -1))
-            np.multiply(before[:2], cos[i], out=here[:2])
+                np.matmul(link, frame.reshape(4, -1), out=before.reshape(4, -1))
+            np.multiply(before[:2], cos[i], out=frame[:2])
             np.multiply(before[1::-1], sin[i], out=turned)
-            here[0] += turned[0]
-            here[1] -= turned[1]
-            here[2:] = before[2:]
+            frame[0] += turned[0]
+            frame[1] -= turned[1]
+            frame[2:] = before[2:]
             if not self.turning[i]:
-                here[3] += (self._d[i] + values[i]) * here[2]
+                frame[3] += (self._d[i] + values[i]) * frame[2]
             elif self._d[i]:
-                here[3] += self._d[i] * here[2]
+                frame[3] += self._d[i] * frame[2]
             if self.standard:
-                np.matmul(link, here.reshape(4, -1), out=after.reshape(4, -1))
+                np.matmul(link, frame.reshape(4, -1), out=after.reshape(4, -1))
             elif ends is not None:
-                ends[i] = here
+                ends[i] = frame
         if not self.standard:
-            found[-1] = here
+            found[-1] = frame
         return found

@@ -120,7 +120,7 @@ class Situation:
         return replace(one, meaning=f'{one.meaning} {left}')
 
 
-def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Advice, ...]:
+def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tuple[Advice, ...]:
     """Return the refusals in plain words, grouped by rule, consequences last."""
     found: dict[Rule, list[str]] = {}
     for each in reasons:
@@ -132,8 +132,8 @@ def advice(reasons: Sequence[Reason], here: Situation = Situation()) -> tuple[Ad
         if (cause := next(causes, rule)) is not rule:
             following.setdefault(cause, []).extend(texts)
             continue
-        one = replace(rules()[rule], refusal='; '.join(texts))
-        advised.append(here.said_of(one) if rule in {Rule.GAIN, Rule.REGION} else one)
+        refusal = replace(rules()[rule], refusal='; '.join(texts))
+        advised.append(situation.said_of(refusal) if rule in {Rule.GAIN, Rule.REGION} else refusal)
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'
         advised.append(Advice(heading, '', (), '; '.join(texts)))

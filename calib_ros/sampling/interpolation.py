@@ -89,9 +89,9 @@ def last_moves(
         return np.tile(earlier, (len(now), 1))
     path = continuous(values, revolute)
     now = path[first] + unwrapped(now - path[first], revolute)
-    there = _last_outside(path, first, now - MOVED, now + MOVED)
-    signs = np.sign(now - np.take_along_axis(path, there, axis=0))
-    return np.asarray(np.where(there >= 0, signs, earlier))
+    last = _last_outside(path, first, now - MOVED, now + MOVED)
+    signs = np.sign(now - np.take_along_axis(path, last, axis=0))
+    return np.asarray(np.where(last >= 0, signs, earlier))
 
 
 def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatArray) -> Index:
@@ -109,18 +109,18 @@ def _last_outside(values: FloatArray, last: Index, low: FloatArray, high: FloatA
     end = np.repeat(last + 1, shape[1])  # not yet searched before this
     found, sizes = np.full(len(end), -1), np.zeros(len(end), dtype=np.intp)
 
-    def outside(level: int, block: Index, here: Index) -> Flags:
-        where = (block, column[here])
-        return np.asarray((lows[level][where] < low[here]) | (highs[level][where] > high[here]))
+    def outside(level: int, block: Index, rows: Index) -> Flags:
+        where = (block, column[rows])
+        return np.asarray((lows[level][where] < low[rows]) | (highs[level][where] > high[rows]))
 
     for level in range(len(lows)):
-        here = np.flatnonzero((found < 0) & (end >> level & 1 == 1))
-        block = (end[here] >> level) - 1
-        hit = outside(level, block, here)
-        found[here[hit]], sizes[here[hit]] = block[hit], level
-        end[here[~hit]] -= 1 << level
+        rows = np.flatnonzero((found < 0) & (end >> level & 1 == 1))
+        block = (end[rows] >> level) - 1
+        hit = outside(level, block, rows)
+        found[rows[hit]], sizes[rows[hit]] = block[hit], level
+        end[rows[~hit]] -= 1 << level
     for level in reversed(range(len(lows) - 1)):
-        here = np.flatnonzero(sizes > level)
-        block = 2 * found[here] + 1
-        found[here] = np.where(outside(level, block, here), block, block - 1)
+        rows = np.flatnonzero(sizes > level)
+        block = 2 * found[rows] + 1
+        found[rows] = np.where(outside(level, block, rows), block, block - 1)
     return found.reshape(shape)

@@ -140,9 +140,9 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
         changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
         for begin, end in itertools.pairwise((0, *changes.tolist(), len(rows))):
             if fault := _fault(rows[begin].tobytes()):
-                here = np.zeros(len(rows), dtype=bool)
-                here[begin:end] = True
-                refuse(here, fault)
+                faulty = np.zeros(len(rows), dtype=bool)
+                faulty[begin:end] = True
+                refuse(faulty, fault)
     if not found.child.isprintable():  # it is written to tables
         refuse(good.copy(), 'child frame whose name cannot be printed')
     return good, causes

@@ -250,8 +250,8 @@ def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
         rows = [getattr(sample, name) for sample in samples]
         if all(row is None for row in rows):
             return None
-        nothing = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
-        return np.array([nothing if row is None else row for row in rows], dtype=np.float64)
+        still = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
+        return np.array([still if row is None else row for row in rows], dtype=np.float64)
 
     found = Observations(
         np.array([sample.stamp_ns for sample in samples], dtype=np.int64),

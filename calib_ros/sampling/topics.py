@@ -159,8 +159,8 @@ def _apart(
         begin, end = dense[0][[0, -1]]
         known = (sparse[0] >= begin) & (sparse[0] <= end)
         if known.any():
-            there = np.interp(sparse[0][known] - begin, dense[0] - begin, dense[1])
-            error = float(np.abs(sparse[1][known] - there).max())
+            resampled = np.interp(sparse[0][known] - begin, dense[0] - begin, dense[1])
+            error = float(np.abs(sparse[1][known] - resampled).max())
             largest = max(largest or (error, name), (error, name))
     if largest is None:
         return f'{a} and {b} never come at the same time'

@@ -272,9 +272,9 @@ class Track:
             cut = min(cut, rows.count - 1)
             if cut <= 0:
                 continue
-            here = np.array([cut])
+            cuts = np.array([cut])
             earlier = last_moves(
-                rows.values, here, rows.values[here], self._earlier[index], self._revolute[index]
+                rows.values, cuts, rows.values[cuts], self._earlier[index], self._revolute[index]
             )
             self._earlier[index] = earlier[0]
             rows.release(cut)
