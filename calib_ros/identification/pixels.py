@@ -130,7 +130,7 @@ class PixelSamples(Samples):
     def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Return the residuals in sigma (N, 2), and NaN (N, 3) in place of an orientation."""
         pixels, _ = seen_residuals(chain, self.observations)
-        return pixels / self.sigmas[0], np.full((self.count, 3), np.nan)
+        return self.in_sigma(pixels, np.full((self.count, 3), np.nan))
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
         """Yield the residuals (M, 2) of all points, and of all images: what their points share.

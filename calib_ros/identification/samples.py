@@ -232,13 +232,16 @@ class Samples:
         errors[:, :width] = self.sigmas[0] * rows[:, :width]
         return errors
 
-    def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
-        """Return the residuals in sigma: position (N, 3 or 1), orientation (N, 3).
+    def whitened_residuals(self, chain: Chain) -> Both:
+        """Return the residuals by a chain `in_sigma`."""
+        return self.in_sigma(*residual_arrays(chain, self.observations))
+
+    def in_sigma(self, position: FloatArray, orientation: FloatArray) -> Both:
+        """Return residuals in sigma: position (N, 3 or 1), orientation (N, 3).
 
         NaN where nothing was measured. Samples with covariances of their own are whitened as a
         whole; their two parts are then only nearly those of position and orientation.
         """
-        position, orientation = residual_arrays(chain, self.observations)
         if self.whitening is not None:
             both = np.concatenate([position, np.nan_to_num(orientation)], axis=1)
             both = np.einsum('rsn,ns->nr', self.whitening, both)
