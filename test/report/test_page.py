@@ -29,6 +29,7 @@ from calib_ros.report.page import Input, Origin, Verdict, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
+from calib_ros.report.words import as_document, limits_mm, summary
 
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
 
@@ -96,15 +97,22 @@ def test_positions_alone_leave_the_orientation_out():
 def test_the_page_says_whether_it_is_good_enough(solved):
     _, result = solved
     rms = 1e-3 * result.validation.figures[1].rms_mm
+    lower, upper = limits_mm(result.validation, 1)
     for tolerance, state, words in (
         (3.0 * rms, 'good', 'within the tolerance'),
+        (0.999e-3 * upper, 'open', 'perhaps not within the tolerance'),
         (rms, 'open', 'perhaps not within the tolerance'),
         (0.3 * rms, 'open', 'but not within the tolerance'),
     ):
         verdict = report_of(*solved, tolerance=tolerance).verdict
         assert verdict.state == state
         assert words in verdict.heading
-    assert f'{1e3 * rms:.3f} mm (' in report_of(*solved).verdict.gain
+    shown = f'{1e3 * rms:.3f} mm ({lower:.3f} to {upper:.3f})'
+    assert shown in report_of(*solved).verdict.gain
+    assert f'mm (95 %: {lower:.3f} to {upper:.3f} mm; by' in summary(result)
+    told = as_document(result, {})
+    assert told['validation']['after']['rms_95_mm'] == [lower, upper]
+    assert 'rms_95_mm' not in told['fitted']['after']
 
 
 def test_what_others_named_is_text(solved):
