@@ -71,7 +71,8 @@ def workspace_report(
     rest = 'The remaining error is unknown: the file has no uncertainties.'
     if len(spreads) > 1:
         text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm maximum.')
-        rest = 'Expected to remain: this uncertainty and the RMS error on poses not fitted.'
+        rest = 'Expected to remain: this uncertainty and the RMS error on poses not fitted, which '
+        rest += 'includes the noise of the measuring device.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
     about = 'Radius: distance from the axis of the base. Height: above its origin.'

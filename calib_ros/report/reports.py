@@ -93,6 +93,8 @@ def _verdict(
     if not result.accepted:
         return _refused(reasons)
     how = 'Before and after, on poses not used to compute it; 95 % interval in brackets.'
+    if again := _again(result):
+        how += f' {again} of them repeat poses that were used.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
@@ -100,6 +102,14 @@ def _verdict(
     heading = f'Accepted{somewhere(result)}' + (f', {within}' if within else '')
     open_yet = 'not' in within or bool(result.remarks)
     return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
+
+
+def _again(result: Identification) -> int:
+    """Return how many of the poses in the figures are held out at fitted joint values."""
+    judged = result.validation
+    if judged is None or judged.repeated is None:
+        return 0
+    return int((judged.judged & judged.repeated).sum())
 
 
 def somewhere(result: Identification) -> str:
