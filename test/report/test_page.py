@@ -25,7 +25,7 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import verification_report, workspace_report
-from calib_ros.report.page import Input, Origin, Verdict, render
+from calib_ros.report.page import Input, Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
@@ -415,3 +415,22 @@ def test_distances_and_outliers_have_pages():
     page = page_of(report_of(problem, result))
     assert 'Outliers: ' in page.text
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
+
+
+def test_poses_and_measurements_are_two_counts(solved):
+    """A bag gives several measurements of each pose; what is empty is no fact."""
+    counts = {'samples': TRAIN, 'poses': 3 * TRAIN, 'foreign_names': (), 'unused': {}}
+    lines = markdown(report_of(*solved), counts).splitlines()
+    assert [each for each in lines if each.startswith('- Poses')] == [f'- Poses: {TRAIN + TEST}']
+    assert f'- poses fitted: {TRAIN}' in lines
+    assert f'- measurements: {3 * TRAIN}' in lines
+    assert not any('foreign' in each or 'not used' in each for each in lines[-20:])
+
+
+def test_poses_that_were_used_are_counted_where_none_is_said_to_be(solved):
+    problem, result = solved
+    again = np.arange(TEST) < 3
+    told = replace(result, validation=replace(result.validation, repeated=again))
+    said = '3 of them repeat poses that were used.'
+    assert said in report_of(problem, told).verdict.text[0]
+    assert said not in report_of(problem, result).verdict.text[0]
