@@ -223,8 +223,8 @@ def verification_report(
     share = f'{100.0 * found.confidence:g} %'
     rms, lower, upper = (rounded(1e3 * x) for x in (found.rms, found.lower, found.upper))
     text = [
-        f'The RMS position error over poses like these is {rms} mm, between {lower} mm and '
-        f'{upper} mm; each limit holds with {share} confidence.'
+        f'The RMS position error over poses like these, each counted once, is {rms} mm, between '
+        f'{lower} mm and {upper} mm; each limit holds with {share} confidence.'
     ]
     if found.fitted:
         text.append('This allows for what the refitted frames absorb.')

@@ -72,6 +72,7 @@ def identification_report(
             '' if result.validation else UNPROVEN,
             f'"Before" is {words.BEFORE}, so the gain comes from the arm alone.',
             'RMS (root mean square) is the typical error over poses like these.',
+            *(f'Note: {note}.' for note in filter(None, (words.in_part(result),))),
             with_outliers=judged.figures_of_all[1] if judged.outliers else None,
             intervals=result.validation is not None,
         ),

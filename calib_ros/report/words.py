@@ -105,12 +105,25 @@ def notes(result: Identification) -> list[str]:
     given = set(result.priors) - set(result.weak) - {name for name, _ in result.chain.effects}
     if given:
         found.append(f'priors on {len(given)} parameters')
+    if partly := in_part(result):
+        found.append(partly)
     if result.weak:
         found.append(f'hardly determined, held near nominal by priors: {", ".join(result.weak)}')
     weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
         found.append(f'weakly determined: {", ".join(weak)}')
     return found
+
+
+def in_part(result: Identification) -> str:
+    """Return what errors are of measurements that are no places in space; empty where all are."""
+    position = result.fitted.after.position
+    if (position[:, 0] != 0.0)[~position[:, 1:].any(axis=1)].any():
+        return (
+            'errors of distances and touched planes are along one direction: position errors in '
+            'space are about 1.7 times as large if alike in all directions'
+        )
+    return 'errors of corners are the shortest shifts that explain them' if result.images else ''
 
 
 def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
@@ -187,7 +200,9 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
         if which is judged:
-            before['rms_95_mm'], after['rms_95_mm'] = (limits_mm(which, when) for when in (0, 1))
+            for when, told in enumerate((before, after)):
+                ends = limits_mm(which, when) or (None, None)
+                told['rms_lower_mm'], told['rms_upper_mm'] = ends
         with_outliers = asdict(which.figures_of_all[1])
         found = {'before': before, 'after': after, 'outliers': which.outliers}
         return found | {'after_with_outliers': with_outliers}

@@ -111,8 +111,9 @@ def test_the_page_says_whether_it_is_good_enough(solved):
     assert shown in report_of(*solved).verdict.gain
     assert f'mm (95 %: {lower:.3f} to {upper:.3f} mm; by' in summary(result)
     told = as_document(result, {})
-    assert told['validation']['after']['rms_95_mm'] == [lower, upper]
-    assert 'rms_95_mm' not in told['fitted']['after']
+    after = told['validation']['after']
+    assert (after['rms_lower_mm'], after['rms_upper_mm']) == (lower, upper)
+    assert 'rms_lower_mm' not in told['fitted']['after']
 
 
 def test_what_others_named_is_text(solved):
@@ -414,6 +415,7 @@ def test_distances_and_outliers_have_pages():
     assert poses.outlier.sum() == len(result.outliers) > 0
     page = page_of(report_of(problem, result))
     assert 'Outliers: ' in page.text
+    assert 'touched planes are along one direction' in page.text
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
 
 
@@ -434,3 +436,4 @@ def test_poses_that_were_used_are_counted_where_none_is_said_to_be(solved):
     said = '3 of them repeat poses that were used.'
     assert said in report_of(problem, told).verdict.text[0]
     assert said not in report_of(problem, result).verdict.text[0]
+    assert 'one direction' not in page_of(report_of(problem, result)).text

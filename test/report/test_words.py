@@ -69,7 +69,7 @@ def test_the_error_told_is_the_one_within_its_limits():
     assert f'{said}{1e3 * found.rms:.4f} mm' in in_words(found)
     poses = poses_to_verify(arm, [seen], found.comparison)
     report = verification_report(arm, found, poses, Origin())
-    assert f'{said}{1e3 * found.rms:.3f} mm' in report.verdict.text[0]
+    assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
     assert any('refitted' in each for each in report.verdict.text)
 
 
