@@ -199,10 +199,8 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
-        if which is judged:
-            for when, told in enumerate((before, after)):
-                ends = limits_mm(which, when) or (None, None)
-                told['rms_lower_mm'], told['rms_upper_mm'] = ends
+        for when, told in enumerate((before, after) if which is judged else ()):
+            told['rms_lower_mm'], told['rms_upper_mm'] = limits_mm(which, when) or (None, None)
         with_outliers = asdict(which.figures_of_all[1])
         found = {'before': before, 'after': after, 'outliers': which.outliers}
         return found | {'after_with_outliers': with_outliers}
