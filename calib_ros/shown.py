@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import html
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -24,6 +25,17 @@ def some(words: Sequence[str], most: int = NAMED) -> list[str]:
     """Return the first words, and the number of the others."""
     more = len(words) - most
     return [*words[:most], f'and {more} more'] if more > 0 else list(words)
+
+
+def rounded(value: float, decimals: int = 3) -> str:
+    """Return a value with so many decimals, or as many more as two digits of it need."""
+    digits = 1 - math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
+    return f'{value:.{max(decimals, digits)}f}'
+
+
+def of_them(count: int, what: str) -> str:
+    """Return how many of several are outliers or effects."""
+    return f'1 of them an {what}' if count == 1 else f'{count} of them {what}s'
 
 
 class Shown:

@@ -172,7 +172,9 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             worst = max(columns, key=lambda k: float(size[k]))
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
-    text += f'; largest predicted error {1e3 * result.position_before[kept].max():.3f} mm, '
+    text += (
+        f'; largest error by the calibration {1e3 * result.position_before[kept].max():.3f} mm, '
+    )
     text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
     text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
     text += f'{1e3 * result.orientation[kept].max():.3f} mrad'

@@ -44,6 +44,7 @@ from calib_ros.report.reports import (
 )
 from calib_ros.sampling.problems import with_lenses
 from calib_ros.settings import Settings
+from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
 
 RESULT_FILES = (
@@ -290,23 +291,26 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     proof = '' if result.validation else '; on the poses fitted, which proves nothing'
     measured = words.measured(result)
     if result.outliers:
-        measured += f', {len(result.outliers)} of them outliers without weight'
+        measured += f', {of_them(len(result.outliers), "outlier")} with little or no weight'
     fitted = f'{result.rank} parameters fitted'
     if result.chain.effects:
-        fitted += f', {len(result.chain.effects)} of them effects'
-    second = ('largest error', f'{before.max_mm:.3f} -> {after.max_mm:.3f} mm')
+        fitted += f', {of_them(len(result.chain.effects), "effect")}'
+    second = ('largest error', f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm')
     if before.rms_mrad is not None and after.rms_mrad is not None:
         turn = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
         second = ('orientation error', turn)
     if before.rms_px is not None and after.rms_px is not None:
         second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
     valid: tuple[tuple[str, str], ...] = ()
+    likely = [words.between(result.validation, when) for when in (0, 1)]
+    known = (('95 % interval', f'RMS {" -> ".join(likely)} mm'),) if all(likely) else ()
     if result.accepted and result.region is not None:
         valid = (('valid', result.region.in_words().removeprefix('valid ')),)
     return (
         ('robot', f'{result.chain.name}, {fitted}'),
         ('fitted to', measured),
-        ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm{proof}'),
+        ('position error', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm{proof}'),
+        *known,
         second,
         ('judged by', result.validated_by),
         *valid,

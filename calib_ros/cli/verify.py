@@ -75,7 +75,8 @@ def show(found: Verification, screen: Screen) -> None:
         orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    interval = f'RMS {1e3 * found.lower:.4f} to {1e3 * found.upper:.4f} mm over poses like these'
+    likely = f'RMS {1e3 * found.rms:.4f} mm; with {100.0 * found.confidence:g} % confidence each '
+    likely += f'above {1e3 * found.lower:.4f} and below {1e3 * found.upper:.4f} mm'
     state, steps = STANDINGS[found.verdict]
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     rows = {
@@ -83,7 +84,7 @@ def show(found: Verification, screen: Screen) -> None:
         'position error': f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm',
         'largest': f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm',
         'orientation error': orientation,
-        f'{100.0 * found.confidence:g} % confidence': interval,
+        'poses like these': likely,
         'tolerance': tolerance,
     }
     screen.table(tuple(rows.items()))

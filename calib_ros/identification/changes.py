@@ -30,7 +30,7 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.identification.identifiability import followed
-from calib_ros.identification.levels import CERTAIN, CONFIDENT, SCALE, chance_of
+from calib_ros.identification.levels import CERTAIN, CONFIDENT, INTERVAL, SCALE, chance_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
@@ -42,6 +42,8 @@ from calib_ros.shown import Shown
 FALSE = 0.5 * (1.0 - CERTAIN)
 """False-alarm probability for an unchanged arm: one side of CERTAIN
 (benchmarks/recalibration.py)."""
+LIKELY = float(special.ndtri(INTERVAL))
+"""Half of a 95 % interval in standard deviations."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Typical size [m, rad] of changes by a collision or a replaced motor; a factor of three either
 way costs half a unit of log evidence."""
@@ -80,8 +82,13 @@ class Explanation(Shown):
         """Return the size of the change of a single parameter."""
         (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
         if self.names == (SCALE_OF_DEVICE,):
-            return f'{1e6 * change:+.0f} ± {1e6 * sigma:.0f} ppm'
-        return f'{1e3 * change:+.3f} ± {1e3 * sigma:.3f} m{self.names[0].unit}'
+            return f'{1e6 * change:+.0f} ± {1e6 * LIKELY * sigma:.0f} ppm (95 %)'
+        return with_limits(change, sigma, self.names[0].unit)
+
+
+def with_limits(change: float, sigma: float, unit: str) -> str:
+    """Return a change [m, rad] in thousandths, with its 95 % interval."""
+    return f'{1e3 * change:+.3f} ± {1e3 * LIKELY * sigma:.3f} m{unit} (95 %)'
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:

@@ -102,10 +102,11 @@ class Difference(Shown):
 
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Return the six parameters with the largest change in sigmas, and their changes."""
-        change, sigma = 1e3 * self.change, 1e3 * self.sigma
-        order = np.argsort(-np.abs(change) / sigma)[:6].tolist()
+        order = np.argsort(-np.abs(self.change) / self.sigma)[:6].tolist()
         names = [self.names[k] for k in order]
-        sizes = [f'{change[k]:+.3f} ± {sigma[k]:.3f} m{self.names[k].unit}' for k in order]
+        sizes = [
+            changes.with_limits(self.change[k], self.sigma[k], self.names[k].unit) for k in order
+        ]
         return tuple(zip(names, sizes, strict=True))
 
 

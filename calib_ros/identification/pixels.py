@@ -122,7 +122,7 @@ class PixelSamples(Samples):
     def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
         """Return residuals in sigma (N, 2), and NaN (N, 3) for the orientation."""
         pixels, _ = seen_residuals(chain, self.observations)
-        return pixels / self.sigmas[0], np.full((self.count, 3), np.nan)
+        return self.in_sigma(pixels, np.full((self.count, 3), np.nan))
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
         """Yield the residuals (M, 2) of all points, then the shared ones of all images.

@@ -211,13 +211,16 @@ class Samples:
         errors[:, :width] = self.sigmas[0] * rows[:, :width]
         return errors
 
-    def whitened_residuals(self, chain: Chain) -> tuple[FloatArray, FloatArray]:
+    def whitened_residuals(self, chain: Chain) -> Both:
+        """Return the residuals by a chain `in_sigma`."""
+        return self.in_sigma(*residual_arrays(chain, self.observations))
+
+    def in_sigma(self, position: FloatArray, orientation: FloatArray) -> Both:
         """Return residuals in sigma: position (N, 3 or 1), orientation (N, 3).
 
         NaN where not measured. With covariances, samples are whitened as a whole, so the two parts
         are only approximate.
         """
-        position, orientation = residual_arrays(chain, self.observations)
         if self.whitening is not None:
             both = np.concatenate([position, np.nan_to_num(orientation)], axis=1)
             both = np.einsum('rsn,ns->nr', self.whitening, both)

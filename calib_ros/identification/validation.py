@@ -24,7 +24,7 @@ from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index, norms
-from calib_ros.shown import Shown, as_frame
+from calib_ros.shown import Shown, as_frame, of_them
 
 COUNTS = 0.005
 """Relative change of an RMS error that counts; less is chance (benchmarks/real_robots.py)."""
@@ -96,7 +96,7 @@ class Residuals:
             float(np.sqrt(np.mean(distance**2))),
             float(distance.mean()),
             float(distance.max()),
-            float(distance.mean() + 3.0 * distance.std()),
+            float(distance.mean() + 3.0 * distance.std(ddof=int(len(distance) > 1))),
             float(np.sqrt(np.mean(angle**2))) if angle.size else None,
             float(np.sqrt(np.mean(away**2))) if away.size else None,
         )
@@ -199,12 +199,13 @@ def validate(
         if problem.loss != 'none':
             distances = distances_of(after, names, problem.system(problem.judging))
             judged = np.concatenate(distances) <= OUTLIER
-            if explained is not None:
-                judged |= explained
+            judged |= np.False_ if explained is None else explained
             comparison = replace(comparison, judged=judged)
         text = f'{len(comparison.judged)} held-out poses'
-        if repeated.any():
-            text += f'; the {repeated.sum()} that repeat fitted poses do not count for acceptance'
+        if comparison.outliers:
+            text += f', {of_them(comparison.outliers, "outlier")} not in the figures'
+        if count := repeated.sum():
+            text += f'; those that repeat fitted poses ({count}) do not count for acceptance'
         return comparison, text
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):

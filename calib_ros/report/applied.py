@@ -21,6 +21,7 @@ from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer, numbers, unit_of
 from calib_ros.report.verdicts import hints, limits
+from calib_ros.shown import rounded
 
 SOMETHING_MOVED = (
     'Check that measuring device, target and robot have not moved since the calibration; if one '
@@ -69,7 +70,8 @@ def workspace_report(
     rest = 'The remaining error is unknown: the file has no uncertainties.'
     if len(spreads) > 1:
         text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm maximum.')
-        rest = 'Expected to remain: this uncertainty and the RMS error on poses not fitted.'
+        rest = 'Expected to remain: this uncertainty and the RMS error on poses not fitted, which '
+        rest += 'includes the noise of the measuring device.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
     about = 'Radius: distance from the axis of the base. Height: above its origin.'
@@ -218,10 +220,13 @@ def verification_report(
 ) -> Report:
     """Return the report of a verification of a calibrated chain."""
     share = f'{100.0 * found.confidence:g} %'
+    rms, lower, upper = (rounded(1e3 * x) for x in (found.rms, found.lower, found.upper))
     text = [
-        f'The RMS position error over poses like these is between {1e3 * found.lower:.3f} mm and '
-        f'{1e3 * found.upper:.3f} mm; each limit holds with {share} confidence.'
+        f'The RMS position error over poses like these, each counted once, is {rms} mm, between '
+        f'{lower} mm and {upper} mm; each limit holds with {share} confidence.'
     ]
+    if found.fitted:
+        text.append('This allows for what the refitted frames absorb.')
     if found.tolerance is not None:
         text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
     text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))
@@ -254,6 +259,10 @@ def _by_configuration(found: Verification) -> Section:
         'configurations',
         'Pose by pose (ISO 9283)',
         'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma.',
+        ''
+        if found.by_program
+        else 'Both are relative to the joint values reported: how well the controller reaches the '
+        'commanded ones does not show (--commanded).',
         head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
         rows=tuple(
             (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in values))

@@ -63,10 +63,14 @@ def _curve(mode: str, name: str, x: FloatArray, y: FloatArray, **more: Any) -> F
 
 
 def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figure:
-    """Return the share of poses, or other `things`, within a position error (N,)."""
-    share = np.linspace(0.0, 1.0, min(QUANTILES, max(2, len(before_mm))))
+    """Return the share of poses, or other `things`, with at most a given position error (N,)."""
+    count, points = len(before_mm), min(QUANTILES, len(before_mm))
+    rank = (np.arange(1, points + 1) * count - 1) // points
+    share = 100.0 * np.append(0, rank + 1) / count
     data = [
-        _curve('lines', name, np.quantile(errors, share), 100.0 * share, line=line)
+        _curve(
+            'lines', name, np.sort(errors)[np.append(0, rank)], share, line=line | {'shape': 'hv'}
+        )
         for name, errors, line in (('before', before_mm, DASHED), ('after', after_mm, SOLID))
     ]
     across = axis('position error [mm]', rangemode='tozero')
@@ -75,15 +79,14 @@ def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figur
 
 
 def against_noise(poses: Poses) -> Figure:
-    """Return the quantiles of residuals in stated sigmas against normal quantiles."""
-    chosen = poses.select(poses.judged)
+    """Return the quantiles of residuals in stated sigmas against those of a normal law."""
+    position, orientation = np.split(poses.in_sigma[poses.judged], 2, axis=1)
     data: list[Figure] = []
-    for name, errors, column, colour, symbol in (
-        ('position', chosen.after, 0, AFTER, 'circle'),
-        ('orientation', chosen.turned_after, 1, '#7570b3', 'diamond'),
+    for name, errors, colour, symbol in (
+        ('position', position, AFTER, 'circle'),
+        ('orientation', orientation, '#7570b3', 'diamond'),
     ):
-        z = (errors / chosen.sigma[:, column, np.newaxis]).ravel()
-        z = z[np.isfinite(z)]
+        z = errors[np.isfinite(errors)]
         if not z.size:
             continue
         count = min(QUANTILES, z.size)

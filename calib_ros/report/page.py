@@ -36,6 +36,19 @@ MISSING_PDF = (
 )
 
 
+COUNTED = {
+    'samples': 'poses fitted',
+    'held_out': 'poses held out',
+    'poses': 'measurements',
+    'configurations': 'different poses',
+    'joint_states': 'joint states',
+    'recorded': 'messages recorded',
+    'read': 'messages read',
+    'unused': 'not used',
+}
+"""Words for counts of the input, where poses are what was fitted."""
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What a reader sees first: state, words, and the `gain` from before to after."""
@@ -214,7 +227,7 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
         if each.rows:
             head, rest = '|' + '---|' * len(each.head), map(_row, each.rows)
             lines += [_row(each.head), head, *rest, '']
-    pairs = [*report.identity, *((k, v) for k, v in samples.items() if v not in (0, {}, None))]
+    pairs = [*report.identity, *((COUNTED.get(k, k), v) for k, v in samples.items() if v)]
     pairs += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
     identity = [f'{name}: {value}' for name, value in pairs]
     steps = () if report.advice else report.steps

@@ -172,6 +172,7 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
     error = curve.get('error_x', {}).get('array')
     marks = {'marker': mark if 'markers' in curve['mode'] else '', 'markersize': 4}
     shown = {'color': look['color'], 'linestyle': line, 'label': curve['name'], **marks}
+    shown['drawstyle'] = 'steps-post' if look.get('shape') == 'hv' else 'default'
     axes.errorbar(curve['x'], _plain(curve['y']), xerr=error, **shown)
 
 

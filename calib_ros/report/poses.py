@@ -19,9 +19,11 @@ from numpy.typing import NDArray
 
 from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.observations import SOME_POSES, Observations
+from calib_ros.identification.pixels import samples_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import MANY
+from calib_ros.identification.samples import Samples
 from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import DH_KINDS
@@ -62,7 +64,7 @@ class Poses:
     after: FloatArray
     turned_before: FloatArray
     turned_after: FloatArray
-    sigma: FloatArray  # (N, 2) stated for one coordinate [m, rad]
+    in_sigma: FloatArray  # (N, 6) `after` in stated sigmas, position first; NaN: not measured
     role: NDArray[np.str_]  # FITTED, JUDGED or REPEATED
     outlier: NDArray[np.bool_]
     size: FloatArray  # of the residual in usual errors; NaN where the pose was not fitted
@@ -133,26 +135,27 @@ class Poses:
 
 def _poses(
     chain: Chain,
-    sigmas: tuple[float, float],
-    groups: Sequence[tuple[Sequence[Observations], Comparison, NDArray[np.str_], FloatArray]],
+    groups: Sequence[tuple[Sequence[Samples], Comparison, NDArray[np.str_], FloatArray]],
     lines: bool,
     images: Mapping[int, str],
 ) -> Poses:
     """Return the poses of sets with residuals, roles (N,) and sizes (N,), in stamp order."""
     parts: list[dict[str, NDArray[Any]]] = []
-    for sets, comparison, role, sizes in groups:
+    for measured, comparison, role, sizes in groups:
         first, before, after = 0, comparison.before, comparison.after
-        for each in sets:
+        for samples in measured:
+            each = samples.observations
             rows = slice(first, first + len(each))
             first = rows.stop
             base = chain.frame(each.base).matrix
             turn = base[:3, :3]
             reached = chain.forward(each.joints, each.approach, each.base, each.tool)
             along = np.eye(3) if each.distances is not None else turn
-            sigma = np.tile(sigmas, (len(each), 1))
-            if each.covariance is not None:
-                variances = np.diagonal(each.covariances(sigmas), axis1=1, axis2=2)
-                sigma = np.sqrt(variances.reshape(-1, 2, 3).mean(axis=2))
+            left = after.position[rows] if each.pixels is None else after.pixels[rows]
+            left = left[:, :1] if each.distances is not None else left
+            parts_in_sigma = samples.in_sigma(left, after.orientation[rows])
+            in_sigma = np.full((len(each), 6), np.nan)
+            in_sigma[:, : left.shape[1]], in_sigma[:, 3:] = parts_in_sigma
             part = {
                 'joints': each.joints,
                 'stamps_ns': each.stamps_ns,
@@ -161,7 +164,7 @@ def _poses(
                 'after': after.position[rows] @ along,
                 'turned_before': before.orientation[rows] @ turn,
                 'turned_after': after.orientation[rows] @ turn,
-                'sigma': sigma,
+                'in_sigma': in_sigma,
                 'role': role[rows],
                 'outlier': ~comparison.judged[rows],
                 'size': sizes[rows],
@@ -185,16 +188,16 @@ def poses_of(
 ) -> Poses:
     """Return all poses of an identification, judged ones by a fit without them."""
     sizes = np.concatenate(result.distances)
-    judged = result.validation
+    judged, sets = result.validation, problem.system(problem.sets).sets
     if judged is None or judged.repeated is not None:
-        groups = [(problem.sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
-    else:  # each was held out once
-        groups = [(problem.sets, judged, np.full(len(sizes), JUDGED), sizes)]
+        groups = [(sets, result.fitted, np.full(len(sizes), FITTED), sizes)]
+    else:  # each was left out once
+        groups = [(sets, judged, np.full(len(sizes), JUDGED), sizes)]
     if judged is not None and judged.repeated is not None:
         role = np.where(judged.repeated, REPEATED, JUDGED)
-        groups.append((problem.judging, judged, role, np.full(len(role), np.nan)))
-    sigmas = (problem.sigma_position, problem.sigma_orientation)
-    return _poses(result.chain, sigmas, groups, lines, images)
+        sets = problem.system(problem.judging).sets
+        groups.append((sets, judged, role, np.full(len(role), np.nan)))
+    return _poses(result.chain, groups, lines, images)
 
 
 def poses_to_verify(
@@ -202,9 +205,10 @@ def poses_to_verify(
 ) -> Poses:
     """Return the poses of new measurements, all judged."""
     count = len(comparison.judged)
-    groups = [(sets, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
-    return _poses(chain, sigmas, groups, lines, NAMELESS)
+    samples = [samples_of(each, sigmas, Settings.sigma_pixel) for each in sets]
+    groups = [(samples, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
+    return _poses(chain, groups, lines, NAMELESS)
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:

@@ -13,7 +13,7 @@ from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.configurations import distinct
-from calib_ros.identification.levels import CONFIDENT, INTERVAL
+from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.linear_model import COMPARED
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Problem
@@ -58,7 +58,7 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
-    limits = interval_of(judged, 1, CONFIDENT)
+    limits = interval_of(judged, 1, INTERVAL)
     corrected = table_hash(result.chain) if result.accepted else 'none: not accepted'
     return Report(
         kind='Kinematic calibration',
@@ -72,7 +72,9 @@ def identification_report(
             '' if result.validation else UNPROVEN,
             f'"Before" is {words.BEFORE}, so the gain comes from the arm alone.',
             'RMS (root mean square) is the typical error over poses like these.',
+            *(f'Note: {note}.' for note in filter(None, (words.in_part(result),))),
             with_outliers=judged.figures_of_all[1] if judged.outliers else None,
+            intervals=result.validation is not None,
         ),
         picture=sections.distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
@@ -92,6 +94,8 @@ def _verdict(
     if not result.accepted:
         return _refused(reasons)
     how = 'Before and after, on poses not used to compute it; 95 % interval in brackets.'
+    if again := _again(result):
+        how += f' {again} of them repeat poses that were used.'
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
@@ -99,6 +103,14 @@ def _verdict(
     heading = f'Accepted{somewhere(result)}' + (f', {within}' if within else '')
     open_yet = 'not' in within or bool(result.remarks)
     return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
+
+
+def _again(result: Identification) -> int:
+    """Return how many of the poses in the figures are held out at fitted joint values."""
+    judged = result.validation
+    if judged is None or judged.repeated is None:
+        return 0
+    return int((judged.judged & judged.repeated).sum())
 
 
 def somewhere(result: Identification) -> str:
@@ -109,7 +121,8 @@ def somewhere(result: Identification) -> str:
 
 def doubts(result: Identification) -> tuple[str, ...]:
     """Return the checks to make before using an accepted result."""
-    return tuple(f'Check before you use it: {each}.' for each in result.remarks)
+    ends = ((each, '' if each.endswith('?') else '.') for each in result.remarks)
+    return tuple(f'Check before you use it: {each}{end}' for each, end in ends)
 
 
 def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
@@ -117,7 +130,7 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
-    lower, upper = interval_of(judged, 1, CONFIDENT)
+    lower, upper = interval_of(judged, 1, INTERVAL)
     if upper <= tolerance:
         return f'and {wanted}'
     if lower > tolerance:
@@ -198,7 +211,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         'noise',
         'Remaining errors against device noise',
         'If only the stated noise of the measuring device remained, all dots would lie on the '
-        'dotted line. A steeper line means more error, or understated noise.',
+        'dotted line. A steeper line means more error, understated noise, or few poses.',
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
@@ -260,7 +273,7 @@ def _outliers(poses: Poses) -> Section:
     more = ' The 50 largest are shown.' if len(rows) > 50 else ''
     return section(
         'outliers',
-        f'Outliers: {len(rows)} {poses.things} carry little or no weight',
+        f'Outliers: little or no weight for {len(rows):,} of {len(poses):,} {poses.things}',
         'They differ from the others by more than this arm and device explain. Measure them '
         f'again, or find out what happened.{more}',
         head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),

@@ -10,19 +10,20 @@ from datetime import datetime, timezone
 import numpy as np
 
 import calib_ros
-from calib_ros.apply.confidence import interval_of
 from calib_ros.files.history import is_time
-from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report import figures
+from calib_ros.report import figures, words
 from calib_ros.report.page import Origin, Section, section
 from calib_ros.report.poses import Poses
+from calib_ros.shown import rounded
 
-ISO_9283 = (
-    'The error of a pose is its position accuracy AP of ISO 9283: from the commanded pose to the '
-    'mean of the attained poses. If measured once, it includes the repeatability.'
+ERROR = (
+    'An error is the distance from where the model of the arm puts the target to where it was '
+    'measured: for a controller with this model, the position accuracy AP of ISO 9283 and the '
+    'repeatability together, because each measurement counts by itself. Sigma is the standard '
+    'deviation of the errors.'
 )
 LABELS = (
     *('RMS [mm]', '95 % interval', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
@@ -35,13 +36,9 @@ def gain(which: Comparison, intervals: bool = True) -> str:
     """Return the errors before and after, with their uncertainty if wanted."""
     parts = []
     for when, found in enumerate(which.figures):
-        between = _between(interval_of(which, when, INTERVAL)) if intervals else ''
-        parts.append(f'{found.rms_mm:.3f} mm' + (f' ({between})' if between else ''))
+        between = words.between(which, when) if intervals else ''
+        parts.append(f'{rounded(found.rms_mm)} mm' + (f' ({between})' if between else ''))
     return f'RMS position error: {" → ".join(parts)}'
-
-
-def _between(limits: tuple[float, float]) -> str:
-    return f'{1e3 * limits[0]:.3f} to {1e3 * limits[1]:.3f}' if np.isfinite(limits[1]) else ''
 
 
 def accuracy_section(
@@ -54,24 +51,22 @@ def accuracy_section(
 ) -> Section:
     """Return the accuracy table, before and after; `things` are counted."""
     columns = [
-        _column(name, found, interval_of(judged, when, INTERVAL) if intervals else None)
+        _column(name, found, words.between(judged, when) if intervals else '')
         for when, (name, found) in enumerate(zip(('before', 'after'), judged.figures, strict=True))
     ]
     if with_outliers is not None:
         columns.append(_column('after, with outliers', with_outliers))
     labels = ('', things, *LABELS)
     head, *rows = (row for row in zip(labels, *columns, strict=True) if any(row[1:]))
-    return section('accuracy', title, *text, ISO_9283, head=head, rows=tuple(rows))
+    return section('accuracy', title, *text, ERROR, head=head, rows=tuple(rows))
 
 
-def _column(
-    label: str, found: ErrorFigures, limits: tuple[float, float] | None = None
-) -> tuple[str, ...]:
+def _column(label: str, found: ErrorFigures, between: str = '') -> tuple[str, ...]:
+    """Return a column of the table of accuracy, with the interval of the RMS if it is known."""
     lengths = (found.mean_mm, found.max_mm, found.mean_plus_3_sigma_mm)
     rest = (*lengths, found.rms_mrad, found.rms_px)
-    between = '' if limits is None else _between(limits)
-    shown = ('' if x is None else f'{x:.3f}' for x in rest)
-    return (label, f'{found.count:,}', f'{found.rms_mm:.3f}', between, *shown)
+    shown = ('' if x is None else rounded(x) for x in rest)
+    return (label, f'{found.count:,}', rounded(found.rms_mm), between, *shown)
 
 
 def identity_of(

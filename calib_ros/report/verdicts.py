@@ -28,8 +28,9 @@ def in_words(found: Verification) -> str:
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
     wanted = '' if found.tolerance is None else f'; wanted: {1e3 * found.tolerance:g} mm'
     lines.append(
-        f'{verdict}the RMS error over poses like these is below {1e3 * found.upper:.4f} '
-        f'mm with {share:g} % confidence, and above {1e3 * found.lower:.4f} mm{wanted}'
+        f'{verdict}the RMS error over poses like these is {1e3 * found.rms:.4f} mm; below '
+        f'{1e3 * found.upper:.4f} mm with {share:g} % confidence, and above '
+        f'{1e3 * found.lower:.4f} mm{wanted}'
     )
     return '\n'.join([*lines, *remarks(found)])
 

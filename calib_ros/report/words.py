@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 
 import calib_ros
+from calib_ros.apply.confidence import interval_of
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import FALSE, changes_in_words
+from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.recalibrated import Recalibration
@@ -26,7 +28,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
-from calib_ros.shown import some
+from calib_ros.shown import rounded, some
 from calib_ros.texts import dump_yaml
 
 WEAK = Settings.largest_error
@@ -46,14 +48,16 @@ def summary(
     do first about a refusal.
     """
     before, after = (result.validation or result.fitted).figures
-    text = f'{measured(result)}, RMS {before.rms_mm:.3f} -> '
-    text += f'{after.rms_mm:.3f} mm (by {result.validated_by})'
+    text = f'{measured(result)}, RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm ('
+    if likely := between(result.validation, 1):
+        text += f'95 %: {likely} mm; '
+    text += f'by {result.validated_by})'
     if before.rms_px is not None and after.rms_px is not None:
         text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
     if count := len(result.outliers):
-        text += '; 1 outlier carries' if count == 1 else f'; {count} outliers carry'
         where = ', see the report' if numbers is None else f': {_named(result.outliers, numbers)}'
-        text += f' no weight{where}'
+        text += '; 1 outlier carries' if count == 1 else f'; {count} outliers carry'
+        text += f' little or no weight{where}'
     if result.region is not None:
         text += f'; {result.region.in_words()}'
     if result.unidentifiable:
@@ -65,6 +69,17 @@ def summary(
         return f'accepted: {text}'
     todo = f'To do first: {first} ' if first else ''
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {todo}{text}'
+
+
+def between(judged: Comparison | None, when: int) -> str:
+    """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty where not known."""
+    return ' to '.join(map(rounded, limits_mm(judged, when) or ()))
+
+
+def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:
+    """Return that interval; None where it is not known: of a fit, it would prove nothing."""
+    limits = [1e3 * x for x in interval_of(judged, when, INTERVAL)] if judged else [np.inf]
+    return limits if np.isfinite(limits).all() else None
 
 
 def measured(result: Identification) -> str:
@@ -90,12 +105,25 @@ def notes(result: Identification) -> list[str]:
     given = set(result.priors) - set(result.weak) - {name for name, _ in result.chain.effects}
     if given:
         found.append(f'priors on {len(given)} parameters')
+    if partly := in_part(result):
+        found.append(partly)
     if result.weak:
         found.append(f'hardly determined, held near nominal by priors: {", ".join(result.weak)}')
     weak = [name for name in weakly_determined(result) if name not in result.weak]
     if weak:
         found.append(f'weakly determined: {", ".join(weak)}')
     return found
+
+
+def in_part(result: Identification) -> str:
+    """Return what errors are of measurements that are no places in space; empty where all are."""
+    position = result.fitted.after.position
+    if (position[:, 0] != 0.0)[~position[:, 1:].any(axis=1)].any():
+        return (
+            'errors of distances and touched planes are along one direction: position errors in '
+            'space are about 1.7 times as large if alike in all directions'
+        )
+    return 'errors of corners are the shortest shifts that explain them' if result.images else ''
 
 
 def _named(outliers: Sequence[Outlier], numbers: Mapping[Outlier, int]) -> str:
@@ -170,6 +198,8 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
+        for when, told in enumerate((before, after) if which is judged else ()):
+            told['rms_lower_mm'], told['rms_upper_mm'] = limits_mm(which, when) or (None, None)
         with_outliers = asdict(which.figures_of_all[1])
         found = {'before': before, 'after': after, 'outliers': which.outliers}
         return found | {'after_with_outliers': with_outliers}

@@ -103,7 +103,7 @@ def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
     status, said, err = run(TABLE)
     assert (status, err) == (0, '')
     assert said.startswith('wrote out.csv: 2 of 2 points corrected, by ')
-    assert 'largest predicted error' in said
+    assert 'largest error by the calibration' in said
     before, after = (
         list(csv.DictReader((tmp_path / name).read_text().splitlines()))
         for name in ('program.csv', 'out.csv')

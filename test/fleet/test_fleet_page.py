@@ -64,7 +64,7 @@ def test_states_from_the_worst_to_the_best():
     assert all(sorted(each, key=order.index) == list(each) for each in states)
     assert [counts(fleet)[state] for state in order] == [1, 1, 2, 2, 1, 1]
     assert fleet[1].alarms == ('2025-10-11: the errors of its verifications have grown',)
-    assert str(CHANGE) == 'changed: <b>.d by +0.100 ± 0.010 mm: was it bumped?'
+    assert str(CHANGE) == 'changed: <b>.d by +0.100 ± 0.020 mm (95 %): was it bumped?'
 
 
 def test_the_page_tells_all_that_is_to_be_said_of_a_robot():

@@ -156,7 +156,7 @@ def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told)
 def test_a_scale_is_told_in_ppm():
     ppm = np.array([2.5e-4])
     told = Explanation('device', (SCALE_OF_DEVICE,), 9.0, 0.0, 1.0, ppm, 0.1 * ppm)
-    assert told.in_words() == 'the scale of the device by +250 ± 25 ppm'
+    assert told.in_words() == 'the scale of the device by +250 ± 49 ppm (95 %)'
 
 
 @pytest.mark.parametrize('slip', [0.0, 2e-3])

@@ -43,7 +43,7 @@ def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
     assert (found.count, found.max_mm) == (3, pytest.approx(5.0))
     assert found.rms_mm == pytest.approx(np.sqrt(35.0 / 3.0))
     assert found.mean_mm == pytest.approx(3.0)
-    assert found.mean_plus_3_sigma_mm == pytest.approx(3.0 + 3.0 * lengths.std())
+    assert found.mean_plus_3_sigma_mm == pytest.approx(3.0 + 3.0 * lengths.std(ddof=1))
     assert found.rms_mrad == pytest.approx(np.sqrt(13.0))
     assert found.rms_px == pytest.approx(5.0)
     bare = errors_of(position).figures(~which)
@@ -176,7 +176,8 @@ def test_held_out_pairs_at_fitted_configurations_are_repeated():
     judged, text = validation.validate(
         replace(problem, loss='none'), problem.model, problem.model, [], None
     )
-    assert text == ('5 held-out poses; the 2 that repeat fitted poses do not count for acceptance')
+    said = '5 held-out poses; those that repeat fitted poses (2) do not count for acceptance'
+    assert text == said
     assert judged.deciding.tolist() == [True, False, True, False, True]
 
 

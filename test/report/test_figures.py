@@ -6,14 +6,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured import TRUE
 from pages import page_of, problem_of, report_of
 from plotly import graph_objects
 
+from calib_ros.apply.simulation import Camera, before_camera, photograph
 from calib_ros.identification.identification import identify
+from calib_ros.identification.observations import Observations
+from calib_ros.identification.validation import compare
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.effects import Verdict
-from calib_ros.report.figures import drives
+from calib_ros.report.figures import against_noise, cumulated, drives
 from calib_ros.report.plots import drawing
+from calib_ros.report.poses import poses_to_verify
+from calib_ros.settings import Settings
 
 UR10E = load_chain('ur10e')
 WAVES = tuple(f'shoulder_lift_joint.{wave}_17' for wave in ('sin', 'cos'))
@@ -44,6 +52,41 @@ def test_an_arm_without_such_errors_has_no_such_figure(rng):
     assert drives(arm, rng.uniform(-1.0, 1.0, (9, 6))) is None
 
 
+def seen_as(kind, rng, count=400):
+    """Return a true arm and what is measured of it, with the noise stated of its kind."""
+    true = TRUE.with_frame('base', Frame())  # its axes are those of the device
+    joints = true.random_joints(count, rng)
+    reached = true.forward(joints)
+    places, noise = reached[:, :3, 3], rng.normal(size=(count, 6))
+    if kind == 'a wire':
+        lengths = np.linalg.norm(places, axis=1) + Settings.sigma_position * noise[:, 0]
+        return true, replace(Observations.from_arrays(joints, places), distances=lengths)
+    if kind == 'a camera':
+        points = np.array([(0.03 * i, 0.03 * j, 0.0) for j in range(4) for i in range(6)])
+        true = before_camera(true, Camera(), points, True, rng)
+        return true, photograph(true, Camera(), points, True, 20, rng, Settings.sigma_pixel)
+    root = np.diag([2e-5, 3e-5, 4e-4, 1e-4, 2e-4, 5e-4])
+    root[2, 0], root[4, 3] = 2e-4, 1e-4
+    error = noise @ root.T
+    turned = se3.exp_rotation(error[:, 3:]) @ reached[:, :3, :3]
+    seen = Observations.from_arrays(joints, places + error[:, :3], turned)
+    return true, replace(seen, covariance=np.tile(root @ root.T, (count, 1, 1)))
+
+
+@pytest.mark.parametrize('kind', ['a wire', 'a camera', 'a device with covariances'])
+def test_noise_as_stated_is_on_the_line(rng, kind):
+    true, seen = seen_as(kind, rng)
+    poses = poses_to_verify(true, [seen], compare(true, true, [seen]))
+    *drawn, _ = against_noise(poses)['data']
+    assert [each['name'] for each in drawn] == ['position', 'orientation'][: len(drawn)]
+    assert len(drawn) == (2 if seen.oriented.any() else 1)
+    for each in drawn:
+        inner = np.abs(each['x']) < 2.0
+        expected, found = np.array(each['x'])[inner], np.array(each['y'])[inner]
+        assert found == pytest.approx(expected, abs=0.25)
+        assert np.polyfit(expected, found, 1)[0] == pytest.approx(1.0, abs=0.1)
+
+
 def test_effects_are_compared_by_changes_in_their_order():
     verdicts = (
         Verdict('ratio', 0.3, 0.3003, pays=False),
@@ -64,3 +107,17 @@ def test_harmonics_of_gears_are_drawn_and_counted_but_not_listed():
     assert 'the 2 harmonics of gears are in result.json.' in page.text
     assert WAVES[0] not in page.text
     assert 'elbow_joint.sin_1' in page.text
+
+
+@pytest.mark.parametrize('count', [1, 5, 30, 3001])
+def test_the_share_of_poses_within_an_error_is_counted(rng, count):
+    before, after = rng.gamma(3.0, size=(2, count))
+    figure = cumulated(before, after, 'poses')
+    for curve, errors in zip(figure['data'], (before, after), strict=True):
+        assert curve['y'][0] == 0.0
+        assert curve['y'][-1] == 100.0
+        assert curve['line']['shape'] == 'hv'
+        for x, y in zip(curve['x'][1:], curve['y'][1:], strict=True):
+            within = errors <= x * (1.0 + 1e-4)  # digits shown
+            assert y == pytest.approx(100.0 * within.mean(), abs=0.1)
+    assert drawing(figure, 200)

@@ -25,10 +25,11 @@ from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import verification_report, workspace_report
-from calib_ros.report.page import Input, Origin, Verdict, render
+from calib_ros.report.page import Input, Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
+from calib_ros.report.words import as_document, limits_mm, summary
 
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
 
@@ -96,15 +97,23 @@ def test_positions_alone_leave_the_orientation_out():
 def test_the_page_says_whether_it_is_good_enough(solved):
     _, result = solved
     rms = 1e-3 * result.validation.figures[1].rms_mm
+    lower, upper = limits_mm(result.validation, 1)
     for tolerance, state, words in (
         (3.0 * rms, 'good', 'within the tolerance'),
+        (0.999e-3 * upper, 'open', 'perhaps not within the tolerance'),
         (rms, 'open', 'perhaps not within the tolerance'),
         (0.3 * rms, 'open', 'but not within the tolerance'),
     ):
         verdict = report_of(*solved, tolerance=tolerance).verdict
         assert verdict.state == state
         assert words in verdict.heading
-    assert f'{1e3 * rms:.3f} mm (' in report_of(*solved).verdict.gain
+    shown = f'{1e3 * rms:.3f} mm ({lower:.3f} to {upper:.3f})'
+    assert shown in report_of(*solved).verdict.gain
+    assert f'mm (95 %: {lower:.3f} to {upper:.3f} mm; by' in summary(result)
+    told = as_document(result, {})
+    after = told['validation']['after']
+    assert (after['rms_lower_mm'], after['rms_upper_mm']) == (lower, upper)
+    assert 'rms_lower_mm' not in told['fitted']['after']
 
 
 def test_what_others_named_is_text(solved):
@@ -406,4 +415,25 @@ def test_distances_and_outliers_have_pages():
     assert poses.outlier.sum() == len(result.outliers) > 0
     page = page_of(report_of(problem, result))
     assert 'Outliers: ' in page.text
+    assert 'touched planes are along one direction' in page.text
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
+
+
+def test_poses_and_measurements_are_two_counts(solved):
+    """A bag gives several measurements of each pose; what is empty is no fact."""
+    counts = {'samples': TRAIN, 'poses': 3 * TRAIN, 'foreign_names': (), 'unused': {}}
+    lines = markdown(report_of(*solved), counts).splitlines()
+    assert [each for each in lines if each.startswith('- Poses')] == [f'- Poses: {TRAIN + TEST}']
+    assert f'- poses fitted: {TRAIN}' in lines
+    assert f'- measurements: {3 * TRAIN}' in lines
+    assert not any('foreign' in each or 'not used' in each for each in lines[-20:])
+
+
+def test_poses_that_were_used_are_counted_where_none_is_said_to_be(solved):
+    problem, result = solved
+    again = np.arange(TEST) < 3
+    told = replace(result, validation=replace(result.validation, repeated=again))
+    said = '3 of them repeat poses that were used.'
+    assert said in report_of(problem, told).verdict.text[0]
+    assert said not in report_of(problem, result).verdict.text[0]
+    assert 'one direction' not in page_of(report_of(problem, result)).text

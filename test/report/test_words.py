@@ -4,16 +4,22 @@ from datetime import datetime, timezone
 
 import numpy as np
 import pytest
+from pages import problem_of
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
 from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.applied import verification_report
+from calib_ros.report.page import Origin
+from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import in_words
 from calib_ros.report.words import checked, verdict
+from calib_ros.shown import rounded
 
 
 @pytest.mark.parametrize(('rms_mm', 'holds'), [(0.14, True), (0.16, False)])
@@ -40,3 +46,34 @@ def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
     assert (row.verdict, row.accepted) == (verdict, False)
     assert ('the error has grown' in in_words(found)) == (verdict == 'does not hold')
+
+
+def test_a_held_out_gross_error_is_counted_where_the_figures_are():
+    problem = problem_of()
+    (held_out,) = problem.judging
+    held_out.positions[3] += 0.02
+    result = identify(problem)
+    count = result.validation.figures[1].count
+    said = f'{count + 1} held-out poses, 1 of them an outlier not in the figures'
+    assert result.validated_by == said
+
+
+def test_the_error_told_is_the_one_within_its_limits():
+    """Repeats count once, and a refitted base leaves less than it would elsewhere."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
+    joints = arm.random_joints(8, rng).repeat([9, 1, 1, 1, 1, 1, 1, 1], axis=0)
+    seen = measure(arm, joints, rng, 5e-5, 2e-4)
+    found = verify(Calibration(arm, arm), [seen], 1e-3, new_base=True)
+    assert found.rms > 1.02e-3 * found.comparison.figures[1].rms_mm
+    said = 'over poses like these is '
+    assert f'{said}{1e3 * found.rms:.4f} mm' in in_words(found)
+    poses = poses_to_verify(arm, [seen], found.comparison)
+    report = verification_report(arm, found, poses, Origin())
+    assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
+    assert any('refitted' in each for each in report.verdict.text)
+
+
+def test_no_figure_is_rounded_to_nothing():
+    values = (0.00042, 0.0996, 0.31, 12.3456, 0.0, -0.00042)
+    wanted = ['0.00042', '0.100', '0.310', '12.346', '0.000', '-0.00042']
+    assert [rounded(value) for value in values] == wanted
