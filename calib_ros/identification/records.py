@@ -37,7 +37,7 @@ Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, whether a camera on the flange measured, whether it is a socket; device or target."""
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
 ALWAYS = ('table_sha256', 'nominal', 'region')
-"""Keys of every record that calib_ros makes, which follow those that every one begins with."""
+"""Keys of every record that calib_ros makes; it begins with others and ends with the first."""
 Hashes: TypeAlias = NDArray[np.uint64]
 KEPT = 256
 """Of 1,000 rows fitted, 12 taken again show in 95 % of cases: one in four of them is kept.
@@ -136,7 +136,9 @@ class Record:
             raise ConfigError(
                 f'{where} was not accepted: identify again, from more or better poses'
             )
-        if 'software' in record and (missing := [key for key in ALWAYS if key not in record]):
+        unset = {key for key, value in record.items() if value is None and key != 'region'}
+        missing = [key for key in ALWAYS if key not in record or key in unset]
+        if missing and {'created', 'software'} & set(record):
             raise ConfigError(
                 f'{where} is cut off: its record lacks {", ".join(missing)}, which calib_ros '
                 'always writes; copy the file again'
