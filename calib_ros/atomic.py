@@ -36,7 +36,7 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
     A process that is killed meanwhile leaves the first, new or old, and none that does not belong
     to it.
     """
-    for path in contents:
+    for path in reversed(tuple(contents)):  # the first is the one that was asked for
         refuse_to_replace(path, overwrite)
     placed: list[Path] = []
     try:

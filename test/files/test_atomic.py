@@ -153,7 +153,11 @@ def test_a_disk_that_cannot_be_written_is_told_by_the_name_asked_for(tmp_path, m
 
     for module, name in ((os, 'open'), (Path, 'unlink'), (Path, 'mkdir')):
         monkeypatch.setattr(module, name, refused)
-    for write in (lambda path: write_file(path, 'A'), lambda path: make(path, 'A')):
+
+    def both(path):
+        write_together({path: 'A', path.with_name('beside'): 'A'})
+
+    for write in (lambda path: write_file(path, 'A'), both, lambda path: make(path, 'A')):
         with pytest.raises(OSError, match='Read-only') as caught:
             write(tmp_path / 'out')
         assert caught.value.filename == str(tmp_path / 'out')
