@@ -6,7 +6,8 @@ A folder NAME is made as `.NAME.partial/NAME` beside its place. At the end an ea
 `.NAME.partial/NAME.old`, and the new one takes its place: two renames. A killed process leaves
 `.NAME.partial` behind, with the earlier folder in it if killed between the two; the next process
 that writes NAME restores it and removes the rest. `.NAME.partial` is locked by the process that
-writes into it, which distinguishes leftovers from work in progress.
+writes into it, which distinguishes leftovers from work in progress. Files are made in such a
+folder too.
 """
 
 from __future__ import annotations
@@ -34,37 +35,36 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
     All are on disk before the first is moved into place. If one cannot be moved, the others are
     restored. A process killed meanwhile leaves the first, old or new, and no mismatched others.
     """
-    mark = secrets.token_hex(8)
-    partials, earlier = (
-        {path: path.with_name(f'.{short_name(path.name)}.{mark}.{what}') for path in contents}
-        for what in ('partial', 'earlier')
-    )
-    for path in contents:
-        if path.exists() and not overwrite:
-            raise _exists(path)
-    placed = []
+    for path in reversed(tuple(contents)):  # the first is the one that was asked for
+        refuse_to_replace(path, overwrite)
+    placed: list[Path] = []
     try:
-        for path, content in contents.items():
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-            with os.fdopen(os.open(partials[path], flags, 0o666), 'wb') as file:
-                file.write(content.encode() if isinstance(content, str) else content)
-                file.flush()
-                os.fsync(file.fileno())
-        for k, path in enumerate(contents if overwrite and len(contents) > 1 else ()):
-            if path.is_file():
-                (os.replace if k else _link)(path, earlier[path])
-                placed.append(path)
-        for path, partial in partials.items():
-            (os.replace if overwrite else _rename_new)(partial, path)
-            placed.append(path)
-        placed = []
+        with _beside(path) as mark:
+            partials, earlier = (
+                {path: Path(f'{mark}.{k}.{what}') for k, path in enumerate(contents)}
+                for what in ('partial', 'earlier')
+            )
+            for path, content in contents.items():
+                flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+                with os.fdopen(os.open(partials[path], flags, 0o666), 'wb') as file:
+                    file.write(content.encode() if isinstance(content, str) else content)
+                    file.flush()
+                    os.fsync(file.fileno())
+            try:
+                for k, path in enumerate(contents if overwrite and len(contents) > 1 else ()):
+                    if path.is_file():
+                        (os.replace if k else _link)(path, earlier[path])
+                        placed.append(path)
+                for path, partial in partials.items():
+                    (os.replace if overwrite else _rename_new)(partial, path)
+                    placed.append(path)
+                placed = []
+            finally:
+                _put_back({path: earlier[path] for path in placed})
+            with suppress(PermissionError):  # of a folder that is only written
+                _sync(path.parent)
     except OSError as err:
         raise OSError(err.errno, err.strerror, str(path)) from err
-    finally:
-        _put_back({path: earlier[path] for path in placed})
-        with suppress(OSError):  # the disk may be read-only
-            for left in (*partials.values(), *earlier.values()):
-                left.unlink(missing_ok=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, str | bytes]) -> None:
@@ -113,6 +113,14 @@ def whole_folder(
         os.close(claim)
 
 
+def refuse_to_replace(path: Path, overwrite: bool = False, cure: str = 'move it') -> None:
+    """Refuse to write where something is but a file to `overwrite`; a `cure` is told for files."""
+    if path.exists() and not path.is_file():
+        raise InputError(f'{path} is not a file: choose another name')
+    if path.exists() and not overwrite:
+        raise InputError(f'{path} exists already: choose another name or {cure}')
+
+
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
     """Return the real path of a file named from outside, if it is in one of some folders.
 
@@ -131,7 +139,7 @@ def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
 
 def short_name(name: str) -> str:
     """Return a name with room for a suffix [bytes]; a long one ends with its hash."""
-    data = name.encode()
+    data = os.fsencode(name)
     if len(data) <= LONGEST_NAME:
         return name
     return f'{data[: LONGEST_NAME - 17].decode(errors="ignore")}_{sha256(data).hexdigest()[:16]}'
@@ -141,7 +149,8 @@ def _put_back(earlier: Mapping[Path, Path]) -> None:
     for path, before in earlier.items():
         try:
             if before.exists():
-                before.replace(path)
+                before.replace(path)  # which leaves it where both are names of one file
+                _remove(before.parent, before.name)
             else:
                 path.unlink(missing_ok=True)
         except OSError as err:
@@ -149,22 +158,51 @@ def _put_back(earlier: Mapping[Path, Path]) -> None:
             raise InputError(words) from err
 
 
-def _exists(path: Path) -> InputError:
-    return InputError(f'{path} exists already: move it or choose another name')
-
-
 def _rename_new(partial: Path, path: Path) -> None:
     try:
         os.link(partial, path)
     except FileExistsError:
-        raise _exists(path) from None
+        raise InputError(f'{path} exists already: choose another name or move it') from None
     except OSError:  # a file system without hard links
-        if path.exists():
-            raise _exists(path) from None
+        refuse_to_replace(path)
         partial.rename(path)
 
 
-def _claim(work: Path, path: Path) -> int:
+@contextmanager
+def _beside(path: Path) -> Iterator[Path]:
+    """Yield the common start of temporary names, in a hidden folder beside a file.
+
+    The folder goes at the end. Processes that write one file wait for each other, and leftovers of
+    a killed one are removed. Without locks the names are beside the file, and leftovers stay.
+    """
+    work = path.with_name(f'.{short_name(path.name)}.partial')
+    mark = work / secrets.token_hex(8)
+    claim = _claim(work, path, wait=True)
+    try:
+        try:
+            fcntl.flock(claim, fcntl.LOCK_EX)
+        except OSError:
+            mark = path.with_name(f'{work.name}.{mark.name}')
+        else:
+            _remove(work)
+        yield mark
+        _remove(mark.parent, mark.name, '.earlier')
+    finally:
+        _remove(mark.parent, mark.name, '.partial')
+        with suppress(OSError):  # it holds what could not be put back
+            work.rmdir()
+        os.close(claim)
+
+
+def _remove(folder: Path, begin: str = '', end: str = '') -> None:
+    """Remove leftover files, if possible, by the start and end of their names."""
+    with suppress(OSError):  # a disk that cannot be written
+        for path in folder.iterdir():
+            if path.name.startswith(begin) and path.name.endswith(end):
+                path.unlink(missing_ok=True)
+
+
+def _claim(work: Path, path: Path, wait: bool = False) -> int:
     """Claim a working folder, new or left by a dead process, until its handle is closed."""
     while True:
         try:
@@ -177,22 +215,22 @@ def _claim(work: Path, path: Path) -> int:
         with suppress(FileNotFoundError), ExitStack() as stack:
             handle = os.open(work, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
             stack.callback(os.close, handle)
-            _lock(handle, work, path, made)
+            _lock(handle, work, path, made, wait)
             if os.path.samestat(os.fstat(handle), os.lstat(work)):
                 stack.pop_all()
                 return handle  # else its owner has just ended: try again
 
 
-def _lock(handle: int, work: Path, path: Path, made: bool) -> None:
+def _lock(handle: int, work: Path, path: Path, made: bool, wait: bool) -> None:
     if os.fstat(handle).st_uid != os.geteuid():
         raise InputError(f'{work} belongs to another user: choose another place for {path}')
     other = f'another process is writing {path}'
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except BlockingIOError:
         raise InputError(f'{other}: wait for it, or choose another name') from None
     except OSError:  # a file system without locks: owned by its creator
-        if not made:
+        if not (made or wait):
             raise InputError(f'{other}, or was killed: remove {work} if none runs') from None
 
 

@@ -35,6 +35,9 @@ _ADVICE = {
     errno.EROFS: 'this disk is read-only: choose another place',
     errno.EACCES: 'permission denied: choose another place, or ask its owner',
     errno.EFBIG: 'the file would be too large for this disk: write to another place',
+    errno.EEXIST: 'something else is there already: choose another name',
+    errno.ENOTDIR: 'a file is where a folder should be: choose another place',
+    errno.ENAMETOOLONG: 'the name is too long: choose a shorter one',
     errno.EMFILE: 'too many files are open: close programs, or raise the limit (ulimit -n)',
 }
 

@@ -5,9 +5,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import NamedTuple
 
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import LAYOUT, Contents, sessions_of, settings_of
@@ -16,7 +18,14 @@ from calib_ros.errors import InputError
 from calib_ros.files import loading
 from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.history import Filing, History, content_hash, measured_at, settings_hash
+from calib_ros.files.history import (
+    Filing,
+    History,
+    content_hash,
+    measured_at,
+    samples_hash,
+    settings_hash,
+)
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.tables import Table
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
@@ -27,6 +36,19 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
 WRITTEN = 'give the folder written by identify --out'
+
+
+class Unread(NamedTuple):
+    """Measurements before they are read; without files where they come through a pipe."""
+
+    path: Path
+    files: tuple[tuple[str, int, int], ...]  # with sizes [bytes] and times of change [ns]
+
+    @classmethod
+    def of(cls, path: Path) -> Unread:
+        """Return the measurements at a path."""
+        found = ((str(each), each.stat()) for each in page.files_of(path))
+        return cls(path, tuple((name, now.st_size, now.st_mtime_ns) for name, now in found))
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
@@ -43,13 +65,14 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     return Foreign(layout, chain, options.joints, log if options.joints else Layout())
 
 
-def history_of(options: argparse.Namespace) -> History | None:
-    """Return the history to file a result in, if any; refuse one without a serial number."""
+def history_of(options: argparse.Namespace) -> tuple[History, Unread] | None:
+    """Return where a result is filed, if it is to be; refuse one without a serial number."""
     if options.history is None:
         return None
     if not options.serial:
         raise InputError('--history files results by serial number: add --serial')
-    return History(options.history)
+    named = (getattr(options, name, None) for name in ('csv', 'detections', 'measured'))
+    return History(options.history), Unread.of(next(filter(None, named), Path(os.devnull)))
 
 
 def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Calibration:
@@ -71,15 +94,16 @@ def filing_of(
     options: argparse.Namespace,
     nominal: Chain,
     sets: Sequence[Observations],
-    measured: Path,
+    unread: Unread,
     *judged_by: object,
 ) -> Filing:
-    """Return the filing data of a result."""
-    settings = settings_hash(nominal, settings_of(options), *judged_by)
-    changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
-    content = content_hash(
-        [each.sha256 for each in page.input_of(measured)], options.session or ''
-    )
+    """Return what is filed with a result: by its files, or by the samples where these changed."""
+    settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.path
+    content, changed = samples_hash(sets), None
+    if unread.files and unread == Unread.of(measured):
+        hashed = [each.sha256 for each in page.input_of(measured)]
+        content = content_hash(hashed, options.session or '')
+        changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
 
 

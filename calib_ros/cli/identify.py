@@ -65,15 +65,15 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
     if options.previous is not None:
         return _recalibrated(options, screen)
-    history = given.history_of(options)
+    filed = given.history_of(options)
     with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
-    if history is not None:
-        problem, measured = found.loaded.problem, options.csv or options.detections
-        sets, measured = problem.all_sets, measured or options.measured
-        about = given.filing_of(options, problem.chain, sets, measured, options.largest_loss)
+    if filed is not None:
+        (history, unread), problem = filed, found.loaded.problem
+        judged_by = options.largest_loss
+        about = given.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
         history.file(row_of(found.result, about, found.loaded.warnings))
     shown = () if found.result.accepted and not options.json else words.remarks(found.result)
     for warning in (*found.loaded.warnings, *shown):

@@ -5,7 +5,8 @@
 
 Exit status: 0 done, 1 the input cannot be used, 2 wrong usage, 3 the identification ran but its
 result is not accepted, a program has samples that cannot be compensated, or a corrected arm does
-not pass; 4 measurements of some robots of a fleet cannot be used; 130 interrupted.
+not pass; 4 measurements of some robots of a fleet cannot be used; 130 interrupted
+or terminated.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import importlib
 import os
 import re
 import shlex
+import signal
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -72,6 +74,8 @@ WAY = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:  # a program, not a call: `timeout` and systemd end it as Ctrl-C does
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     for name in ('stdout', 'stderr'):  # closed by the caller: no file may get its number
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115

@@ -12,7 +12,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from calib_ros.atomic import whole_folder, write_files
+from calib_ros.atomic import refuse_to_replace, whole_folder, write_files
 from calib_ros.errors import InputError
 from calib_ros.settings import Settings
 
@@ -103,8 +103,7 @@ def refuse_existing(options: argparse.Namespace, *paths: Path) -> None:
     for path in paths:
         if not path.parent.is_dir():
             raise InputError(f'there is no folder {path.parent} to write {path.name} into')
-        if path.exists() and not options.force:
-            raise InputError(f'{path} exists already: choose another name or --force')
+        refuse_to_replace(path, options.force, '--force')
 
 
 def settings_of(options: argparse.Namespace) -> Settings:

@@ -36,7 +36,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
-    history = given.history_of(options)
+    filed = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
     sets, warnings, by_line = _sets(options, nominal, screen)
@@ -45,9 +45,10 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
     with screen.work('judging') as work:
         found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)
-    if history is not None:
+    if filed is not None:
+        history, unread = filed
         judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved)
-        about = given.filing_of(options, nominal, sets, options.measured, *judged_by)
+        about = given.filing_of(options, nominal, sets, unread, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)

@@ -81,6 +81,8 @@ def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
         try:
             files, pattern = _file_system(each.files)
             matched = files.glob(pattern, detail=True)
+            if not _is_hidden(pattern):  # nor are copies until they are whole
+                matched = {path: matched[path] for path in matched if not _is_hidden(path)}
         except CalibrationError as err:
             wrong[each.files] = str(err)
             continue
@@ -157,6 +159,10 @@ def _file_system(url: str) -> tuple[Any, str]:
     except (ImportError, ValueError) as err:
         raise ConfigError(f'{url} cannot be read: {err}') from err
     return files, path
+
+
+def _is_hidden(path: str) -> bool:
+    return PurePosixPath(path).name.startswith('.')
 
 
 def _is_folder(files: Any, path: str) -> bool:

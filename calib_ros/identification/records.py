@@ -37,7 +37,7 @@ Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, camera on the flange, socket; device or target."""
 OWNER = ('session', 'eye_in_hand', 'socket', 'label')
 ALWAYS = ('table_sha256', 'nominal', 'region')
-"""Keys of every record that calib_ros writes, after those that all records start with."""
+"""Keys of every record that calib_ros writes; others come before, the first of these is last."""
 Hashes: TypeAlias = NDArray[np.uint64]
 KEPT = 256
 """Of 1,000 rows fitted, 12 repeated ones are detected in 95 % of cases: one in four is kept.
@@ -136,7 +136,9 @@ class Record:
             raise ConfigError(
                 f'{where} was not accepted: identify again, from more or better poses'
             )
-        if 'software' in record and (missing := [key for key in ALWAYS if key not in record]):
+        unset = {key for key, value in record.items() if value is None and key != 'region'}
+        missing = [key for key in ALWAYS if key not in record or key in unset]
+        if missing and {'created', 'software'} & set(record):
             raise ConfigError(
                 f'{where} is cut off: its record lacks {", ".join(missing)}, which calib_ros '
                 'always writes; copy the file again'

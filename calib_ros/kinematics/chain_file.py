@@ -225,10 +225,14 @@ def _frame_document(frame: Frame) -> dict[str, Any]:
 
 
 def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> str:
-    """Return the text of a chain file; `calibration` is the origin of its numbers."""
+    """Return the text of a chain file; `calibration` is the origin of its numbers.
+
+    The hash of its table ends it: a file that was cut off has none.
+    """
     document = chain_document(chain)
     if calibration is not None:
-        document['calibration'] = dict(calibration)
+        ordered = sorted(calibration.items(), key=lambda each: each[0] == 'table_sha256')
+        document['calibration'] = dict(ordered)
     return dump_yaml(document)
 
 

@@ -257,11 +257,15 @@ def _is_number(cell: str) -> bool:
     return cell.lstrip('+-').replace('.', '', 1).isdecimal()
 
 
+def files_of(path: Path) -> list[Path]:
+    """Return a file, or those of a folder; none of a pipe, which cannot be read once more."""
+    return sorted(each for each in (path, *path.rglob('*')) if each.is_file())
+
+
 def input_of(path: Path) -> tuple[Input, ...]:
-    """Return a file, or those in a folder such as a bag, with size and hash."""
-    files = sorted(each for each in path.rglob('*') if each.is_file()) if path.is_dir() else [path]
+    """Return a file, or those of a folder such as a bag, with size and hash."""
     found = []
-    for each in files:
+    for each in files_of(path):
         digest = hashlib.sha256()
         with each.open('rb') as file:
             while block := file.read(1 << 20):

@@ -1,13 +1,17 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import hashlib
 import json
+import os
 import signal
+from pathlib import Path
 
 import pandas
 import plants
 import pytest
 from distributed import LocalCluster
 
+from calib_ros.cli import identify
 from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
 from calib_ros.files.history import History
@@ -46,6 +50,37 @@ def test_identify_and_verify_are_filed(folder, capsys):
     assert main(['history', 'history', '--robot', '42']) == 1
     assert 'did you mean "0042"' in capsys.readouterr().err
     assert main(['history', 'nothing']) == 1
+
+
+def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
+    """Of pipes the rest was hashed, which is empty; of a file what it was when all was done."""
+    plants.write_plant(folder, ['A'], 2)
+    common = ['--chain', 'ur10e', '--history', 'history', '--serial', 'A']
+    nights = sorted(Path('nights/A').iterdir())
+    for k, night in enumerate(nights):
+        end, begin = os.pipe()
+        os.write(begin, night.read_bytes())
+        os.close(begin)
+        assert main(['identify', '--csv', f'/dev/fd/{end}', *common, '--out', f'out{k}']) == 0
+        os.close(end)
+    assert len(History('history').rows('A')) == 2
+    origin = json.loads(Path('out0/result.json').read_text())['origin']
+    assert hashlib.sha256().hexdigest() not in json.dumps(origin)
+
+    identified, growing = identify._identified, Path('growing.csv')
+    *rows, last = nights[0].read_text().splitlines(keepends=True)
+    growing.write_text(''.join(rows))
+
+    def while_it_grows(*given):
+        found = identified(*given)
+        growing.write_text(''.join((*rows, last)))
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(identify, '_identified', while_it_grows)
+        assert main(['identify', str(growing), *common]) == 0
+    assert [main(['identify', str(growing), *common]) for _ in range(2)] == [0, 0]
+    assert len(History('history').rows('A')) == 4
 
 
 def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, capsys):

@@ -368,6 +368,9 @@ def test_a_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, shown)
     [
         (OSError(errno.ENOSPC, 'No space left on device', 'x'), 1, 'make room'),
         (PermissionError(errno.EACCES, 'Permission denied', 'x'), 1, 'choose another place'),
+        (FileExistsError(errno.EEXIST, 'File exists', 'x'), 1, 'choose another name'),
+        (NotADirectoryError(errno.ENOTDIR, 'Not a directory', 'x'), 1, 'choose another place'),
+        (OSError(errno.ENAMETOOLONG, 'File name too long', 'x'), 1, 'choose a shorter one'),
         (MemoryError(), 1, 'out of memory'),
         (KeyboardInterrupt(), 130, 'no half-written file remains'),
     ],

@@ -153,7 +153,11 @@ def test_a_disk_that_cannot_be_written_is_told_by_the_name_asked_for(tmp_path, m
 
     for module, name in ((os, 'open'), (Path, 'unlink'), (Path, 'mkdir')):
         monkeypatch.setattr(module, name, refused)
-    for write in (lambda path: write_file(path, 'A'), lambda path: make(path, 'A')):
+
+    def both(path):
+        write_together({path: 'A', path.with_name('beside'): 'A'})
+
+    for write in (lambda path: write_file(path, 'A'), both, lambda path: make(path, 'A')):
         with pytest.raises(OSError, match='Read-only') as caught:
             write(tmp_path / 'out')
         assert caught.value.filename == str(tmp_path / 'out')
@@ -234,18 +238,25 @@ def test_of_files_that_belong_together_none_is_replaced_alone(
 ):
     names = [tmp_path / name for name in 'abc']
     names[0].write_text('a of A')
-    names[2].mkdir()  # cannot be replaced
     if not links:
         monkeypatch.setattr(os, 'link', unsupported)
+    replace = os.replace
+
+    def not_c(first, second):
+        if second == names[2]:
+            raise OSError(errno.EIO, 'Input/output error')
+        replace(first, second)
+
+    monkeypatch.setattr(os, 'replace', not_c)
     if fails_again:
         monkeypatch.setattr(Path, 'unlink', unsupported)
         with pytest.raises(InputError, match=r'b is new, but files that belong .*do not use it'):
             write_together(dict.fromkeys(names, 'B'), overwrite=True)
         return
-    with pytest.raises(OSError, match=r'directory: .*c'):
+    with pytest.raises(OSError, match=r'output error: .*c'):
         write_together(dict.fromkeys(names, 'B'), overwrite=True)
     assert tree(tmp_path) == {'a': 'a of A'}
-    names[2].rmdir()
+    monkeypatch.setattr(os, 'replace', replace)
     write_together(dict.fromkeys(names, 'B'), overwrite=True)
     assert tree(tmp_path) == {'a': 'B', 'b': 'B', 'c': 'B'}
 
@@ -264,12 +275,63 @@ def test_a_process_killed_meanwhile_leaves_no_files_of_two_sets(tmp_path):
 
     write('A')
     assert every_kill(tmp_path, lambda: write('B'), check) > 10
-    assert tree(tmp_path)['c'] == 'B'
+    assert tree(tmp_path) == dict.fromkeys('abc', 'B')
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.parametrize('locks', [True, False])
+def test_what_killed_processes_leave_does_not_pile_up(tmp_path, monkeypatch, locks):
+    """Without locks it cannot be told from the work of others, which goes on."""
+    if not locks:
+        monkeypatch.setattr(fcntl, 'flock', unsupported)
+    path, number = tmp_path / 'file', 1
+    while killed_at(number, tmp_path, lambda: write_file(path, 'A', overwrite=True)):
+        number += 1
+    assert number > 5
+    write_file(path, 'B', overwrite=True)
+    assert path.read_text() == 'B'
+    assert len(list(tmp_path.iterdir())) == (1 if locks else 2)
+
+
+@pytest.mark.parametrize('locks', [True, False])
+def test_processes_that_write_one_file_wait_for_each_other(tmp_path, monkeypatch, locks):
+    if not locks:
+        monkeypatch.setattr(fcntl, 'flock', unsupported)
+
+    def work(label):
+        for _ in range(30):
+            write_together({tmp_path / name: label for name in 'ab'}, overwrite=True)
+
+    children = [forked(lambda k=k: work(str(k))) for k in range(3)]
+    assert [status_of(child) for child in children] == [0, 0, 0]
+    found = tree(tmp_path)
+    assert set(found) == {'a', 'b'}
+    assert not locks or found['a'] == found['b']
+
+
+@pytest.mark.parametrize('what', ['a folder', 'a pipe', 'a device', '.', '..'])
+def test_what_is_no_file_is_not_replaced(tmp_path, monkeypatch, what):
+    """As root `--out /dev/null --force` put a file in place of the device."""
+    monkeypatch.chdir(tmp_path)
+    path = Path(what)
+    if what == 'a folder':
+        path.mkdir()
+    elif what == 'a pipe':
+        os.mkfifo(path)
+    elif what == 'a device':
+        path.symlink_to('/dev/null')
+    with pytest.raises(InputError, match=f'{what} is not a file: choose another name'):
+        write_file(path, 'A', overwrite=True)
+    assert path.exists()
+    assert not path.is_file()
+    assert not tree(tmp_path)
 
 
 def test_a_name_may_be_as_long_as_the_disk_takes(tmp_path):
     write_file(tmp_path / ('x' * 255), 'A')
     assert tree(tmp_path) == {'x' * 255: 'A'}
+    write_file(tmp_path / os.fsdecode(b'\xff'), 'B')
+    assert (tmp_path / os.fsdecode(b'\xff')).read_text() == 'B'
 
 
 @pytest.mark.parametrize(('links', 'seen'), [(True, True), (False, True), (True, False)])
@@ -300,7 +362,8 @@ def test_temporary_files_follow_no_links_and_have_names_of_their_own(tmp_path):
         for _ in range(2):
             write_file(tmp_path / 'file', 'x', overwrite=True)
         flags = os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
-        assert [given & flags for given in opened.values()] == [flags, flags]
+        created = [given for given in opened.values() if given & os.O_CREAT]
+        assert [given & flags for given in created] == [flags, flags]
 
     assert status_of(forked(child)) == 0
 

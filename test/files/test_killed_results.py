@@ -6,6 +6,8 @@ import itertools
 import os
 import resource
 import shutil
+import signal
+import sys
 from dataclasses import replace
 from unittest.mock import Mock
 
@@ -109,6 +111,15 @@ def identified(monkeypatch):
         calibration, 'datetime', Mock(now=lambda zone: Mock(isoformat=lambda **k: ''))
     )
     return {'A': found('A', 5), 'B': found('B', 6)}
+
+
+def test_a_command_that_is_terminated_tidies_up(tmp_path, monkeypatch):
+    """As by timeout, systemd or docker stop: it ends like one that is interrupted."""
+    arguments = ['identify', '--csv', 'unread', '--chain', 'ur5e', '--out', str(tmp_path / 'out')]
+    monkeypatch.setattr(sys, 'argv', ['calib_ros', *arguments])
+    monkeypatch.setattr(identify, '_identified', lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert status_of(forked(lambda: os._exit(main.main()))) == 130
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_identification_that_is_killed_mixes_nothing(tmp_path, monkeypatch, identified):

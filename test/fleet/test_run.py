@@ -15,7 +15,7 @@ from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Measured, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
 from calib_ros.fleet.standing import standings
-from calib_ros.fleet.work import Outcome, Source, Task
+from calib_ros.fleet.work import Outcome, Source, Task, sources
 from calib_ros.kinematics.chain_file import chain_document, load_chain
 
 CHAIN = json.dumps(chain_document(load_chain('ur10e')))
@@ -203,6 +203,21 @@ def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path)
     found = run((first, second), History(tmp_path / 'history'), cluster)
     assert found.filed == 4
     assert found.errors == {'A': {missing.files: f'nothing matches {missing.files}'}}
+
+
+def test_hidden_files_are_no_nights(plant, tmp_path):
+    """As rsync has them until a copy is whole, and calib_ros until a bag is."""
+    nights = tmp_path / 'nights/A'
+    pattern = Measured(str(nights / '*'))
+    expected = [str(path) for path in sorted(nights.iterdir())]
+    (nights / '.002.csv').write_text('half a night')
+    (nights / '.002.csv.Xy12Za').write_text('half a night')
+    (nights / '.bag.partial').mkdir()
+    found, wrong = sources(replace(plant[0], measured=(pattern,)))
+    assert [each.name for each in found] == expected
+    assert wrong == {}
+    (own,), _ = sources(replace(plant[0], measured=(Measured(str(nights / '.002.csv')),)))
+    assert own.name == str(nights / '.002.csv')
 
 
 def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
