@@ -7,7 +7,6 @@ own to a third, and a camera on the flange sees a board.
 """
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,10 +16,7 @@ from measured import write_csv
 
 from calib_ros.apply.simulation import Cell, drive, faulty, random_frame
 from calib_ros.cli.main import main
-from calib_ros.files.bags import replay
-from calib_ros.identification.validation import residuals
 from calib_ros.kinematics import se3
-from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
 START = 1_700_000_000_000_000_000
@@ -224,27 +220,3 @@ def test_all_sources_of_one_bag(identified, bag):
     assert error(chain, cell, tool='tool_plate') < NOISE[0]
     ground = {'true_base': 'base_wire', 'true_tool': 'tool_ball'}
     assert error(chain, cell, 'base_ground', 'tool_base', **ground) < NOISE[0]
-
-
-def test_poses_that_were_not_used_are_predicted(bag):
-    """Of each set a fifth is held out; what is left there is the noise."""
-    _, path = bag
-    session = CalibrationSession(UR10E, settings())
-    replay(path, session)
-    stops = sorted({sample.stamp_ns // 800_000_000 for sample in session.samples})
-    held_out = set(stops[::5])
-    session.samples[:] = [
-        replace(sample, validation=sample.stamp_ns // 800_000_000 in held_out)
-        for sample in session.samples
-    ]
-    problem = session.problem()
-    result = session.identify()
-    assert result.accepted
-    for each in problem.judging:
-        left = residuals(result.chain, each).position
-        variance = NOISE[0] ** 2
-        if each.covariance is not None:  # that of the camera, which is turned round, or its own
-            variance = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2).mean() / 3.0
-        width = 1 if each.distances is not None else 3
-        rms = np.sqrt((left[:, :width] ** 2).mean())
-        assert rms < 2.0 * np.sqrt(variance / 3.0)  # three measurements a stop

@@ -76,17 +76,6 @@ def test_auto_finds_what_is_there_and_predicts_better(unsearched, group, oriente
     assert auto.accepted
 
 
-def test_the_very_harmonic_is_named():
-    rng = np.random.default_rng(4)
-    true = arm_with('gear', rng)
-    seen = observed(true, UR10E.random_joints(100, rng), rng)
-    auto = identify_model(Problem(UR10E, seen, **SIGMAS), 'auto')
-    assert set(GEAR) <= {name for name, _ in auto.chain.effects}
-    assert [verdict.what for verdict in auto.verdicts if verdict.pays] == [
-        'shoulder_lift_joint, 17 per turn'
-    ]
-
-
 def test_harmonics_that_are_small_each_are_found_together():
     """As drives of measured robots have: none alone shows, together they are most of the error."""
     rng = np.random.default_rng(2)
