@@ -218,11 +218,19 @@ def test_gear_ratios_need_not_be_whole(ratio, rng):
     assert np.sqrt((error**2).sum(axis=1).mean()) < 6e-5  # 0.3 mrad are 0.3 mm at 1 m
 
 
-def test_without_signs_of_the_approach_backlash_is_refused(rng):
-    q = UR10E.random_joints(60, rng)
+@pytest.mark.parametrize(
+    ('group', 'lacking'),
+    [
+        ('backlash', 'backlash needs the signs of the last moves'),
+        ('gear', r'nothing to fit in "gear" \(gear needs the gear_ratio of joints'),
+        ('compliance', 'compliance needs the masses of the links'),
+    ],
+)
+def test_a_group_without_what_it_goes_by_is_refused(group, lacking, rng):
+    q = UR10E.random_joints(20, rng)
     seen = observed(UR10E.forward(q), q, None, rng)
-    with pytest.raises(ConfigError, match='signs of the last moves'):
-        Problem(UR10E, seen, effects=('backlash',))
+    with pytest.raises(ConfigError, match=lacking):
+        Problem(UR10E, seen, effects=(group,))
 
 
 @pytest.mark.parametrize(
