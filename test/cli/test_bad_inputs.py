@@ -44,7 +44,7 @@ def bad_inputs():
     )
     yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag'
     names = ('--joint-names', 'a,a,b,c,d,e,f')
-    yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
+    yield 'joint names', (*bag_of, 'folder', *names), 'wrist_3_joint; not a, a, b, c, d, e, f'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'
     yield 'out is the root', (*good, '--out', '/'), '/ is the root folder: choose'
     yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
