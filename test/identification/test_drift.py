@@ -140,6 +140,7 @@ def test_shares_are_those_of_fits_to_residuals_that_were_moved(lengths):
     columns = [rng.normal(size=(5, *each.shape)) for each in residuals]
     for each in columns:
         each[4] = each[3] - 2.0 * each[0]  # one that tells nothing of its own
+        each[2] *= 1e-9  # of another unit
     inverse = np.array([0.0, 0.5, 0.0, 3.0, 0.0])
     shifts = Shifts(SimpleNamespace(sets=sets), residuals)
     found = shifts.shares(shifts.columns([columns], inverse), [0, 1], [[2, 3], [3, 4]])
