@@ -15,7 +15,7 @@ from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.sizes import TYPICAL
+from calib_ros.identification.sizes import SPREAD, TYPICAL, Evidence
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.parameter import Parameter
 
@@ -175,6 +175,25 @@ def test_what_few_parameters_tell_is_judged_by_other_sizes_as_well(seed):
         for told in (few, many)
     ]
     assert spans[0] > 10.0 * spans[1]
+
+
+def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual_they_are():
+    """One group up and down at a time; a group of no size and the device's scale stay."""
+    found = object.__new__(Evidence)
+    found._names = ('length', 'angle', 'drive', 'scale')
+    found._typical = np.log([TYPICAL['length'], TYPICAL['angle'], TYPICAL['drive'], 1.0])
+    found._of = lambda tried: 0.3 * (tried - found._typical)[:, 0]
+    size = np.add(found._typical, [0.5, -0.3, -50.0, 0.0])
+    told = found.near(size, np.array([2.0, 8.0, 1.0, 1.0]))
+    assert sum(weight for weight, _ in told) == pytest.approx(1.0)
+    for k, step in ((0, 1.0), (1, 0.5)):
+        (more, up), (less, down) = told[2 * k : 2 * k + 2]
+        for each, sign in ((up, 1.0), (down, -1.0)):
+            np.testing.assert_allclose(each[:2], (size + sign * step * np.eye(4)[k])[:2])
+        ends = [((each - found._typical) / np.log(SPREAD)) ** 2 for each in (up, down)]
+        likely = 0.3 * (up - down)[0] - 0.5 * (ends[0] - ends[1]).sum()
+        assert more / less == pytest.approx(np.exp(likely))
+        assert more + less == pytest.approx(0.5)
 
 
 def told(rng, size=3):

@@ -25,13 +25,6 @@ def fading(count, length, rng):
     return lfilter([1.0], [1.0, -decay], steps, axis=0)
 
 
-def smooth(q, rng):
-    """Return (N, 3) errors of unit variance, smooth over the joint space."""
-    place = np.concatenate([np.cos(q), np.sin(q)], axis=1)
-    kernel = np.exp(-0.5 * cdist(place, place, 'sqeuclidean')) + 1e-9 * np.eye(len(q))
-    return np.linalg.cholesky(kernel) @ rng.normal(size=(len(q), 3))
-
-
 def shifted(seen, errors):
     return replace(seen, positions=seen.positions + errors)
 
@@ -79,24 +72,6 @@ def test_intervals_hold_the_truth_though_the_tracker_drifts():
     alone = np.mean([hits(*each, widened=False) for each in runs])
     assert covered == pytest.approx(0.95, abs=0.025)
     assert alone < 0.925
-
-
-def test_errors_smooth_over_the_joint_space_are_shared_by_what_is_near():
-    """The path is measured in random order: successive configurations have nothing in common."""
-    kinds, covered, alone = [], [], []
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        q = rng.permutation(along_path(180, rng))
-        seen = shifted(measure(true, q, rng, *NOISE), 1e-4 * smooth(q, rng))
-        result = fitted(Problem(UR10E, seen, **SIGMAS))
-        kinds.append(result.noise.shared)
-        covered.append(hits(true, result))
-        alone.append(hits(true, result, widened=False))
-    assert all('near' in kind for kind in kinds)
-    assert sum('successive' in kind for kind in kinds) <= 1
-    assert np.mean(covered) == pytest.approx(0.95, abs=0.04)
-    assert np.mean(alone) < 0.85
 
 
 def test_distances_drift_as_well():

@@ -116,6 +116,9 @@ def test_frame_id_helps_at_once_when_frames_differ():
     made.change(replace(made.settings, frame_id='none'))
     with pytest.raises(InputError, match='50 x poses left out, in another frame'):
         made.problem()
+    begun = session(samples(5, frame_id='left'), frame_id='right')
+    with pytest.raises(InputError, match='5 x poses left out, in another frame'):
+        begun.problem()
 
 
 def test_targets_that_were_measured_once_are_left_out():
