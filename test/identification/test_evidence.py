@@ -196,6 +196,18 @@ def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual
         assert more + less == pytest.approx(0.5)
 
 
+def test_a_rival_has_the_size_that_is_asked_for(rng):
+    root, vector = rng.normal(size=(9, 5)), rng.normal(size=5)
+    groups, typical = [None, 'length', 'length', 'angle', 'scale'], [1.0, 2.0, 0.5]
+    names = ('length', 'angle', 'scale')
+    found = Evidence(
+        root.T @ root, vector, np.zeros(5), groups, dict(zip(names, typical, strict=True))
+    )
+    _, precision = found.rival('scale', 0.25, np.log(typical), set())
+    assert precision[[0, 4]].tolist() == [0.0, 16.0]
+    assert (precision[1:4] > 0.0).all()
+
+
 def told(rng, size=3):
     names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta')[:size]
     root, other = rng.normal(size=(2, size, size))
