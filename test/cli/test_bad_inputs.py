@@ -33,7 +33,11 @@ def bad_inputs():
     yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
     yield 'unknown parameter', (*good, '--fixed', 'elbow.a'), 'did you mean "elbow_joint.a"'
     yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
-    yield 'nothing left', (*good, '--fixed', '*'), 'nothing is left to identify'
+    yield (
+        'nothing left',
+        (*good, '--fixed', '*'),
+        ': every parameter is fixed: nothing is left to identify\n',
+    )
     yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
     yield 'NaN', (*good, '--sigma-orientation', 'nan'), 'sigma_orientation must be'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
