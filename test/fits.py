@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A UR10e with errors, what is measured of it, and fits that are not judged."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.identification import fitting
 from calib_ros.identification.leastsquares import minimise
 from calib_ros.identification.validation import residuals
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 
 UR10E = load_chain('ur10e')
@@ -73,3 +75,19 @@ def fitted(problem):
         covariance=fit.uncertainty.covariance,
         noise=fit.noise,
     )
+
+
+def directions(count, rng):
+    direction = rng.normal(size=(count, 3))
+    return direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def spoiled(seen, rng, share, shift=(0.0, 0.0), turn=(0.0, 0.0)):
+    """Return the observations with gross errors [m, rad] in a share, and which they are."""
+    count = round(share * len(seen))
+    index = rng.choice(len(seen), count, replace=False)
+    positions, rotations = seen.positions.copy(), seen.rotations.copy()
+    positions[index] += directions(count, rng) * rng.uniform(*shift, (count, 1))
+    turns = se3.exp_rotation(directions(count, rng) * rng.uniform(*turn, (count, 1)))
+    rotations[index] = turns @ rotations[index]
+    return replace(seen, positions=positions, rotations=rotations), set(index.tolist())

@@ -36,6 +36,11 @@ def header(stamp_ns, frame_id='tracker'):
     return TYPES['std_msgs/msg/Header'](time, frame_id)
 
 
+def stamp_ns(message):
+    stamp = getattr(message, 'transforms', [message])[0].header.stamp
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
 def joint_state(stamp_ns, values=(0.1, 0.2, 0.3), names=('a', 'b', 'c')):
     values, none = np.array(values, dtype=float), np.zeros(0)
     return TYPES[JOINT_STATE](header(stamp_ns, ''), list(names), values, none, none)

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from calib_ros.errors import UnknownNameError
 from calib_ros.identification.leastsquares import STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.identification.levels import ALIKE, SURE
 from calib_ros.identification.observations import SOME_POSES
@@ -116,8 +115,6 @@ def _chance(names: Sequence[str], system: System, first: Robust, second: Robust)
 
 def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
     """Fit the named parameters without gross errors."""
-    if loss not in LOSSES:
-        raise UnknownNameError('loss', loss, LOSSES)
     fit = minimise(chain, names, system)
     iterations = fit.iterations
     distances = distances_of(fit.chain, names, system)

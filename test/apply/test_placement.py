@@ -54,23 +54,6 @@ def test_the_best_placement_beats_the_centre_on_the_true_arm(placed, aim):
         assert there == pytest.approx(expected, rel=0.15)
 
 
-def test_the_best_placement_of_a_corrected_arm_beats_the_centre():
-    """On the average over 20 calibrations of one arm, because only chance is left."""
-    best, centre = [], []
-    arm = calibrated(100)
-    found = place(arm, TASK, cells=6)
-    for seed in range(20):
-        true, result = identified(seed)
-        for which, errors in ((found.best, best), (found.centre, centre)):
-            joints = found.joints[which]
-            left = (result.chain.forward(joints) - true.forward(joints))[:, :3, 3]
-            errors.append((left**2).sum(axis=1).mean())
-    assert np.mean(best) < np.mean(centre)
-    for which, errors in ((found.best, best), (found.centre, centre)):
-        sigma = np.sqrt(np.mean(arm.sigma(found.joints[which]) ** 2))
-        assert np.sqrt(np.mean(errors)) == pytest.approx(sigma, rel=0.2)
-
-
 def test_the_joint_values_bring_the_arm_to_the_placed_task():
     task = TASK[::4]
     arm = calibrated()

@@ -5,14 +5,14 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from designs import POSTURE, SIGMAS, TOOL, arm, design_of, log_det, predicted_square, some
+from designs import POSTURE, TOOL, arm, design_of, log_det, predicted_square, some
 from hypothesis import given, settings, strategies as st
 from robots import DATA, needs_data
 from scipy.spatial.distance import pdist
 
-from calib_ros.apply import planning, simulation
+from calib_ros.apply import planning
 from calib_ros.apply.candidates import visit_order
-from calib_ros.apply.design import Design, accuracy, predicted
+from calib_ros.apply.design import Design, accuracy
 from calib_ros.apply.planning import choose
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.tables import read_table
@@ -122,29 +122,6 @@ def test_wrong_arguments_are_refused():
         choose(design, q, 5, 'task')
 
 
-def test_25_planned_poses_beat_random_ones_on_unseen_poses():
-    """After identification, and predicted: better than the best of 50 random draws."""
-    nominal = arm()
-    rng = np.random.default_rng(6)
-    true = replace(simulation.faulty(nominal, simulation.Cell(), rng), tool=TOOL)
-    design = design_of(nominal)
-    q, unseen = nominal.random_joints(500, rng), nominal.random_joints(100, rng)
-    chosen = q[choose(design, q, 25)]
-
-    def found(joints):
-        seen = simulation.measure(true, joints, rng, *SIGMAS)
-        result = identify(Problem(nominal, seen, held_out=seen.select(np.arange(1)), loss='none'))
-        error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-        return np.sqrt((error**2).sum(axis=1).mean())
-
-    planned = np.mean([found(chosen) for _ in range(12)])
-    assert planned < np.mean([found(nominal.random_joints(25, rng)) for _ in range(4)])
-    random = [accuracy(design, nominal.random_joints(25, rng), unseen)[-1] for _ in range(50)]
-    predicted = accuracy(design, chosen, unseen)[-1]
-    assert predicted < min(random)
-    assert planned == pytest.approx(predicted, rel=0.1)  # what is predicted comes true
-
-
 def measured_problem(name, session):
     chain = load_chain(DATA / name / 'chain.yaml')
     table = read_table(DATA / name / 'uniform.csv', len(chain.joints), (session,))
@@ -190,20 +167,6 @@ def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, sessi
             variance = variance[judged, :3] + (problem.sigma_position * result.noise.position) ** 2
             squares.append(np.mean(result.validation.after.position[judged] ** 2 / variance))
     assert least < np.sqrt(np.mean(squares)) < 1.35
-
-
-def test_next_poses_lead_to_the_wanted_error():
-    chain = arm()
-    design, q, task = design_of(chain), some(chain, 500), some(chain, 100, 2)
-    errors = [np.inf]
-    while errors[-1] > 1.5e-4:
-        design = design.after(q[choose(design, q, 1)])
-        errors.append(predicted(design, task))
-        assert errors[-1] <= errors[-2]
-    count = len(errors) - 1
-    assert 10 <= count < 20
-    whole = accuracy(design_of(chain), q[choose(design_of(chain), q, count)], task)[-1]
-    assert errors[-1] < 1.1 * whole
 
 
 @pytest.mark.parametrize('criterion', ['d', 'task'])

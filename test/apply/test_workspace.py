@@ -33,17 +33,6 @@ def test_what_is_removed_is_what_the_nominal_arm_misses():
     assert 5e-4 < turn.mean() < 5e-3
 
 
-def test_sigma_is_the_size_of_what_remains():
-    """Over 20 calibrations of one arm: the error of predictions is sigma, on the average."""
-    q = UR.random_joints(100, np.random.default_rng(5))
-    shares = []
-    for seed in range(20):
-        true, result = identified(seed)
-        left = (result.chain.forward(q) - true.forward(q))[:, :3, 3]
-        shares.append((left**2).sum(axis=1) / calibrated(seed).sigma(q) ** 2)
-    assert np.sqrt(np.mean(shares)) == pytest.approx(1.0, abs=0.12)
-
-
 def test_expected_errors_add_up():
     _, result = identified()
     arm = calibrated()

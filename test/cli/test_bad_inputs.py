@@ -33,7 +33,11 @@ def bad_inputs():
     yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
     yield 'unknown parameter', (*good, '--fixed', 'elbow.a'), 'did you mean "elbow_joint.a"'
     yield 'a frame is no parameter', (*good, '--fixed', 'base.x'), 'fixed: true'
-    yield 'nothing left', (*good, '--fixed', '*'), 'nothing is left to identify'
+    yield (
+        'nothing left',
+        (*good, '--fixed', '*'),
+        ': every parameter is fixed: nothing is left to identify\n',
+    )
     yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
     yield 'NaN', (*good, '--sigma-orientation', 'nan'), 'sigma_orientation must be'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
@@ -44,7 +48,7 @@ def bad_inputs():
     )
     yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag'
     names = ('--joint-names', 'a,a,b,c,d,e,f')
-    yield 'joint names', (*bag_of, 'folder', *names), 'joint_names must be 6 different names'
+    yield 'joint names', (*bag_of, 'folder', *names), 'wrist_3_joint; not a, a, b, c, d, e, f'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'
     yield 'out is the root', (*good, '--out', '/'), '/ is the root folder: choose'
     yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'

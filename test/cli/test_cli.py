@@ -3,7 +3,11 @@
 import contextlib
 import io
 import json
+import os
 import shutil
+import subprocess
+import sys
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -12,9 +16,10 @@ from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_cs
 
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
-from calib_ros.cli.options import Status
+from calib_ros.cli.options import SETTINGS, Status
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.settings import Settings
 
 
 @pytest.fixture(scope='module')
@@ -227,3 +232,28 @@ def test_a_command_is_kept_without_what_logs_in(tmp_path, monkeypatch):
     assert kept[0].typed == (
         "calib_ros identify 'a table.csv' --chain ur10e --history memory://host/x"
     )
+
+
+def test_who_reads_no_further_is_no_error():
+    command = f'{sys.executable} -m calib_ros.cli.main robots | head -c 1'
+    found = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
+    assert found.stderr == ''
+
+
+def test_tab_completes_options_and_robots(tmp_path):
+    pytest.importorskip('argcomplete')
+    for line, wanted in (
+        ('calib_ros verify --tol', '--tolerance '),
+        ('calib_ros plan --chain kuka_i', 'kuka_iiwa14 '),
+    ):
+        found = tmp_path / 'found'
+        environment = {**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line, 'COMP_TYPE': '9'}
+        environment |= {'COMP_POINT': str(len(line)), '_ARGCOMPLETE_STDOUT_FILENAME': str(found)}
+        command = [sys.executable, '-m', 'calib_ros.cli.main']
+        subprocess.run(command, env=environment, check=False, capture_output=True)
+        assert found.read_text() == wanted
+
+
+def test_every_setting_is_in_a_group():
+    grouped = [name for names in SETTINGS.values() for name in names]
+    assert sorted(grouped) == sorted(item.name for item in fields(Settings))

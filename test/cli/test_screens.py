@@ -13,10 +13,8 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import time
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +25,11 @@ from measured import TEST, TRUE, UR, measured, rows_of, write_csv
 from calib_ros.cli import screen
 from calib_ros.cli.commands import examples_of
 from calib_ros.cli.main import TEXTS, _parser, main
-from calib_ros.cli.options import SETTINGS
 from calib_ros.cli.screen import Work
 from calib_ros.files import bags
 from calib_ros.files.boards import read_board
 from calib_ros.sampling import intake
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 SCREENS = Path(__file__).parent / 'screens'
 ESCAPE = '\x1b'
@@ -110,6 +106,7 @@ def test_the_overview(shown):
     assert status == 2
     assert_shown('overview', text)
     assert shown('--help') == (0, text)
+    assert shown('help', 'plan') == shown('plan', '--help')
 
 
 @pytest.mark.parametrize('name', TEXTS)
@@ -118,10 +115,6 @@ def test_the_help_of_a_command(shown, name):
     assert status == 0
     assert_shown(f'{name}_help', text)
     assert 'default: None' not in text
-
-
-def test_help_of_a_command_is_that_command_with_help(shown):
-    assert shown('help', 'plan') == shown('plan', '--help')
 
 
 @pytest.mark.parametrize(
@@ -407,28 +400,3 @@ def test_a_full_disk_leaves_nothing_behind(cell, shown, monkeypatch, name):
     line = text.splitlines()[-1]
     assert re.match(r'calib_ros: \S*NEW/[^.]\S*: the disk is full: make room', line)
     assert 'partial' not in text
-
-
-def test_who_reads_no_further_is_no_error():
-    command = f'{sys.executable} -m calib_ros.cli.main robots | head -c 1'
-    found = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)
-    assert found.stderr == ''
-
-
-def test_tab_completes_options_and_robots(tmp_path):
-    pytest.importorskip('argcomplete')
-    for line, wanted in (
-        ('calib_ros verify --tol', '--tolerance '),
-        ('calib_ros plan --chain kuka_i', 'kuka_iiwa14 '),
-    ):
-        found = tmp_path / 'found'
-        environment = {**os.environ, '_ARGCOMPLETE': '1', 'COMP_LINE': line, 'COMP_TYPE': '9'}
-        environment |= {'COMP_POINT': str(len(line)), '_ARGCOMPLETE_STDOUT_FILENAME': str(found)}
-        command = [sys.executable, '-m', 'calib_ros.cli.main']
-        subprocess.run(command, env=environment, check=False, capture_output=True)
-        assert found.read_text() == wanted
-
-
-def test_every_setting_is_in_a_group():
-    grouped = [name for names in SETTINGS.values() for name in names]
-    assert sorted(grouped) == sorted(item.name for item in fields(Settings))

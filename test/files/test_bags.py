@@ -18,6 +18,7 @@ from recorded import (
     record_in_chunks,
     recording,
     session_of,
+    stamp_ns,
     standing,
     storages,
     text_message,
@@ -90,10 +91,12 @@ def test_messages_in_any_order_give_the_same(tmp_path, rng):
     assert second.account().samples == 25
     assert second.account().dropped == first.account().dropped == {}
     assert first.account().notes == {}
-    assert set(second.account().notes) == {
-        'joints with a stamp older than the one before',
-        'measurements with a stamp older than the one before',
-    }
+    for topic, kind in (('/joint_states', 'joints'), ('/pose', 'measurements')):
+        stamps = np.array([stamp_ns(each) for at, each in shuffled if at == topic])
+        back = int((stamps < np.maximum.accumulate(stamps)).sum())
+        note = f'{kind} with a stamp older than the one before'
+        assert second.account().notes[note] == back > 5
+        assert f'{back} x {note}' in str(second.account())
 
 
 @pytest.mark.parametrize(
@@ -168,16 +171,6 @@ def test_of_several_topics_some_must_be_chosen(tmp_path):
         assert observations_of(path, sources=(topic,)).positions[:, 0].tolist() == [expected]
     both, _ = session_of(path, sources=('/left device=L', '/right device=R'))
     assert [each.base for each in both.problem().sets] == ['base', 'base_R']
-
-
-def test_of_several_joint_topics_some_can_be_chosen(tmp_path):
-    events = standing([pose_stamped(105 * MS)])
-    events += [('/gripper', joint_state(ms * MS, (5.0, 6.0, 7.0))) for ms in (101, 109)]
-    path = record(tmp_path / 'bag', events)
-    joints = observations_of(path, joint_topics=('/gripper',)).joints
-    np.testing.assert_array_equal(joints, [[5.0, 6.0, 7.0]])
-    joints = observations_of(path, joint_topics=('/joint_states',)).joints
-    np.testing.assert_allclose(joints, [[0.1, 0.2, 0.3]], atol=1e-15)
 
 
 def test_all_joint_topics_are_heard_together(tmp_path):
@@ -309,12 +302,3 @@ def test_a_nan_of_a_foreign_joint_does_not_matter(tmp_path):
     ]
     account = account_of(record(tmp_path / 'bag', [*events, ('/pose', pose_stamped(15 * MS))]))
     assert (account.samples, account.dropped) == (1, {})
-
-
-def test_stamps_going_backwards_lose_nothing_and_are_noted(tmp_path):
-    events = standing([pose_stamped(ms * MS, (ms, 0, 0)) for ms in (305, 105, 405, 205)])
-    session, _ = session_of(record(tmp_path / 'bag', events))
-    assert session.problem().observations.positions[:, 0].tolist() == [105, 205, 305, 405]
-    note = 'measurements with a stamp older than the one before'
-    assert session.account().notes == {note: 2}
-    assert f'note: 2 x {note}' in str(session.account())

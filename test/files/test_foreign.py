@@ -12,13 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Expression, Layout, load_layout, parse_columns, presets
 from calib_ros.files.tables import read_table
-from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.settings import Settings
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
@@ -353,41 +350,6 @@ def test_axes_called_like_accelerations_are_none(tmp_path):
     path.write_text(text)
     assert main(['import', str(path), '--columns', 'q*=A*', '--out', str(out)]) == 0
     assert out.read_text().splitlines()[0] == 'q1,q2,x,y,z'
-
-
-@pytest.mark.parametrize('row', ['1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5'])
-def test_a_table_of_semicolons_says_what_to_give(tmp_path, row):
-    path = tmp_path / 'cell.csv'
-    path.write_text(f'q1;q2;x;y;z\n{row}\n')
-    with pytest.raises(InputError, match=r'separated by semicolons: .* give --separator'):
-        read_table(path, 2)
-
-
-@pytest.mark.parametrize(
-    ('names', 'separator', 'noted'),
-    [
-        (['shoulder', 'Elbow', 'x', 'y', 'z'], ',', 'q1 = shoulder, q2 = elbow'),
-        (['Q1', 'Q2', 'X', 'Y', 'Z'], ',', 'no units are given'),
-        (['q1', 'q2', 'x', 'y', 'z'], ';', 'semicolon'),
-    ],
-)
-def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
-    tmp_path, names, separator, noted
-):
-    path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, names=names).replace(',', separator))
-    joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
-    found = loading.table(path, Chain('arm', 'standard', joints), Settings())
-    np.testing.assert_array_equal(found.fitted[0].joints, JOINTS)
-    assert noted in ' '.join(found.warnings)
-
-
-def test_columns_that_count_the_joints_are_proposed(tmp_path):
-    path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, names=['A1_rad', 'A2_rad', 'x', 'y', 'z']))
-    joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
-    with pytest.raises(InputError, match=r'expected q1, q2, .* --columns "q\*=A\*_rad,x=NAME'):
-        loading.table(path, Chain('arm', 'standard', joints), Settings())
 
 
 def test_workbooks(tmp_path):

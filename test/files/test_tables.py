@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.files import loading
 from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.tables import read_table
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.settings import Settings
 
 POINTS = """q1,q2,x,y,z
 0.1,0.2,1,2,3
@@ -249,3 +252,34 @@ def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
 def test_an_integer_with_separators_of_thousands_is_named_by_its_line(read):
     with pytest.raises(InputError, match='line 2: stamp_ns must be an integer'):
         read('stamp_ns,q1,q2,x,y,z\n"1,000",0.1,0.2,1,2,3\n')
+
+
+@pytest.mark.parametrize('row', ['1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5'])
+def test_a_table_of_semicolons_says_what_to_give(read, row):
+    with pytest.raises(InputError, match=r'separated by semicolons: .* give --separator'):
+        read(f'q1;q2;x;y;z\n{row}\n')
+
+
+@pytest.mark.parametrize(
+    ('names', 'separator', 'noted'),
+    [
+        ('shoulder,Elbow,x,y,z', ',', 'q1 = shoulder, q2 = elbow'),
+        ('Q1,Q2,X,Y,Z', ',', 'no units are given'),
+        ('q1,q2,x,y,z', ';', 'semicolon'),
+        ('A1_rad,A2_rad,x,y,z', ',', r'expected q1, q2, .* --columns "q\*=A\*_rad,x=NAME'),
+    ],
+)
+def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
+    tmp_path, names, separator, noted
+):
+    path = tmp_path / 'cell.csv'
+    path.write_text(POINTS.replace('q1,q2,x,y,z', names).replace(',', separator))
+    joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
+    chain = Chain('arm', 'standard', joints)
+    if 'expected' in noted:
+        with pytest.raises(InputError, match=noted):
+            loading.table(path, chain, Settings())
+        return
+    found = loading.table(path, chain, Settings())
+    np.testing.assert_array_equal(found.fitted[0].joints, [[0.1, 0.2], [-0.3, 0.4]])
+    assert noted in ' '.join(found.warnings)

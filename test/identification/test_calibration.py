@@ -16,6 +16,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.records import nominal_document, unpacked
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
 
 UR = load_chain('ur10e')
@@ -51,6 +52,11 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
                 getattr(theirs, ask)(q), getattr(ours, ask)(q), rtol=1e-6, atol=1e-12
             )
     np.testing.assert_array_equal(read.region.covers(q), found.region.covers(q))
+    jacobian = ErrorModel(found.chain, found.names).jacobian(q)
+    variances = np.einsum('ncp,pr,ncr->nc', jacobian, found.covariance, jacobian)
+    bare = replace(read, region=None)
+    for sigma, part in ((bare.sigma(q), slice(3)), (bare.sigma_turned(q), slice(3, 6))):
+        np.testing.assert_allclose(sigma**2, variances[:, part].sum(axis=1), rtol=1e-6)
     scale = np.sqrt(np.diag(found.covariance))
     difference = (read.covariance - found.covariance) / np.outer(scale, scale)
     np.testing.assert_allclose(difference, 0.0, atol=1e-8)

@@ -15,7 +15,7 @@ from calib_ros.identification.leastsquares import System, minimise
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples
-from calib_ros.identification.sizes import TYPICAL
+from calib_ros.identification.sizes import SPREAD, TYPICAL, Evidence
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.parameter import Parameter
 
@@ -117,25 +117,12 @@ def test_a_healthy_arm_has_small_errors_and_is_not_accepted(seed):
     assert found.posterior.sizes['angle'] < 5e-5
 
 
-def test_data_without_noise_stay_exact():
-    true = arm(0)
-    found = identify(problem_of(true, spread(0), noise=0.0))
-    q = UR10E.random_joints(200, np.random.default_rng(1))
-    assert np.abs((found.chain.forward(q) - true.forward(q))[:, :3, 3]).max() < 1e-9
-
-
+@pytest.mark.parametrize(('reach', 'least', 'most'), [(2.5, 0.0, 0.01), (0.15, 0.2, 2.0)])
 @pytest.mark.parametrize('seed', range(2))
-def test_effects_neither_shown_nor_possible_are_of_no_size(seed):
-    found = identify(problem_of(arm(seed), spread(seed), seed))
-    for group in ('drive', 'coupling', 'gravity'):
-        assert found.posterior.sizes[group] < 0.01 * TYPICAL[group]
-
-
-@pytest.mark.parametrize('seed', range(2))
-def test_effects_that_the_data_cannot_show_are_of_usual_size(seed):
-    found = identify(problem_of(arm(seed), spread(seed, 0.15), seed))
+def test_effects_are_of_the_usual_size_where_the_data_cannot_refute_them(seed, reach, least, most):
+    found = identify(problem_of(arm(seed), spread(seed, reach), seed))
     for group in ('drive', 'gravity'):
-        assert 0.2 < found.posterior.sizes[group] / TYPICAL[group] < 2.0
+        assert least <= found.posterior.sizes[group] / TYPICAL[group] < most
 
 
 def test_effects_that_an_arm_has_are_considered_with_their_size():
@@ -188,6 +175,37 @@ def test_what_few_parameters_tell_is_judged_by_other_sizes_as_well(seed):
         for told in (few, many)
     ]
     assert spans[0] > 10.0 * spans[1]
+
+
+def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual_they_are():
+    """One group up and down at a time; a group of no size and the device's scale stay."""
+    found = object.__new__(Evidence)
+    found._names = ('length', 'angle', 'drive', 'scale')
+    found._typical = np.log([TYPICAL['length'], TYPICAL['angle'], TYPICAL['drive'], 1.0])
+    found._of = lambda tried: 0.3 * (tried - found._typical)[:, 0]
+    size = np.add(found._typical, [0.5, -0.3, -50.0, 0.0])
+    told = found.near(size, np.array([2.0, 8.0, 1.0, 1.0]))
+    assert sum(weight for weight, _ in told) == pytest.approx(1.0)
+    for k, step in ((0, 1.0), (1, 0.5)):
+        (more, up), (less, down) = told[2 * k : 2 * k + 2]
+        for each, sign in ((up, 1.0), (down, -1.0)):
+            np.testing.assert_allclose(each[:2], (size + sign * step * np.eye(4)[k])[:2])
+        ends = [((each - found._typical) / np.log(SPREAD)) ** 2 for each in (up, down)]
+        likely = 0.3 * (up - down)[0] - 0.5 * (ends[0] - ends[1]).sum()
+        assert more / less == pytest.approx(np.exp(likely))
+        assert more + less == pytest.approx(0.5)
+
+
+def test_a_rival_has_the_size_that_is_asked_for(rng):
+    root, vector = rng.normal(size=(9, 5)), rng.normal(size=5)
+    groups, typical = [None, 'length', 'length', 'angle', 'scale'], [1.0, 2.0, 0.5]
+    names = ('length', 'angle', 'scale')
+    found = Evidence(
+        root.T @ root, vector, np.zeros(5), groups, dict(zip(names, typical, strict=True))
+    )
+    _, precision = found.rival('scale', 0.25, np.log(typical), set())
+    assert precision[[0, 4]].tolist() == [0.0, 16.0]
+    assert (precision[1:4] > 0.0).all()
 
 
 def told(rng, size=3):

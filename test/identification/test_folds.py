@@ -14,6 +14,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.model_choice import identify_model
 from calib_ros.identification.observations import numbered
 from calib_ros.identification.problem import Problem
+from calib_ros.identification.rounding import rounded, rounding_errors
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 
@@ -118,6 +119,22 @@ def test_rounded_joint_values_are_no_gain(design):
             found += result.accepted and bool(errors)
     assert healthy == 0
     assert found >= 3
+
+
+def test_what_rounding_gives_to_the_zero_of_a_joint(rng):
+    """A value that most poses share hardly averages out."""
+    q = UR10E.random_joints(40, rng)
+    q[:, 1], q[:, 2] = np.round(q[:, 1], 3), np.repeat([0.0, 1e-3, 5e-3], [20, 10, 10])
+    problem = Problem(UR10E, measure(UR10E, q, rng))
+    steps = rounded(problem)
+    assert steps == {'shoulder_lift_joint': 1e-3, 'elbow_joint': 1e-3}
+    one = 1e-3 / np.sqrt(12.0)
+    assert rounding_errors(problem, steps) == pytest.approx(
+        {
+            'shoulder_lift_joint.theta': one / np.sqrt(40.0),
+            'elbow_joint.theta': one * np.sqrt(0.5**2 + 2 * 0.25**2),
+        }
+    )
 
 
 def test_values_that_nobody_rounded_are_not_called_so(rng):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NO_PRIOR, UR10E, fitted, measured_arm, worst_prediction
+from fits import UR10E, fitted, measured_arm, worst_prediction
 from hypothesis import given, settings, strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -194,41 +194,6 @@ def test_the_model_is_complete_for_every_architecture(convention, joints):
     assert np.abs(error).max() < 1e-9
     lengths = [p.offset for p in result.parameters if p.name.kind in ('a', 'd')]
     assert np.abs(lengths).max() < 0.02  # nothing absurd
-
-
-def test_errors_shared_by_a_configuration_count_once():
-    """Three pairs at each configuration with the same error tell no more than one."""
-    scores = []
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        once = measure(true, UR10E.random_joints(40, rng), rng, 1e-4, 1e-4 / 0.3)
-        thrice = once.select(np.repeat(np.arange(40), 3))
-        scores += scores_of(fitted(Problem(UR10E, thrice)), true)
-    assert np.std(scores) == pytest.approx(1.0, abs=0.1)
-
-
-@pytest.mark.parametrize(('position', 'orientation'), [(1e-4, 3e-5), (1e-5, 1e-3)])
-def test_standard_deviations_follow_the_noise_that_is_there(position, orientation):
-    scores = []
-    for seed in range(20):
-        _, true, seen = measured_arm(seed, 40, (position, orientation))
-        result = fitted(Problem(UR10E, seen))
-        assert not result.noise.consistent
-        scores += scores_of(result, true)
-    assert np.std(scores) == pytest.approx(1.0, abs=0.1)
-
-
-def test_intervals_of_few_poses_hold_where_the_noise_may_be_larger_than_given():
-    """No test of so few residuals would find the sigmas wrong."""
-    inside = []
-    for seed in range(30):
-        _, true, seen = measured_arm(seed, 9, (1.5e-4, 1.5e-4 / 0.3))
-        rows = fitted(Problem(UR10E, seen, priors=NO_PRIOR)).parameters
-        inside += [
-            abs(row.value - true.value(row.name)) < row.half_width() for row in rows if row.std
-        ]
-    assert np.mean(inside) > 0.935
 
 
 @pytest.mark.parametrize(

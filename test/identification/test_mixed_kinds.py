@@ -1,29 +1,21 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Measurements of several kinds in one table or bag, identified together by the command line.
+"""Measurements of several kinds in one table, identified together by the command line.
 
 A tracker sees the pose of one target and the position of another, a wire goes from a point of its
 own to a third, and a camera on the flange sees a board.
 """
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-import recorded
 from fits import NOISE, UR10E
 from measured import write_csv
 
-from calib_ros.apply.simulation import Cell, drive, faulty, random_frame
+from calib_ros.apply.simulation import Cell, faulty, random_frame
 from calib_ros.cli.main import main
-from calib_ros.files.bags import replay
-from calib_ros.identification.validation import residuals
 from calib_ros.kinematics import se3
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
-
-START = 1_700_000_000_000_000_000
 
 
 class Workcell:
@@ -146,105 +138,3 @@ def test_all_kinds_in_one_table(identified, tmp_path, seed):
     only = [row for row in rows if row['kind'] == 'pose']
     alone = identified('--csv', write_csv(tmp_path / 'poses.csv', only))
     assert together < error(corrected(alone), cell)
-
-
-# The same from a bag
-
-
-def placed(pose):
-    """Return position and quaternion of a pose (4, 4)."""
-    return pose[:3, 3].tolist(), se3.to_quat(pose[:3, :3]).tolist()
-
-
-SOURCES = (
-    '/markers type=TransformStamped',
-    '/wire device=wire target=hook',
-    '/odometry device=ground target=base',
-    '/camera device=camera target=board eye_in_hand=true',
-)
-
-
-def events_of(cell, count):
-    """Return the messages of an arm that stops at places, where everything is measured at once."""
-    where = UR10E.random_joints(count, cell.rng)
-    stamps, joints, _ = drive(where, Cell(move=0.3, dwell=0.5, joint_rate=50.0), START)
-    names, covariance = UR10E.joint_names, np.diag(np.repeat(NOISE, 3) ** 2)
-    events = [
-        (stamp, '/joint_states', recorded.joint_state(stamp, row, names))
-        for stamp, row in zip(stamps.tolist(), joints, strict=True)
-    ]
-    for offset in (0.2, 0.3, 0.4):
-        at = START + np.round((0.8 * np.arange(count) + offset) * 1e9).astype(np.int64)
-        seen = zip(
-            at.tolist(),
-            map(placed, cell.poses(where)),
-            map(placed, cell.poses(where, tool='tool_ball')),
-            cell.distances(where).tolist(),
-            map(placed, cell.poses(where, 'base_wire', 'tool_ball')),
-            map(placed, cell.pictures(where)),
-            strict=True,
-        )
-        for stamp, plate, ball, length, ground, board in seen:
-            events += [
-                (stamp, '/markers', recorded.transform_stamped(stamp, *plate, 'plate')),
-                (stamp, '/markers', recorded.transform_stamped(stamp, *ball, 'ball')),
-                (stamp, '/wire', recorded.distance(stamp, length)),
-                (stamp, '/odometry', recorded.odometry(stamp, covariance, '', ground)),
-                (stamp, '/camera', recorded.pose_stamped(stamp, *board)),
-            ]
-    return [event[1:] for event in sorted(events, key=lambda event: event[0])]
-
-
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory):
-    cell = Workcell(6)
-    path = tmp_path_factory.mktemp('cell') / 'bag'
-    return cell, recorded.record(path, events_of(cell, 35))
-
-
-def settings(**more):
-    return Settings(sigma_position=NOISE[0], sigma_orientation=NOISE[1], sources=SOURCES, **more)
-
-
-def test_all_sources_of_one_bag(identified, bag):
-    cell, path = bag
-    document = identified(path, *(part for text in SOURCES for part in ('--sources', text)))
-    samples = document['samples']
-    assert samples['samples'] == 5 * 35
-    assert samples['configurations'] == 35
-    assert samples['poses'] == 3 * 5 * 35
-    assert samples['dropped'] == {}
-    chain = corrected(document)
-    assert set(chain.frame_names) == {
-        *('base', 'base_ground', 'base_wire', 'base_board'),
-        *('tool', 'tool_plate', 'tool_base', 'tool_hook', 'tool_camera'),
-    }
-    # what comes first by its name, the ball, has the frames without names
-    assert error(chain, cell, true_tool='tool_ball') < NOISE[0]
-    assert error(chain, cell, tool='tool_plate') < NOISE[0]
-    ground = {'true_base': 'base_wire', 'true_tool': 'tool_ball'}
-    assert error(chain, cell, 'base_ground', 'tool_base', **ground) < NOISE[0]
-
-
-def test_poses_that_were_not_used_are_predicted(bag):
-    """Of each set a fifth is held out; what is left there is the noise."""
-    _, path = bag
-    session = CalibrationSession(UR10E, settings())
-    replay(path, session)
-    stops = sorted({sample.stamp_ns // 800_000_000 for sample in session.samples})
-    held_out = set(stops[::5])
-    session.samples[:] = [
-        replace(sample, validation=sample.stamp_ns // 800_000_000 in held_out)
-        for sample in session.samples
-    ]
-    problem = session.problem()
-    result = session.identify()
-    assert result.accepted
-    for each in problem.judging:
-        left = residuals(result.chain, each).position
-        variance = NOISE[0] ** 2
-        if each.covariance is not None:  # that of the camera, which is turned round, or its own
-            variance = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2).mean() / 3.0
-        width = 1 if each.distances is not None else 3
-        rms = np.sqrt((left[:, :width] ** 2).mean())
-        assert rms < 2.0 * np.sqrt(variance / 3.0)  # three measurements a stop

@@ -76,17 +76,6 @@ def test_auto_finds_what_is_there_and_predicts_better(unsearched, group, oriente
     assert auto.accepted
 
 
-def test_the_very_harmonic_is_named():
-    rng = np.random.default_rng(4)
-    true = arm_with('gear', rng)
-    seen = observed(true, UR10E.random_joints(100, rng), rng)
-    auto = identify_model(Problem(UR10E, seen, **SIGMAS), 'auto')
-    assert set(GEAR) <= {name for name, _ in auto.chain.effects}
-    assert [verdict.what for verdict in auto.verdicts if verdict.pays] == [
-        'shoulder_lift_joint, 17 per turn'
-    ]
-
-
 def test_harmonics_that_are_small_each_are_found_together():
     """As drives of measured robots have: none alone shows, together they are most of the error."""
     rng = np.random.default_rng(2)
@@ -127,54 +116,33 @@ def test_nothing_is_chosen_on_a_purely_geometric_arm():
     np.testing.assert_array_equal(auto.chain.table, plain.chain.table)
 
 
-def test_auto_takes_several_sessions(rng):
-    true = arm_with('eccentricity', rng)
-    first = observed(true, UR10E.random_joints(100, rng), rng)
-    other = replace(true, base=random_frame(rng, 1.0))
-    second = replace(observed(other, UR10E.random_joints(100, rng), rng), base='base_B')
-    problem = Problem(UR10E, first, more=(second,), **SIGMAS)
-    plain, auto = identify(problem), identify_model(problem, 'auto')
-    unseen = UR10E.random_joints(300, rng)
-    assert 'eccentricity' in chosen(auto)
-    assert rms(auto.chain, true, unseen) < 0.6 * rms(plain.chain, true, unseen)
-
-
-def test_auto_takes_distances(rng):
-    true = arm_with('eccentricity', rng)
-    seen = observed(true, UR10E.random_joints(400, rng), rng)
-    wire = replace(seen, distances=np.linalg.norm(seen.positions, axis=1))
-    problem = Problem(UR10E, wire, **SIGMAS)
-    plain, auto = identify(problem), identify_model(problem, 'auto')
-    assert 'eccentricity' in chosen(auto)
-    unseen = UR10E.random_joints(300, rng)
-    length = np.linalg.norm(true.forward(unseen)[:, :3, 3], axis=1)
-    error = [
-        np.std(np.linalg.norm(each.chain.forward(unseen)[:, :3, 3], axis=1) - length)
-        for each in (plain, auto)
-    ]
-    assert error[1] < 0.6 * error[0]
-
-
-def test_auto_takes_priors(rng):
+@pytest.mark.parametrize('kind', ['sessions', 'distances', 'priors', 'covariances'])
+def test_auto_takes_all_that_is_measured_and_known(kind, rng):
     """Priors make redundant parameters fitted ones: their columns are not independent."""
     true = arm_with('eccentricity', rng)
-    seen = observed(true, UR10E.random_joints(120, rng), rng)
-    priors = {'*_joint.a': 1e-3, '*_joint.d': 1e-3, '*_joint.theta': 2e-3}
-    auto = identify_model(Problem(UR10E, seen, priors=priors, **SIGMAS), 'auto')
+    count = 400 if kind == 'distances' else 120
+    seen = observed(true, UR10E.random_joints(count, rng), rng)
+    other = observed(replace(true, base=random_frame(rng, 1.0)), seen.joints, rng)
+    far, own = np.linalg.norm(seen.positions, axis=1), np.diag(np.repeat(NOISE, 3) ** 2)
+    given, options = {
+        'sessions': (seen, {'more': (replace(other, base='base_B'),)}),
+        'distances': (replace(seen, distances=far), {}),
+        'priors': (seen, {'priors': {'*_joint.[ad]': 1e-3, '*_joint.theta': 2e-3}}),
+        'covariances': (replace(seen, covariance=np.tile(own, (count, 1, 1))), {}),
+    }[kind]
+    problem = Problem(UR10E, given, **options, **SIGMAS)
+    plain, auto = identify(problem), identify_model(problem, 'auto')
     assert 'eccentricity' in chosen(auto)
-
-
-def test_auto_takes_covariances_of_the_samples(rng):
-    true = arm_with('eccentricity', rng)
-    seen = observed(true, UR10E.random_joints(120, rng), rng)
-    sigmas = np.repeat(NOISE, 3)
-    own = replace(seen, covariance=np.tile(np.diag(sigmas**2), (120, 1, 1)))
-    first, second = (
-        identify_model(Problem(UR10E, each, **SIGMAS), 'auto') for each in (seen, own)
-    )
-    assert chosen(first) == chosen(second) == {'eccentricity'}
-    # the size of the noise, by which priors are weighed, is found by parts or as a whole
-    np.testing.assert_allclose(first.chain.table, second.chain.table, rtol=0, atol=1e-6)
+    unseen = UR10E.random_joints(300, rng)
+    if kind == 'distances':
+        length = np.linalg.norm(true.forward(unseen)[:, :3, 3], axis=1)
+        before, after = (
+            np.std(np.linalg.norm(each.chain.forward(unseen)[:, :3, 3], axis=1) - length)
+            for each in (plain, auto)
+        )
+    else:
+        before, after = (rms(each.chain, true, unseen) for each in (plain, auto))
+    assert after < 0.6 * before
 
 
 def test_a_model_is_named_in_the_settings(rng):

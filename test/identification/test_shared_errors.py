@@ -25,13 +25,6 @@ def fading(count, length, rng):
     return lfilter([1.0], [1.0, -decay], steps, axis=0)
 
 
-def smooth(q, rng):
-    """Return (N, 3) errors of unit variance, smooth over the joint space."""
-    place = np.concatenate([np.cos(q), np.sin(q)], axis=1)
-    kernel = np.exp(-0.5 * cdist(place, place, 'sqeuclidean')) + 1e-9 * np.eye(len(q))
-    return np.linalg.cholesky(kernel) @ rng.normal(size=(len(q), 3))
-
-
 def shifted(seen, errors):
     return replace(seen, positions=seen.positions + errors)
 
@@ -81,52 +74,12 @@ def test_intervals_hold_the_truth_though_the_tracker_drifts():
     assert alone < 0.925
 
 
-def test_errors_smooth_over_the_joint_space_are_shared_by_what_is_near():
-    """The path is measured in random order: successive configurations have nothing in common."""
-    kinds, covered, alone = [], [], []
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        true = faulty(UR10E, Cell(), rng)
-        q = rng.permutation(along_path(180, rng))
-        seen = shifted(measure(true, q, rng, *NOISE), 1e-4 * smooth(q, rng))
-        result = fitted(Problem(UR10E, seen, **SIGMAS))
-        kinds.append(result.noise.shared)
-        covered.append(hits(true, result))
-        alone.append(hits(true, result, widened=False))
-    assert all('near' in kind for kind in kinds)
-    assert sum('successive' in kind for kind in kinds) <= 1
-    assert np.mean(covered) == pytest.approx(0.95, abs=0.04)
-    assert np.mean(alone) < 0.85
-
-
-def test_the_correlation_is_that_of_the_errors():
-    """The drift has 4/5 of the variance and decays by exp(-1/10) from one pose to the next."""
-    found = [run(seed, 300, 'random', drift=10.0)[1].noise for seed in range(6)]
-    expected = 0.8 * np.exp(-0.1)
-    assert np.mean([noise.successive for noise in found]) == pytest.approx(expected, abs=0.08)
-    assert np.abs(np.mean([noise.near for noise in found])) < 0.1
-
-
 def test_distances_drift_as_well():
     rng, _, seen = measured_arm(4, 300, (0.0, 0.0))
     length = np.linalg.norm(seen.positions, axis=1) + 5e-5 * rng.normal(size=300)
     for drift, shared in ((0.0, ()), (2e-4, ('successive',))):
         wire = replace(seen, distances=length + drift * fading(300, 20.0, rng)[:, 0])
         assert identify(Problem(UR10E, wire, **SIGMAS)).noise.shared == shared
-
-
-def test_covariances_of_the_samples_change_nothing_when_equal():
-    rng = np.random.default_rng(6)
-    true = faulty(UR10E, Cell(), rng)
-    seen = shifted(measure(true, along_path(60, rng), rng, *NOISE), 2e-4 * fading(60, 10.0, rng))
-    own = np.tile(np.diag(np.repeat(NOISE, 3) ** 2), (60, 1, 1))
-    plain, whitened = (
-        identify(Problem(UR10E, each, **SIGMAS)) for each in (seen, replace(seen, covariance=own))
-    )
-    assert plain.noise.shared == whitened.noise.shared == ('successive', 'near')
-    # whitened rows are one part: orientations count as drifting, too
-    ratio = np.diag(whitened.covariance) / np.diag(plain.covariance)
-    assert 0.5 < np.median(np.sqrt(ratio)) < 2.0
 
 
 @pytest.mark.parametrize('block', [1, 24, 96])  # 24: the last one holds a single stop
@@ -199,8 +152,9 @@ def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
     residual = left @ rows[:, -1]
     excess = residual @ dense @ residual - ratio * (residual[60:] ** 2).sum()
     excess *= np.trace(free) / (residual[60:] ** 2).sum()
-    expected = excess / np.sqrt(2.0 * np.trace(centred @ centred))
-    assert forms.test(1, links)[1] == pytest.approx(expected, rel=1e-9)
+    score = excess / np.sqrt(2.0 * np.trace(centred @ centred))
+    pairs = measured.astype(float) @ dense @ measured
+    assert forms.test(1, links) == pytest.approx((excess / pairs, score), rel=1e-9)
 
 
 def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
@@ -251,10 +205,12 @@ def test_stops_have_the_sums_of_their_samples(share, run):
     q = UR10E.random_joints(14, rng)[stops]
     poses = measure(UR10E, q, rng, *NOISE)
     points = measure(UR10E, q[stops < 9], rng, *NOISE, oriented=False)
+    own = np.diag(np.repeat(NOISE, 3) ** 2) + 1e-9  # whitened, a pose is one part
     weights = np.where(np.arange(len(q)) == 3, 0.0, rng.uniform(0.5, 1.0, len(q)))
     sets = (
         samples_module.Samples(points, *NOISE),
         samples_module.Samples(poses, *NOISE).weighted(weights),
+        samples_module.Samples(replace(poses, covariance=np.tile(own, (len(q), 1, 1))), *NOISE),
     )
     names = UR10E.parameter_names[:8]
     units = shared_errors._gather(UR10E, names, System(sets), share, run)
@@ -267,8 +223,9 @@ def test_stops_have_the_sums_of_their_samples(share, run):
             which = np.flatnonzero((stops[: samples.count] == stop) & (good > 0))
             if stop // run % share == 0 and len(which):
                 whole = rows[..., which].sum(axis=2) / np.sqrt(len(which))
-                parts[0].append(whole[:, :3])
-                parts[1].append(whole[:, 3:])
+                first = 6 if number == 2 else 3
+                parts[0].append(np.pad(whole[:, :first], ((0, 0), (0, 6 - first))))
+                parts[1].append(whole[:, 3:] * (number < 2))
                 counts.append(len(which))
                 here = q[which[0]]
                 far = shared_errors.ELSEWHERE * number
@@ -350,10 +307,12 @@ def test_the_middle_is_the_sum_of_all_that_a_test_finds(most, monkeypatch):
     limit = norm.ppf(1.0 - 0.01 / 4)
     scores = {('successive', 0): limit + 1e-6, ('near', 0): 9.0, ('near', 1): limit - 1e-6}
     scores |= {('successive', 1): 9.0}
+    share = 1 if most > 24 else 2  # every second one of 24 stops, at most 20
     kinds = iter(['successive'] * 2 + ['near'] * 2)
     sizes = {0: np.array([2.0, 0, 0, 0.3, 0, 0, 0, 0.0, 0.7]), 1: np.zeros(6)}
 
-    def test(_, part, __):
+    def test(forms, part, _):
+        assert forms._units.time.tolist() == [*range(0, 24, share)]
         kind = next(kinds)
         return 0.1 * (1 + part) * (1 if kind == 'near' else -1), scores[kind, part]
 
@@ -373,7 +332,6 @@ def test_the_middle_is_the_sum_of_all_that_a_test_finds(most, monkeypatch):
     rows = system.rows_of(fit.chain, names)[0][:-1, :3]
     time = np.arange(24)
     place = np.concatenate([np.cos(seen.joints), np.sin(seen.joints)], axis=1)
-    share = 1 if most > 24 else 2  # every second one of 24 stops, at most 20
     kept = time % share == 0
     near = 0.7 * share * np.exp(-cdist(place, place) / 3.0)
     near = near * np.outer(kept, kept) * np.where(np.eye(24, dtype=bool), 1.0, share)

@@ -120,18 +120,6 @@ def test_well_determined_parameters_are_not_named():
     assert not result.priors
 
 
-def test_sockets_alone_and_in_rows_of_three_make_a_place_each():
-    true, problem = cell(0)
-    first, second = (true.forward(problem.sets[k].joints[:1])[0, :3, 3] for k in (3, 4))
-    apart = float(np.linalg.norm(first - second))
-    separations = (*problem.separations[1:], ('base_1_1', 'base_2_0', apart))
-    result = identify(replace(problem, separations=separations))
-    assert result.accepted
-    assert difference(result.chain, true) < 1e-8
-    # the two of place 0, places 1 and 2 together, and place 3
-    assert result.validated_by == 'leaving out one of 4 places at a time'
-
-
 @pytest.mark.parametrize('slip', [0.0, 5e-3])
 def test_known_distances_that_the_arm_does_not_keep_are_no_step(slip):
     """Eccentric joints bend space, so that the sockets seem to be elsewhere from the start."""

@@ -3,13 +3,14 @@
 """Closed forms of the frames, and the search for the best half of the samples."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fits import UR10E, worst_prediction
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.identification import trimmed
+from calib_ros.identification import start, trimmed
 from calib_ros.identification.identification import identify
 from calib_ros.identification.leastsquares import Prior, System
 from calib_ros.identification.problem import Problem
@@ -140,6 +141,33 @@ def test_frames_anywhere_need_no_guess_even_of_six_poses(seed, oriented):
     found = start_frames(UR10E, [seen], 1e-4, 1e-3, 'redescending')
     left = norms(found.forward(seen.joints)[:, :3, 3] - seen.positions)
     assert np.median(left) < 0.01  # what the errors of the arm leave
+
+
+@pytest.mark.parametrize('order', ['near,far,near', 'far,near,alike', 'near,near,far'])
+def test_the_start_that_brings_most_samples_near_is_the_best(order, monkeypatch, rng):
+    """Gross errors do not count; what is as near for most of the samples is the same start."""
+    residual = {'far': np.full((10, 3), 0.1), 'near': np.zeros((10, 3))}
+    residual['near'][6:] = 3.0
+    residual['alike'] = residual['near'] * [-1.0, 1.0, 1.0]
+    seen = measure(UR10E, UR10E.random_joints(10, rng), rng)
+    starts = [replace(UR10E, name=each) for each in order.split(',')]
+    fitted = []
+
+    def minimise(chain, *_, **__):
+        fitted.append(chain.name)
+        return SimpleNamespace(chain=chain)
+
+    def robust_fit(chain, names, *_):
+        assert len(names) == 12
+        return SimpleNamespace(fit=minimise(chain))
+
+    monkeypatch.setattr(start, '_starts', lambda *_: iter([iter(starts)]))
+    monkeypatch.setattr(start, 'residual_arrays', lambda chain, _: (residual[chain.name],))
+    monkeypatch.setattr(start, 'minimise', minimise)
+    monkeypatch.setattr(start, 'robust_fit', robust_fit)
+    found = start._start_one(UR10E, seen, (1e-4, 1e-3), 'none')
+    assert found.name == 'near'
+    assert fitted == [*dict.fromkeys(each for each in order.split(',') if each != 'alike'), 'near']
 
 
 def test_a_wrong_initial_frame_does_no_harm():

@@ -13,6 +13,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.tables import read_table
+from calib_ros.identification import start
 from calib_ros.identification.identification import identify
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
@@ -71,6 +72,16 @@ def test_the_jacobian_is_that_of_finite_differences():
         )
         slope = (less - more)[:, 0] / 2e-6 / SIGMA
         np.testing.assert_allclose(rows[k, 0], slope, rtol=1e-6, atol=0.01)
+
+
+def test_closed_forms_put_touches_on_their_plane():
+    """With the tool as it is given, or as the heights tell."""
+    true, sets = cell(0, noise=0.0)
+    seen = replace(sets[1], base='base')
+    given = replace(true, tool=replace(true.tool, fixed=True))
+    for k, chain in enumerate((given, replace(true, base=None, tool=None))):
+        found = [*start._on_plane(chain, start.flange(chain, seen), seen)][k]
+        np.testing.assert_allclose(residual_arrays(found, seen)[0][:, 0], 0.0, atol=1e-9)
 
 
 def test_planes_tell_the_arm_but_not_its_size():

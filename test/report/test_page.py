@@ -19,7 +19,6 @@ from calib_ros.apply.verification import verify
 from calib_ros.apply.workspace import survey
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
@@ -34,8 +33,9 @@ from calib_ros.report.words import as_document, limits_mm, summary
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
 
 
-def figures_of(page):
-    return page.data['figures']
+def rms_of(errors):
+    """Return the RMS [1000] of vectors (N, 3) [1]."""
+    return 1e3 * np.sqrt(np.mean(np.sum(errors**2, axis=1)))
 
 
 def test_the_figures_are_those_of_the_result(solved):
@@ -58,9 +58,8 @@ def test_poses_are_those_judged_and_their_errors_make_the_figures(solved):
     for errors, figures in zip(
         (poses.before, poses.after), result.validation.figures, strict=True
     ):
-        rms = 1e3 * np.sqrt(np.mean(np.sum(errors[poses.judged] ** 2, axis=1)))
-        assert rms == pytest.approx(figures.rms_mm, rel=1e-12)
-    turned = 1e3 * np.sqrt(np.mean(np.sum(poses.turned_after[poses.judged] ** 2, axis=1)))
+        assert rms_of(errors[poses.judged]) == pytest.approx(figures.rms_mm, rel=1e-12)
+    turned = rms_of(poses.turned_after[poses.judged])
     assert turned == pytest.approx(result.validation.figures[1].rms_mrad, rel=1e-12)
 
 
@@ -69,8 +68,7 @@ def test_cross_validated_poses_have_the_errors_of_the_folds():
     result = identify(problem)
     poses = poses_of(problem, result)
     assert (poses.role == JUDGED).all()
-    rms = 1e3 * np.sqrt(np.mean(np.sum(poses.after**2, axis=1)))
-    assert rms == pytest.approx(result.validation.figures[1].rms_mm, rel=1e-12)
+    assert rms_of(poses.after) == pytest.approx(result.validation.figures[1].rms_mm, rel=1e-12)
 
 
 def test_residuals_csv_holds_every_pose(solved):
@@ -135,7 +133,7 @@ def test_what_others_named_is_text(solved):
     plain = identification_report(*solved, poses, told, warnings=('g',))
     plain = replace(plain, advice=advice.advice([Reason(Rule.GAIN, 'h'), Reason(Rule.DRIFT, 'i')]))
     assert {tag for tag, _ in page.tags} <= {tag for tag, _ in page_of(plain).tags}
-    shown = json.dumps(figures_of(page))
+    shown = json.dumps(page.data['figures'])
     assert '<b ' not in shown
     assert '<script' not in shown
 
@@ -156,7 +154,7 @@ def test_every_figure_is_one_that_plotly_knows(solved):
     reports = [report_of(*solved), workspace_report(arm, found, Origin())]
     count = 0
     for report in reports:
-        for figure in figures_of(page_of(report)).values():
+        for figure in page_of(report).data['figures'].values():
             graph_objects.Figure(figure)
             count += 1
     assert count >= 8
@@ -238,25 +236,18 @@ def test_what_follows_from_another_reason_sends_nobody_elsewhere(rules, steps, l
     assert told[0].heading in told[-1].heading
 
 
-def test_an_accepted_page_says_that_the_robot_is_not_changed_yet(solved):
+def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubtful(solved):
+    """And that the robot is not changed yet."""
     problem, result = solved
     report = report_of(problem, result)
     assert result.accepted
+    assert report.verdict.heading == 'Accepted'
     assert 'unchanged so far' in report.verdict.text[-1]
     assert 'calib_ros compensate' in ' '.join(report.steps)
-
-
-def test_a_calibration_that_is_valid_somewhere_alone_is_accepted_there(solved):
-    problem, result = solved
     near = replace(result, region=replace(result.region, limit=1e-3, share=0.1))
     report = report_of(problem, near)
     assert report.verdict.heading == 'Accepted near the measured poses'
     assert report.steps[0].startswith('To use it beyond the measured poses')
-    assert report_of(problem, result).verdict.heading == 'Accepted'
-
-
-def test_a_doubt_about_an_accepted_result_stands_in_the_verdict(solved):
-    problem, result = solved
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
     verdict = report_of(problem, doubtful).verdict
     assert 'ur3' in verdict.text[1]
@@ -288,7 +279,7 @@ def test_a_refused_page_says_why_and_what_to_do():
         assert each.heading in page.text
         assert each.refusal in page.text
     assert 'none: not accepted' in page.text
-    assert 'map' not in figures_of(page)
+    assert 'map' not in page.data['figures']
 
 
 @pytest.mark.parametrize('sigma', [1e-4, 1e-5])
@@ -337,8 +328,9 @@ def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     good = ~poses.outlier
     assert sum(shown['cells']['count']) == good.sum()
     squares = np.square(shown['cells']['rms_after']) * shown['cells']['count']
-    rms = 1e3 * np.sqrt(np.mean(np.sum(poses.after[good] ** 2, axis=1)))
-    assert np.sqrt(squares.sum() / good.sum()) == pytest.approx(rms, rel=1e-3)
+    assert np.sqrt(squares.sum() / good.sum()) == pytest.approx(
+        rms_of(poses.after[good]), rel=1e-3
+    )
     low, middle, high = shown['bins']['joint2']['length']['after']
     known = [k for k, value in enumerate(middle) if value is not None]
     assert known
@@ -396,19 +388,12 @@ def test_the_arrays_of_a_page_are_the_poses(solved):
 
 def test_distances_and_outliers_have_pages():
     rows = measured(count=80)
+    far = np.linalg.norm(rows.positions - [1.0, 1.0, 0.5], axis=1)
+    wire = replace(rows.at(rows.stamps_ns + 7), distances=far, base='base_wire')
+    wire = replace(wire, oriented=np.zeros(80, bool))
     shifted = rows.positions.copy()
     shifted[7] += 0.02
-    plain = replace(rows, positions=shifted)
-    wire = Observations(
-        rows.stamps_ns + 7,
-        rows.joints,
-        rows.positions,
-        rows.rotations,
-        np.zeros(80, bool),
-        distances=np.linalg.norm(rows.positions - [1.0, 1.0, 0.5], axis=1),
-        base='base_wire',
-    )
-    problem = Problem(UR, plain, more=(wire,))
+    problem = Problem(UR, replace(rows, positions=shifted), more=(wire,))
     result = identify(problem)
     poses = poses_of(problem, result)
     assert len(poses) == 160

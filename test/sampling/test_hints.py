@@ -36,28 +36,42 @@ def heard(
     noise=0.0,
     hole=(0.0, 0.0),
     late=lambda times: 0.0,
+    early=lambda times: 0.0,
     shaken=(0.0, 0.0),
+    creep=0.0,
+    twice=None,
+    other=0.0,
+    precise=1.0,
     **more,
 ):
     """Return a session that has heard joint states at a rate, with noise, and poses at 50 Hz.
 
-    There are no joint states in the `hole` [s], poses are stamped `late` by a function of times
-    (N,) [s], and the target vibrates for half of each second while it is `shaken` [s]; `more` are
-    settings.
+    There are no joint states in the `hole` [s]; poses are stamped `late` and joint states `early`
+    by functions of times (N,) [s]. The target vibrates for half of each second while it is
+    `shaken` [s], and moves by `creep` [m/s] for the first second of each two. Joint states or
+    poses come `twice`, the second time off by `other`; poses are `precise` times as exact as
+    usual. `more` are settings.
     """
     rng = np.random.default_rng(3)
     times, measured = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.003, seconds - 0.3, 0.02)
     times = times[(times < hole[0]) | (times >= hole[1])]
+    if twice == 'joints':
+        times = np.repeat(times, 2)
+    elif twice == 'measurements':
+        measured = np.repeat(measured, 2)
     joints = motion(times)
     joints = joints + rng.normal(scale=noise, size=joints.shape)
-    seen = measure(TRUE, motion(measured), rng, 2e-5, 1e-4)
+    seen = measure(TRUE, motion(measured), rng, 2e-5 / precise, 1e-4 / precise)
     swing = 2e-3 * np.exp(-(measured % 1.0) / 0.08) * np.sin(50.0 * measured)
     swing *= (measured >= shaken[0]) & (measured < shaken[1])
+    swing += creep * np.minimum(measured % PERIOD, 1.0)
     positions = seen.positions + swing[:, np.newaxis]
-    measured = measured + late(measured)
+    if twice:
+        (joints if twice == 'joints' else positions)[1::2] += other
     made = CalibrationSession(UR5E, Settings(**more))
-    known = times, stamps(times), joints
-    hear(made, known, (measured, stamps(measured), positions, seen.rotations))
+    known = times, stamps(times - early(times)), joints
+    comes = measured + np.maximum(late(measured), 0.0)
+    hear(made, known, (comes, stamps(measured + late(measured)), positions, seen.rotations))
     return made
 
 
@@ -155,22 +169,6 @@ def test_clocks_too_far_apart_for_the_delay_to_be_found_are_told(seconds):
             made.identify()
 
 
-def with_a_step(step, of):
-    """Return a session in whose last 2 s of 40 the clock of something was moved by `step` [s]."""
-    motion = tour(25)
-    times, seen = np.arange(0.0, 40.0, 0.01), np.arange(0.003, 40.0, 0.02)
-    stamped = {'joints': times, 'measurements': seen}
-    stamped[of] = stamped[of] + np.where(stamped[of] > 38.0, step, 0.0)
-    found = measure(TRUE, motion(seen), np.random.default_rng(3), 2e-5, 1e-4)
-    made = CalibrationSession(UR5E)
-    hear(
-        made,
-        (times, stamps(stamped['joints']), motion(times)),
-        (seen, stamps(stamped['measurements']), found.positions, found.rotations),
-    )
-    return made
-
-
 @pytest.mark.parametrize(
     ('step', 'of', 'words'),
     [
@@ -179,33 +177,26 @@ def with_a_step(step, of):
         (-5.0, 'joints', '5 s after'),
         (-1e9, 'measurements', '1000000000 s before'),
         (-1e9, 'joints', '1000000000 s after'),
+        (0.0, 'joints', ''),
     ],
 )
 def test_a_clock_that_goes_far_astray_is_told_at_once(step, of, words):
-    """However many measurements were matched before it, and by how much it was moved."""
-    (warning,) = told(with_a_step(step, of))
-    assert (
-        f'measurement is stamped {words} the newest joint state: synchronise the clocks' in warning
-    )
+    """In the last 2 s of 40, however many measurements were matched before, and by how much."""
 
+    def moved(times):
+        return np.where(times > 38.0, step, 0.0)
 
-def test_a_clock_that_is_not_moved_is_not_told_of():
-    assert told(with_a_step(0.0, 'joints')) == ()
+    clocks = {'late': moved} if of == 'measurements' else {'early': lambda t: -moved(t)}
+    warnings = told(heard(tour(25), 40.0, **clocks))
+    assert len(warnings) == bool(words)
+    said = f'measurement is stamped {words} the newest joint state: synchronise the clocks'
+    assert all(said in each for each in warnings)
 
 
 @pytest.mark.parametrize(('speed', 'stops_taken'), [(0.0, 15), (0.02, 0)])
 def test_stops_at_which_the_target_still_moves_are_told(speed, stops_taken):
     """A device that smooths, an arm that creeps: the operator stood there for nothing."""
-    motion, rng = tour(15), np.random.default_rng(3)
-    times, seen = np.arange(0.0, 29.5, 0.01), np.arange(0.003, 29.2, 0.02)
-    found = measure(TRUE, motion(seen), rng, 2e-5, 1e-4)
-    positions = found.positions + speed * np.minimum(seen % PERIOD, 1.0)[:, np.newaxis]
-    made = CalibrationSession(UR5E)
-    hear(
-        made,
-        (times, stamps(times), motion(times)),
-        (seen, stamps(seen), positions, found.rotations),
-    )
+    made = heard(tour(15), 29.5, creep=speed)
     made.finish()
     assert len(made.samples) == stops_taken
     warnings = told(made)
@@ -231,16 +222,7 @@ def test_much_that_is_dropped_is_told_and_why(share, count):
 def test_two_publishers_are_told_rather_than_what_comes_of_them():
     """Zeros with the stamps of the true joint values: some stops seem to move."""
     motion = tour(25)
-    times, seen = np.repeat(np.arange(0.0, 49.5, 0.01), 2), np.arange(0.003, 49.2, 0.02)
-    found = measure(TRUE, motion(seen), np.random.default_rng(3), 2e-5, 1e-4)
-    joints = motion(times)
-    joints[1::2] = 0.0
-    made = CalibrationSession(UR5E)
-    hear(
-        made,
-        (times, stamps(times), joints),
-        (seen, stamps(seen), found.positions, found.rotations),
-    )
+    made = heard(motion, 49.5, twice='joints', other=-motion(np.arange(0.0, 49.5, 0.01)))
     made.finish()
     assert made.account().dropped['measurements: a stop with more spread than noise'] > 100
     (warning,) = told(made)
@@ -257,18 +239,7 @@ def test_two_publishers_are_told_rather_than_what_comes_of_them():
     ],
 )
 def test_other_values_with_the_same_stamp_are_told(of, other, count):
-    motion = tour(15)
-    times, seen = np.arange(0.0, 29.5, 0.01), np.arange(0.003, 29.2, 0.02)
-    if of == 'joints':
-        times = np.repeat(times, 2)
-    else:
-        seen = np.repeat(seen, 2)
-    found = measure(TRUE, motion(seen), np.random.default_rng(3), 0.0, 0.0)
-    joints, positions = motion(times), found.positions.copy()
-    (joints if of == 'joints' else positions)[1::2] += other
-    rotations = found.rotations
-    made = CalibrationSession(UR5E)
-    hear(made, (times, stamps(times), joints), (seen, stamps(seen), positions, rotations))
+    made = heard(tour(15), 29.5, twice=of, other=other, precise=1e9)
     made.finish()
     warnings = told(made)
     assert len(warnings) == count

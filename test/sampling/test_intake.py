@@ -118,18 +118,6 @@ def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     assert one.samples
 
 
-def test_of_new_streams_the_one_that_comes_first_has_the_place(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 1)
-    quat = [0.0, 0.0, 0.0, 1.0]
-    messages = [pose(START, [np.nan, 0.0, 0.0], quat)]
-    for k in range(1, 5):
-        messages += [point(START + k, np.zeros(3)), pose(START + k, np.zeros(3), quat)]
-    session = CalibrationSession(ARM)
-    assert feed(session, messages, TYPESTORE.deserialize_cdr) == []
-    assert session.account().waiting == 4
-    assert [key.device for key in session._collector.waiting] == ['camera']
-
-
 def test_a_damaged_message_is_told_and_the_others_are_taken():
     stamps = [START + k * 10_000_000 for k in range(20)]
     messages = [joints(JOINTS, stamp, ARM.joint_names, np.zeros(6)) for stamp in stamps]
@@ -163,17 +151,20 @@ def test_numbers_that_stand_for_nothing_are_dropped(value, together):
 
 
 def test_streams_of_the_same_joints_share_a_buffer():
-    """Two drivers name the joints in another order: their samples are kept together."""
-    order = list(reversed(ARM.joint_names))
+    """Two drivers name the joints in another order: of equal stamps one sample is kept."""
+    row = np.arange(6.0)
     messages = [
-        joints(stream, START + k * 1_000_000, names, np.zeros(6))
-        for k in range(200)
-        for stream, names in ((JOINTS, ARM.joint_names), (GRIPPER, order))
+        joints(stream, START + k * 1_000_000, ARM.joint_names[::way], row[::way])
+        for k in range(60)
+        for stream, way in ((JOINTS, 1), (GRIPPER, -1))
     ]
     session = CalibrationSession(ARM, Settings(joint_buffer=150))
     assert feed(session, messages[:2], TYPESTORE.deserialize_cdr) == []
     assert feed(session, messages[2:], TYPESTORE.deserialize_cdr) == []
-    assert session.received['joints'] == 400
+    session.status()
+    assert session.received['joints'] == 120
+    assert session.account().dropped == {'joints: same stamp twice': 60}
+    np.testing.assert_array_equal(session.latest[1], row)
 
 
 def test_an_error_in_a_batch_costs_no_other_message():

@@ -47,17 +47,6 @@ def test_at_the_end_it_is_the_batch(oriented, seed):
     assert live.suspicious == []
 
 
-def test_what_it_expects_is_what_comes(rng):
-    """The error against the truth, over runs, is that of the standard deviation it gives."""
-    ratios = []
-    for _ in range(10):
-        true = faulty(UR10E, Cell(), rng)
-        samples, live = seen(true, 50, rng), LiveEstimate(session().problem_of)
-        said = [live.update(samples[:count]) for count in (25, 50)]
-        ratios += [apart(each.chain, true, rng) / each.sigma for each in said]
-    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.3)
-
-
 def test_it_begins_early_and_only_gets_better(rng):
     _, said = growing(seen(faulty(UR10E, Cell(), rng), 60, rng))
     assert said[: START - 1] == [None] * (START - 1)

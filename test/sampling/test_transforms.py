@@ -12,9 +12,9 @@ from recorded import (
     TYPES,
     TYPESTORE,
     joint_state,
-    pose_stamped,
     record,
     session_of,
+    stamp_ns,
     standing,
     storages,
     transform_stamped,
@@ -43,11 +43,6 @@ def link(parent, child, stamp_ns=0, matrix=None):
     message = transform_stamped(stamp_ns, matrix[:3, 3].tolist(), quat.tolist(), child)
     message.header.frame_id = parent
     return message
-
-
-def stamp_ns(message):
-    stamp = getattr(message, 'transforms', [message])[0].header.stamp
-    return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 def frame(rng):
@@ -94,24 +89,11 @@ def test_a_link_between_two_frames_is_a_measurement(tmp_path, rng, storage, with
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
     (sample, *_) = session.samples
     assert (sample.frame_id, sample.target) == ('world', 'tool')
+    assert [each.stamp_ns for each in session.samples] == [ms * MS for ms in TIMES]
+    joints = session.problem().observations.joints
+    np.testing.assert_allclose(joints, [[0.1, 0.2, 0.3]] * len(TIMES), atol=1e-15)
     assert session.account().poses == len(TIMES)
     assert session.account().dropped == session.account().unused == {}
-
-
-def test_a_link_is_worth_a_pose_of_its_own_to_the_last_digit(tmp_path, rng):
-    matrices = [frame(rng) for _ in TIMES]
-    poses = [
-        pose_stamped(ms * MS, t[:3, 3].tolist(), se3.to_quat(t[:3, :3]).tolist(), 'world')
-        for ms, t in zip(TIMES, matrices, strict=True)
-    ]
-    plain, _ = session_of(record(tmp_path / 'plain', standing(poses)))
-    moving = [tf(link('world', 'tool', ms * MS, t)) for ms, t in zip(TIMES, matrices, strict=True)]
-    _, session = poses_of(record(tmp_path / 'bag', events(rng, moving)))
-    for name in ('stamps_ns', 'joints', 'positions', 'rotations'):
-        np.testing.assert_array_equal(
-            getattr(session.problem().observations, name),
-            getattr(plain.problem().observations, name),
-        )
 
 
 CHAINS = {

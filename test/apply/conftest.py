@@ -1,0 +1,18 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import pytest
+
+
+@pytest.fixture(scope='session')
+def cell():
+    """Return a true arm, its identification and what was fitted."""
+    from verified import cell
+
+    return cell()
+
+
+@pytest.fixture(scope='session')
+def arm(cell):
+    from calib_ros.identification.calibration import Calibration
+
+    return Calibration.of(cell[1], fitted=[cell[2]])

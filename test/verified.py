@@ -1,0 +1,26 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A UR10e, calibrated, and measurements by which it is verified."""
+
+import numpy as np
+
+from calib_ros.apply import simulation
+from calib_ros.identification.identification import identify
+from calib_ros.identification.problem import Problem
+from calib_ros.kinematics.chain_file import load_chain
+
+UR = load_chain('ur10e')
+NOISE = (5e-5, 2e-4)
+
+
+def cell():
+    """Return a true arm, its identification and what was fitted."""
+    rng = np.random.default_rng(0)
+    true = simulation.faulty(UR, simulation.Cell(), rng)
+    seen = simulation.measure(true, UR.random_joints(40, rng), rng, *NOISE)
+    return true, identify(Problem(UR, seen)), seen
+
+
+def measured(true, joints, repeats=3, noise=NOISE, seed=1):
+    rng = np.random.default_rng(seed)
+    return simulation.measure(true, np.repeat(joints, repeats, axis=0), rng, *noise)
