@@ -143,15 +143,15 @@ class Calibration(Shown):
 
         With a region it is the expected error, unmodelled effects included.
         """
-        if self.region is not None:
-            return self.region.sigma(joints)
-        return self._sigma(joints, slice(3))
+        return self._sigma(joints, np.s_[:3])
 
     def sigma_turned(self, joints: FloatArray) -> FloatArray:
-        """Return the standard deviation (N,) [rad] of orientations; NaN if unknown."""
-        return self._sigma(joints, slice(3, 6))
+        """Return the same (N,) [rad] of orientations."""
+        return self._sigma(joints, np.s_[3:])
 
     def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
+        if self.region is not None:
+            return self.region.sigma(joints, components)
         if self.covariance is None:
             return np.full(len(joints), np.nan)
         return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
