@@ -102,8 +102,9 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
             screen.warn(warning)
         new = ('base',) * options.new_base + ('tool',) * options.new_tool
         years, growth = years_since(previous.record), 1e-3 * options.growth
+        problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
-            found = recalibrate(previous, loaded.problem, years, growth, new)
+            found = recalibrate(previous, problem, years, growth, new)
         text = dump_json(found.document()) + '\n'
         contents['result.json'] = text
         if found.accepted:
@@ -354,7 +355,9 @@ def result_files(
         contents['report.md'] = markdown(report, loaded.samples)
         contents |= given.page_of(report, screen, pdf=pdf)
     if result.accepted:
-        kept = Calibration.of(result, owners=loaded.owners, fitted=loaded.problem.sets)
+        # the only device and target of a table may be any of a bag or node
+        owners = loaded.owners if loaded.read or len(loaded.owners) > 2 else {}
+        kept = Calibration.of(result, owners=owners, fitted=loaded.problem.sets)
         contents['calibration.yaml'] = kept.dump()
         return contents
     return contents | _set_aside(out)

@@ -182,6 +182,22 @@ class Calibration(Shown):
         """Return the share of measurements to which it was fitted, as far as known."""
         return 0.0 if self.rows is None else self.rows.share(sets)
 
+    def frames_of(self, owners: Mapping[str, records.Owner]) -> dict[str, str]:
+        """Return which of its frames those of new measurements are, by their names.
+
+        They are of the same session, device or target; else of that in another session; else those
+        that have the names, unless these are of others.
+        """
+        same = {(name[:4], *owner): name for name, owner in self.owners.items()}
+        other = {(side, *what): n for (side, _, *what), n in reversed(same.items()) if what[-1]}
+        keys = {name: (name[:4], *owner) for name, owner in owners.items()}
+        found = {name: same[key] for name, key in keys.items() if key in same}
+        for name in [name for name in owners if name not in found]:
+            _, *what = owners[name]
+            now = other.get((name[:4], *what), name)
+            found[name] = f'{name} ({what[-1]})' if now in found.values() else now
+        return found
+
     def commanded_by(self, model: Model) -> Chain:
         """Return the chain by which a model turns poses into joint values."""
         return self.chain if model == 'corrected' else self.before
