@@ -35,9 +35,13 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the lines of a table of the poses [mm]; none without poses."""
+    """Return the lines of a table of the poses [mm]; none without poses.
+
+    They are those of ISO 9283 only where the program tells what was wanted.
+    """
     again = any(pose.repeatability is not None for pose in found.each)
-    lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
+    what = 'repeatability' if found.by_program else 'scatter'
+    lines = ['  pose   measured   before    after' + again * f'   {what} (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
         line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
         lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
