@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import LAYOUT, Contents, sessions_of, settings_of
+from calib_ros.cli.options import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files import loading
@@ -77,10 +77,19 @@ def filing_of(
     """Return what is filed with a result."""
     settings = settings_hash(nominal, settings_of(options), *judged_by)
     changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
-    content = content_hash(
-        [each.sha256 for each in page.input_of(measured)], options.session or ''
-    )
+    content = content_hash(_read(options, measured), options.session or '')
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
+
+
+def _read(options: argparse.Namespace, measured: Path) -> list[str]:
+    """Return hashes of all that was read, and how: the same table in other units is another."""
+    found = [each.sha256 for each in page.input_of(measured)]
+    for name in (*OF_TABLES[1:], 'joints_preset', 'commanded'):  # a session is told apart anyway
+        value = getattr(options, name, None)
+        if isinstance(value, Path):
+            value = [each.sha256 for each in page.input_of(value)]
+        found += [f'{name} {value}'] if value else []
+    return found
 
 
 def origin_of(

@@ -50,10 +50,6 @@ RESULT_FILES = (
     *('calibration.yaml', 'result.json', 'report.html', 'report.md', 'residuals.csv'),
     *('before_after.png', 'settings.yaml'),
 )
-OF_TABLES = (
-    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *common.LAYOUT),
-    *('detections', 'board', 'places', 'intrinsics', 'lens'),
-)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 
 
@@ -185,7 +181,7 @@ def _source(options: argparse.Namespace) -> str:
         raise InputError(
             'give a bag, or a table, or --detections FILE; a table and --detections go together'
         )
-    for name in OF_BAGS if source == 'table' else OF_TABLES:
+    for name in OF_BAGS if source == 'table' else common.OF_TABLES:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} does not apply to a {source}')
     return source
