@@ -87,4 +87,9 @@ def hints(found: Verification) -> list[str]:
             f'{100.0 * found.common:.0f} % of the error would remain: was the measuring device '
             'moved? If on purpose, --new-base fits its frame, and --new-tool that of a new target'
         )
+    elif 1e-3 * found.comparison.figures[1].rms_mm > Settings.largest_error:
+        lines.append(
+            'no arm is so far off: check units and columns of the measurements (--length, '
+            '--joint-angle, --columns), their rows, the robot, and the target (--new-tool)'
+        )
     return lines

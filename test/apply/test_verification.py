@@ -236,6 +236,13 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
         assert ('AP after [mm]' in str(_by_configuration(each))) is each.by_program
 
 
+@pytest.mark.parametrize(('scale', 'told'), [(1.0, False), (1e3, True)])
+def test_what_no_arm_can_be_off_is_of_other_units(cell, arm, program, scale, told):
+    seen = measured(cell[0], program)
+    text = in_words(verify(arm, [replace(seen, positions=scale * seen.positions)], 1e-3))
+    assert ('check units and columns of the measurements (--length' in text) is told
+
+
 def test_repeats_do_not_count_as_more_configurations(arm):
     errors = np.random.default_rng(0).normal(scale=1e-4, size=(6, 3))
     once = with_errors(arm, errors)
