@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.options import LAYOUT, Contents, sessions_of, settings_of
+from calib_ros.cli.options import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files import loading
@@ -101,10 +101,20 @@ def filing_of(
     settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.path
     content, changed = samples_hash(sets), None
     if unread.files and unread == Unread.of(measured):
-        hashed = [each.sha256 for each in page.input_of(measured)]
-        content = content_hash(hashed, options.session or '')
+        content = content_hash(_read(options, measured), options.session or '')
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
+
+
+def _read(options: argparse.Namespace, measured: Path) -> list[str]:
+    """Return hashes of all that was read, and how: the same table in other units is another."""
+    found = [each.sha256 for each in page.input_of(measured)]
+    for name in (*OF_TABLES[1:], 'joints_preset', 'commanded'):  # a session is told apart anyway
+        value = getattr(options, name, None)
+        if isinstance(value, Path):
+            value = [each.sha256 for each in page.input_of(value)]
+        found += [f'{name} {value}'] if value else []
+    return found
 
 
 def origin_of(

@@ -51,10 +51,6 @@ RESULT_FILES = (
     *('calibration.yaml', 'result.json', 'report.html', 'report.md', 'residuals.csv'),
     *('before_after.png', 'settings.yaml'),
 )
-OF_TABLES = (
-    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *common.LAYOUT),
-    *('detections', 'board', 'places', 'intrinsics', 'lens'),
-)
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 
 
@@ -102,8 +98,9 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
             screen.warn(warning)
         new = ('base',) * options.new_base + ('tool',) * options.new_tool
         years, growth = years_since(previous.record), 1e-3 * options.growth
+        problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
-            found = recalibrate(previous, loaded.problem, years, growth, new)
+            found = recalibrate(previous, problem, years, growth, new)
         text = dump_json(found.document()) + '\n'
         contents['result.json'] = text
         if found.accepted:
@@ -182,7 +179,7 @@ def _source(options: argparse.Namespace) -> str:
         raise InputError(
             'give a bag, or a table, or --detections FILE; a table and --detections go together'
         )
-    for name in OF_BAGS if source == 'table' else OF_TABLES:
+    for name in OF_BAGS if source == 'table' else common.OF_TABLES:
         if getattr(options, name):
             raise InputError(f'--{name.replace("_", "-")} does not apply to a {source}')
     return source
@@ -352,7 +349,9 @@ def result_files(
         contents['report.md'] = markdown(report, loaded.samples)
         contents |= given.page_of(report, screen, pdf=pdf)
     if result.accepted:
-        kept = Calibration.of(result, owners=loaded.owners, fitted=loaded.problem.sets)
+        # the only device and target of a table may be any of a bag or node
+        owners = loaded.owners if loaded.read or len(loaded.owners) > 2 else {}
+        kept = Calibration.of(result, owners=owners, fitted=loaded.problem.sets)
         contents['calibration.yaml'] = kept.dump()
         return contents
     return contents | _set_aside(out)

@@ -47,6 +47,10 @@ LAYOUT = (
     *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
 )
 """Options of foreign tables."""
+OF_TABLES = (
+    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *LAYOUT),
+    *('detections', 'board', 'places', 'intrinsics', 'lens'),
+)
 
 
 class Status(IntEnum):

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import given, options as common
@@ -14,15 +14,16 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.history import verified
 from calib_ros.files.programs import read_joints
-from calib_ros.identification.calibration import calibration_file
+from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.applied import STANDINGS, verification_report
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, in_words, remarks
-from calib_ros.sampling.sample import collect
+from calib_ros.sampling.sample import Frames, collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
 
@@ -39,7 +40,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     filed = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
-    sets, warnings, by_line = _sets(options, nominal, screen)
+    sets, warnings, by_line = _sets(options, nominal, arm, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
     confidence, moved = options.confidence, (options.new_base, options.new_tool)
@@ -98,17 +99,27 @@ def show(found: Verification, screen: Screen) -> None:
 
 
 def _sets(
-    options: argparse.Namespace, nominal: Chain, screen: Screen
+    options: argparse.Namespace, nominal: Chain, arm: Calibration, screen: Screen
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
     settings = common.settings_of(options)
     if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)
-        return (*found.fitted, *found.held_out), found.warnings, found.by_line
+        sets, owners = (*found.fitted, *found.held_out), found.owners
+        return _between(arm, sets, owners), found.warnings, found.by_line
 
     session, read = given.replayed(options.measured, nominal, settings, screen)
     screen.say(f'{read}; {session.account()}')
     sigmas = (settings.sigma_position, settings.sigma_orientation)
-    fitted, held_out = collect(session.usable, sigmas)
+    frames = Frames()
+    fitted, held_out = collect(session.usable, sigmas, frames)
     if not (fitted or held_out):
         raise InputError(f'{options.measured} gives no poses: {session.account()}')
-    return (*fitted, *held_out), read.warnings, False
+    return _between(arm, (*fitted, *held_out), frames.owners), read.warnings, False
+
+
+def _between(
+    arm: Calibration, sets: Sequence[Observations], owners: Mapping[str, Owner]
+) -> Sequence[Observations]:
+    """Return sets between the calibration's frames of their devices and targets."""
+    names = arm.frames_of(owners)
+    return [each.between(names) for each in sets]

@@ -119,6 +119,7 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
     """Return columns; refuse those without rows or needed columns."""
     missing = [name for name in needed if name not in found.header]
     if missing:
+        refuse_separator(found.path, found.header)
         raise InputError(
             f'{found.path} has no column {", ".join(missing)}; expected {", ".join(needed)}; '
             f'found {", ".join(found.header) or "nothing"}'

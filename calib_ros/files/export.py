@@ -101,6 +101,7 @@ def exports(
     ):
         best = _approximated(chain, nominal, kinds, region)
         error = _distance(best.forward(region), chain.forward(region))
+        what += ', with the effects of the nominal chain' * bool(nominal.effects)
         text = _csv(best, f'{nominal.convention} {what}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
@@ -266,12 +267,12 @@ def _distance(first: FloatArray, second: FloatArray) -> float:
 def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: FloatArray) -> Chain:
     """Return the nominal chain with some kinds of parameters fitted to another one.
 
-    `zero` stands for the joints' offsets. Base and tool are those of the other chain, since no row
-    holds them, and d of nearly parallel axes stays: without beta it would carry a tilt as a common
-    normal metres away.
+    `zero` stands for the joints' offsets. The controller's effects are those of the nominal
+    chain. Base and tool are those of the other one, since no row holds them, and d of nearly
+    parallel axes stays: without beta it would carry a tilt as a common normal metres away.
     """
     base, tool = chain.frame('base'), chain.frame('tool')
-    start = replace(nominal, parallel=(), base=base, tool=tool, frames=(), effects=())
+    start = replace(nominal, parallel=(), base=base, tool=tool, frames=())
     if 'zero' in kinds:
         names = {joint.driven for joint in start.joints}
     else:

@@ -42,7 +42,21 @@ class Loaded:
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
     refusals: tuple[Reason, ...] = ()  # reasons not to accept any result
     instead: bool = False  # the refusals replace those of the result
-    owners: Mapping[str, Owner] = field(default_factory=dict)  # of the frames, from a bag
+    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is
+
+    def between(self, names: Mapping[str, str]) -> Problem:
+        """Return the problem with renamed frames."""
+        problem = self.problem
+        first, *more = (each.between(names) for each in problem.sets)
+        return replace(
+            problem,
+            observations=first,
+            more=more,
+            held_out=[each.between(names) for each in problem.judging],
+            separations=[
+                (names.get(a, a), names.get(b, b), apart) for a, b, apart in problem.separations
+            ],
+        )
 
     def identified(self, model: str, progress: Notify = quiet) -> Identification:
         """Identify, and refuse the result if too much of the input is lost."""
@@ -103,4 +117,5 @@ def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> 
     problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))
     samples = {'samples': fitted, 'held_out': held_out, 'sets': len(found.fitted)}
-    return Loaded(problem, samples, found.warnings, lines=found.by_line)
+    by_line, owners = found.by_line, found.owners
+    return Loaded(problem, samples, found.warnings, lines=by_line, owners=owners)

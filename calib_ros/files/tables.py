@@ -12,8 +12,8 @@ corner, joined by semicolons.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ from calib_ros.files.measurements import (
     measurements,
 )
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.records import Owner
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
@@ -56,6 +57,7 @@ class Table(Measured):
 
     warnings: tuple[str, ...] = ()
     by_line: bool = False
+    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is
 
 
 def read_table(
@@ -164,7 +166,8 @@ def _table(
     pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
     place, names = made.frame_id
     world_frame = next((names[k] for k in place.tolist() if names[k]), '')
-    return Table(fitted, held_out, pairs, world_frame, cameras, warnings, by_line)
+    more = warnings, by_line, frames.owners
+    return Table(fitted, held_out, pairs, world_frame, cameras, *more)
 
 
 def check_table(made: MadeColumns) -> None:

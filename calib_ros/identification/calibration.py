@@ -142,15 +142,15 @@ class Calibration(Shown):
 
         With a region it is the expected error, unmodelled effects included.
         """
-        if self.region is not None:
-            return self.region.sigma(joints)
-        return self._sigma(joints, slice(3))
+        return self._sigma(joints, np.s_[:3])
 
     def sigma_turned(self, joints: FloatArray) -> FloatArray:
-        """Return the standard deviation (N,) [rad] of orientations; NaN if unknown."""
-        return self._sigma(joints, slice(3, 6))
+        """Return the same (N,) [rad] of orientations."""
+        return self._sigma(joints, np.s_[3:])
 
     def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
+        if self.region is not None:
+            return self.region.sigma(joints, components)
         if self.covariance is None:
             return np.full(len(joints), np.nan)
         return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
@@ -180,6 +180,22 @@ class Calibration(Shown):
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that this calibration was fitted to, if known."""
         return 0.0 if self.rows is None else self.rows.share(sets)
+
+    def frames_of(self, owners: Mapping[str, records.Owner]) -> dict[str, str]:
+        """Return which of its frames those of new measurements are, by their names.
+
+        They are of the same session, device or target; else of that in another session; else those
+        that have the names, unless these are of others.
+        """
+        same = {(name[:4], *owner): name for name, owner in self.owners.items()}
+        other = {(side, *what): n for (side, _, *what), n in reversed(same.items()) if what[-1]}
+        keys = {name: (name[:4], *owner) for name, owner in owners.items()}
+        found = {name: same[key] for name, key in keys.items() if key in same}
+        for name in [name for name in owners if name not in found]:
+            _, *what = owners[name]
+            now = other.get((name[:4], *what), name)
+            found[name] = f'{name} ({what[-1]})' if now in found.values() else now
+        return found
 
     def commanded_by(self, model: Model) -> Chain:
         """Return the chain that converts poses to joint values for a model."""

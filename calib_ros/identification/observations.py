@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -264,6 +264,11 @@ class Observations(Shown):
     def moving(self) -> bool:
         """Tell whether the arm moved while it was measured, so that a delay matters."""
         return self.velocity is not None and bool(self.velocity.any())
+
+    def between(self, names: Mapping[str, str]) -> Observations:
+        """Return them between the frames that have these names now."""
+        base, tool = (names.get(name, name) for name in (self.base, self.tool))
+        return replace(self, base=base, tool=tool)
 
     @property
     def camera(self) -> str:

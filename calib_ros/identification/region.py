@@ -63,10 +63,13 @@ class Region(Shown):
     tool: str = 'tool'
     by_scale: float = 0.0
 
-    def sigma(self, joints: FloatArray) -> FloatArray:
-        """Return the expected error (N,) [m] of positions predicted at joint values (N, n)."""
+    def sigma(self, joints: FloatArray, components: slice = np.s_[:3]) -> FloatArray:
+        """Return the expected error (N,) [m] of positions predicted at joint values (N, n).
+
+        Of orientations [rad] by other `components` of the pose.
+        """
         model = ErrorModel(self.chain, self.names, self.base, self.tool)
-        return sigma_of(model, self.square, joints)
+        return sigma_of(model, self.square, joints, components)
 
     def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""

@@ -255,15 +255,20 @@ def verification_report(
 
 
 def _by_configuration(found: Verification) -> Section:
+    """Return the figures of the standard, or of errors at the joint values that were reported."""
+    title, names = 'Pose by pose (ISO 9283)', ('AP before [mm]', 'AP after [mm]', 'RP [mm]')
+    text = 'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma.'
+    if not found.by_program:
+        title, names = 'Pose by pose', ('before [mm]', 'after [mm]', 'scatter [mm]')
+        text = (
+            'Errors at the joint values reported: of the mean over all cycles, and their scatter, '
+            'mean + 3 sigma. AP and RP of ISO 9283 need the program (--commanded).'
+        )
     return section(
         'configurations',
-        'Pose by pose (ISO 9283)',
-        'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma.',
-        ''
-        if found.by_program
-        else 'Both are relative to the joint values reported: how well the controller reaches the '
-        'commanded ones does not show (--commanded).',
-        head=('pose', 'cycles', 'AP before [mm]', 'AP after [mm]', 'RP [mm]'),
+        title,
+        text,
+        head=('pose', 'cycles', *names),
         rows=tuple(
             (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in values))
             for k, (cycles, *values) in enumerate(map(astuple, found.each), 1)

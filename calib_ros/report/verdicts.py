@@ -36,9 +36,10 @@ def in_words(found: Verification) -> str:
 
 
 def each_in_words(found: Verification) -> list[str]:
-    """Return the table lines of the poses [mm]."""
+    """Return the table lines of the poses [mm]; of ISO 9283 only if the program is known."""
     again = any(pose.repeatability is not None for pose in found.each)
-    lines = ['  pose   measured   before    after' + again * '   repeatability (mean + 3 sigma)']
+    what = 'repeatability' if found.by_program else 'scatter'
+    lines = ['  pose   measured   before    after' + again * f'   {what} (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
         line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
         lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
@@ -83,5 +84,10 @@ def hints(found: Verification) -> list[str]:
             'without one common shift and turn of all positions, only '
             f'{100.0 * found.common:.0f} % of the error would remain: was the measuring device '
             'moved? If on purpose, --new-base fits its frame, and --new-tool that of a new target'
+        )
+    elif 1e-3 * found.comparison.figures[1].rms_mm > Settings.largest_error:
+        lines.append(
+            'no arm is so far off: check units and columns of the measurements (--length, '
+            '--joint-angle, --columns), their rows, the robot, and the target (--new-tool)'
         )
     return lines

@@ -120,6 +120,13 @@ def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
     np.testing.assert_allclose(corrected, expected, rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize(('mark', 'name'), [(';', 'semicolon'), ('\t', 'tab')])
+def test_cells_separated_otherwise_are_named(run, mark, name):
+    status, _, err = run(TABLE.replace(',', mark))
+    assert status == 1
+    assert f'are separated by {name}s: save it with commas' in err
+
+
 def test_columns_may_have_the_names_of_the_joints(run, tmp_path):
     """In any order, as drivers write them."""
     assert run(TABLE)[0] == 0

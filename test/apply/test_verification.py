@@ -18,6 +18,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.validation import Residuals
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
+from calib_ros.report.applied import _by_configuration
 from calib_ros.report.verdicts import in_words
 
 _UNIT = ['(mean', '+', '3', 'sigma)']
@@ -142,7 +143,7 @@ def test_pass_fail_and_undecided(cell, arm, program):
     errors = 1e3 * near.comparison.after.position[near.group == 2]
     assert near.each[2].after == pytest.approx(np.linalg.norm(errors.mean(axis=0)))
     heads = [line.split() for line in text.splitlines()]
-    table = heads[heads.index(['pose', 'measured', 'before', 'after', 'repeatability', *_UNIT]) :]
+    table = heads[heads.index(['pose', 'measured', 'before', 'after', 'scatter', *_UNIT]) :]
     for k, (pose, row) in enumerate(zip(near.each, table[1:6], strict=True), 1):
         figures = (pose.before, pose.after, pose.repeatability)
         assert row == [str(k), '3', *(f'{each:.4f}' for each in figures)]
@@ -191,6 +192,30 @@ def test_repeatability_is_that_of_the_standard():
     assert everything.mean_mm == pytest.approx(lengths.mean())
     spread = lengths.std(ddof=1)  # as of the repeatability
     assert everything.mean_plus_3_sigma_mm == pytest.approx(lengths.mean() + 3.0 * spread)
+
+
+def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program):
+    """Joint values that report how the arm comes back leave only the noise of the errors."""
+    rng = np.random.default_rng(0)
+    moved = np.repeat(compensate(Compensator(UR, arm.chain), program).joints, 10, axis=0)
+    moved += rng.normal(scale=2e-4, size=moved.shape)
+    seen = simulation.measure(cell[0], moved, rng, 1e-5, 1e-4)
+    found, alone = (verify(arm, [seen], 1.0, commanded=each) for each in (program, None))
+    for k, (pose, other) in enumerate(zip(found.each, alone.each, strict=True)):
+        places = seen.positions[found.group == k]
+        apart = np.linalg.norm(places - places.mean(axis=0), axis=1)
+        assert pose.repeatability == pytest.approx(1e3 * (apart.mean() + 3.0 * apart.std(ddof=1)))
+        assert other.repeatability < 0.3 * pose.repeatability
+    for each, word in ((found, 'repeatability'), (alone, 'scatter')):
+        assert f'after   {word} (mean + 3 sigma)' in in_words(each)
+        assert ('AP after [mm]' in str(_by_configuration(each))) is each.by_program
+
+
+@pytest.mark.parametrize(('scale', 'told'), [(1.0, False), (1e3, True)])
+def test_what_no_arm_can_be_off_is_of_other_units(cell, arm, program, scale, told):
+    seen = measured(cell[0], program)
+    text = in_words(verify(arm, [replace(seen, positions=scale * seen.positions)], 1e-3))
+    assert ('check units and columns of the measurements (--length' in text) is told
 
 
 def test_repeats_do_not_count_as_more_configurations(arm):

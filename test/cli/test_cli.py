@@ -7,13 +7,14 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 import yaml
 from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 
+from calib_ros.apply.simulation import random_frame
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
 from calib_ros.cli.options import SETTINGS, Status
@@ -257,3 +258,47 @@ def test_tab_completes_options_and_robots(tmp_path):
 def test_every_setting_is_in_a_group():
     grouped = [name for names in SETTINGS.values() for name in names]
     assert sorted(grouped) == sorted(item.name for item in fields(Settings))
+
+
+def seen_by(ends, count, seed):
+    """Return rows of a table of the arm, some for each (device, target), wherever these are."""
+    rows = []
+    for device, target in ends:
+        rng = np.random.default_rng([len(device), len(target)])
+        frames = {'base': random_frame(rng, 2.0), 'tool': random_frame(rng, 0.1)}
+        true = replace(TRUE, **frames)
+        made = rows_of(measured(true, count, seed), held_out=0)
+        rows += [row | {'device': device, 'target': target} for row in made]
+    return rows
+
+
+@pytest.fixture(scope='module')
+def of_two(tmp_path_factory):
+    """Return the folder of a calibration by two devices with a target each."""
+    folder = tmp_path_factory.mktemp('of_two')
+    table = write_csv(folder / 'first.csv', seen_by((LEICA, VICON), 20, 1))
+    given = ['identify', str(table), '--chain', 'ur5e', '--out', str(folder / 'result')]
+    assert main(given) == 0
+    return folder / 'result'
+
+
+LEICA, VICON = ('leica', 'ball'), ('vicon_2', 'cube')
+
+
+@pytest.mark.parametrize('ends', [(LEICA,), (VICON,), (VICON, LEICA)])
+def test_what_each_device_measures_again_is_judged_in_its_own_frame(of_two, run, tmp_path, ends):
+    """In whatever order, and without the others: the second was judged in the first one's."""
+    write_csv(tmp_path / 'new.csv', seen_by(ends, 10, 2))
+    judged = ['new.csv', '--chain', 'ur5e']
+    status, out, _ = run('verify', *judged, '--calibration', of_two, '--tolerance', '0.3')
+    assert (status, out[:6]) == (0, 'PASS: ')
+    status, out, _ = run('identify', *judged, '--previous', of_two)
+    assert (status, out[:8]) == (0, 'accepted')
+
+
+def test_a_device_that_a_calibration_does_not_know_has_no_frame_of_another(of_two, run, tmp_path):
+    write_csv(tmp_path / 'new.csv', seen_by((('optitrack', 'ball'), LEICA), 10, 2))
+    judged = ['new.csv', '--chain', 'ur5e', '--calibration', of_two]
+    status, _, err = run('verify', *judged, '--new-base')
+    assert status == 1
+    assert 'not base (optitrack) and tool: measure with the same device and target' in err

@@ -83,6 +83,21 @@ def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
     assert len(History('history').rows('A')) == 4
 
 
+def test_the_same_table_read_or_judged_in_another_way_is_another_result(folder):
+    """A wrong unit stayed on file, and a correction that does not arrive was never filed."""
+    plants.write_plant(folder, ['0042'], 2)
+    common = ['--chain', 'ur10e', '--history', 'history', '--serial', '0042']
+    table = 'nights/0042/001.csv'
+    assert main(['identify', 'nights/0042/000.csv', *common, '--out', 'result']) == 0
+    verify = ['verify', table, *common, '--calibration', 'result', '--tolerance', '0.5']
+    assert main([*verify, '--length', 'mm']) == Status.NOT_ACCEPTED
+    assert main([*verify, '--length', 'm']) == 0
+    assert [main(verify), main(verify)] == [0, 0]  # the second time nothing is new
+    assert main([*verify, '--commanded', table]) == Status.NOT_ACCEPTED
+    rows = History('history').rows('0042')[1:]
+    assert sorted(row.verdict for row in rows) == ['FAIL', 'FAIL', 'PASS', 'PASS']
+
+
 def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, capsys):
     plants.write_plant(folder, ['A'], 1)
     ended = []

@@ -102,7 +102,7 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
     read = parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml')
     q = UR.random_joints(300, np.random.default_rng(1))
     assert (read.names, read.covariance, read.noise, read.owners) == ((), None, None, {})
-    assert np.isnan(read.sigma_turned(q)).all()
+    assert np.isnan(replace(read, region=None).sigma_turned(q)).all()
     np.testing.assert_allclose(read.remaining(q), found.remaining(q), rtol=1e-6)
     first, second = (np.sqrt(np.mean(each.removed(q)[0] ** 2)) for each in (read, found))
     assert first == pytest.approx(second, rel=0.05)

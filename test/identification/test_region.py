@@ -18,6 +18,7 @@ from calib_ros.identification.region import region_of_record
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.jacobian import orientation_error
 from calib_ros.report.words import as_document, summary
 
 pytestmark = pytest.mark.usefixtures('unsearched')
@@ -161,6 +162,11 @@ def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
     inside = ((np.einsum('nij,nj->ni', axes, error) / squares) ** 2).sum(axis=1) <= 1.0
     assert (inside | ~found.region.covers(other)).mean() >= 0.9
     assert rms(found.chain, true, other) < rms(found.before, true, other)
+    turned = orientation_error(
+        *(each.trace(each.effective(q.T))[0] for each in (found.chain, true))
+    )
+    known = Calibration.of(found).sigma_turned(q)
+    assert np.sqrt(np.mean(np.sum(turned**2, axis=0)) / np.mean(known**2)) < 1.25
 
 
 @pytest.mark.parametrize('name', ['ur10e', 'ur10e_on_linear_axis'])
