@@ -85,6 +85,29 @@ def test_without_motion_there_is_no_delay():
     assert account.waiting == 0
 
 
+@pytest.mark.parametrize('last', [9.9, 10.25, None])  # at rest, on the way, never
+def test_joint_states_that_freeze_are_told(last):
+    """Where they go on nothing is told, though the target is lost for a tenth of the time."""
+    true, _, rng = true_cell(0)
+    motion = stops(UR10E.random_joints(50, rng) * 0.5, 0.5, 0.5)
+    session = CalibrationSession(UR10E)
+    joint_times, times = np.arange(0.0, 50.0, 0.005), np.arange(0.05, 49.7, 0.02)
+    end = 10.0 if last is None else last  # then the arm stands, or is only said to
+    seen = measure(true, motion(np.minimum(times, end) if last is None else times), rng, *NOISE)
+    lost = rng.random(len(times)) < 0.1
+    places = np.where(lost[:, np.newaxis], 0.0, seen.positions)
+    joints = motion(np.minimum(joint_times, end))
+    hear(
+        session,
+        (joint_times, stamps(joint_times), joints),
+        (times + 0.005, stamps(times), places, seen.rotations),
+    )
+    session.finish()
+    told = [each for each in session.warnings if 'joint states stood still' in each]
+    assert len(told) == (last is not None)
+    assert ('are joint states frozen?' in session.status()) == (last is not None)
+
+
 @pytest.mark.parametrize(
     ('lag', 'settings', 'said'),
     [
