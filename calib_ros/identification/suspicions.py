@@ -13,6 +13,9 @@ the lens it would be another arm, not just a more accurate one.
 Board. Printers stretch one side of a page. The residuals at the board, averaged over the images,
 show the ratio of its sides; the arm absorbs the scale of both together, which is as uncertain.
 
+Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
+leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
+
 Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
 the poses add nothing to the priors.
 """
@@ -31,7 +34,7 @@ from calib_ros.identification.configurations import distinct
 from calib_ros.identification.fitting import fit
 from calib_ros.identification.identifiability import growth
 from calib_ros.identification.leastsquares import stacked
-from calib_ros.identification.levels import CLEARLY, NEARER, SCALE, SURE, chance_of
+from calib_ros.identification.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, chance_of
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.region import SHELL
@@ -90,7 +93,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         first = another and not imitated
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
-    found = (scale, sister, lens, board, gravity, COUPLED if result.coupled else '', sigmas)
+    coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
+    found = (scale, sister, lens, board, gravity, coupled, motion, sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=remarks, refusals=tuple(refusals))
 
@@ -207,6 +211,23 @@ def _gravity(problem: Problem, result: Identification) -> str:
         f'along the direction given {100.0 * given:.0f} %: is the arm mounted on a wall? Set '
         'gravity in the chain file'
     )
+
+
+def _motion(problem: Problem, result: Identification) -> str:
+    """Return in words that what is left is larger where the arm moves faster."""
+    for each, far in zip(problem.sets, result.distances, strict=True):
+        for what, rates in (('speed', each.velocity), ('acceleration', each.acceleration)):
+            if rates is None or result.noise.position <= 1.0:
+                continue
+            size = np.linalg.norm(rates, axis=1)
+            low, high = np.quantile(size, [1.0 / 3.0, 2.0 / 3.0])
+            slow, fast = np.median(far[size <= low]), np.median(far[size >= high])
+            if fast > ALIKE * slow:
+                return (
+                    f'errors grow with the {what} of the arm: stamps jitter, clocks drift, or the '
+                    'device or the joint states are smoothed. Stop at each pose (mode dwell)'
+                )
+    return ''
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:

@@ -21,7 +21,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.collector import Collector
-from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved
+from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved, stuck
 from calib_ros.sampling.making import POSITION, QUAT
 from calib_ros.sampling.slices import JOINTS, Piece, Rows, Series, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
@@ -207,6 +207,7 @@ class Clocks:
         self._unclear: Delay | None = None  # with rivals, before a clear one
         self._moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
         """Changes of the delay [s], and the least number of samples before."""
+        self._deaf = 0  # how often targets moved while no joint did
 
     @property
     def delay(self) -> Delay | None:
@@ -258,6 +259,8 @@ class Clocks:
         for rows in (joints, *poses):
             rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
+        follow = [self._follows(joints.values, rows.values[:, POSITION]) for rows in poses]
+        self._deaf += bool(follow) and not any(follow)
         found = self._delay_of((joints.stamps, joints.values), measured)
         joints.release(joints.count)
         self._poses.clear()
@@ -276,6 +279,12 @@ class Clocks:
             self._seen, self._unclear = found, None
         self._agreed = self._taken
         self._awake = self._continuous
+
+    def _follows(self, joints: FloatArray, places: FloatArray) -> bool:
+        """Tell whether joints move if a target does, by more than errors are."""
+        far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+        stand = np.ptp(joints, axis=0).max() <= self.settings.still
+        return not (stand and np.median(far) > self.settings.largest_error)
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
         """Estimate the delay for a collector, at intervals until it is clear.
@@ -311,6 +320,8 @@ class Clocks:
         """Return what looks wrong with the clocks."""
         found = []
         delay, known = self.delay, self.settings.delay
+        if self._deaf:
+            found.append(stuck(1e-9 * WATCH_NS * self._deaf))
         if self._moves:
             found.append(moved(self._moves))
         elif delay is not None and not self._continuous and self._spoils(delay.seconds):

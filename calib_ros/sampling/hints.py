@@ -183,6 +183,15 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
     )
 
 
+def stuck(seconds: float) -> Hint:
+    """Tell that targets moved for some time [s] while no joint did, as far as anybody told."""
+    return Hint(
+        'the target moves but no joint does: are joint states frozen?',
+        f'the target moved for {seconds:.0f} s or more while the joint states stood still: does '
+        'the driver of the robot send live data? Restart it, and repeat the poses of that time',
+    )
+
+
 def frozen(samples: Sequence[Sample]) -> Hint | None:
     """Report a device that measures the same to the nanometre wherever the arm is, if it does."""
     places: dict[tuple[object, ...], list[FloatArray]] = {}

@@ -86,6 +86,55 @@ def test_without_motion_there_is_no_delay():
 
 
 @pytest.mark.parametrize(
+    ('jitter', 'smoothing', 'said'),
+    [(0.0, 0.0, ''), (0.05, 0.0, 'the speed'), (0.0, 0.05, 'the acceleration')],
+)
+def test_errors_of_time_are_told(jitter, smoothing, said, unsearched):
+    """In motion they pass for errors of the arm, and an arm without any may look better for it."""
+    true, _, rng = true_cell(0)
+    motion = stops(UR10E.random_joints(25, rng) * 0.5, 1.5, 0.05)
+    joint_times, times = np.arange(0.0, 38.0, 0.005), np.arange(0.05, 37.7, 0.05)
+    seen = measure(true, motion(times), rng, *NOISE)
+    joints = motion(joint_times)
+    for k in range(1, len(joints)) if smoothing else ():
+        joints[k] = joints[k - 1] + (joints[k] - joints[k - 1]) * 0.005 / smoothing
+    late = times + jitter * rng.random(len(times))
+    session = CalibrationSession(UR10E, Settings(mode='continuous', largest_error=1.0))
+    hear(
+        session,
+        (joint_times, stamps(joint_times), joints),
+        (late + 0.005, stamps(late), seen.positions, seen.rotations),
+    )
+    session.finish()
+    remarks = [each for each in session.identify().remarks if 'errors grow' in each]
+    assert len(remarks) == bool(said)
+    assert said in ''.join(remarks)
+
+
+@pytest.mark.parametrize('last', [9.9, 10.25, None])  # at rest, on the way, never
+def test_joint_states_that_freeze_are_told(last):
+    """Where they go on nothing is told, though the target is lost for a tenth of the time."""
+    true, _, rng = true_cell(0)
+    motion = stops(UR10E.random_joints(50, rng) * 0.5, 0.5, 0.5)
+    session = CalibrationSession(UR10E)
+    joint_times, times = np.arange(0.0, 50.0, 0.005), np.arange(0.05, 49.7, 0.02)
+    end = 10.0 if last is None else last  # then the arm stands, or is only said to
+    seen = measure(true, motion(np.minimum(times, end) if last is None else times), rng, *NOISE)
+    lost = rng.random(len(times)) < 0.1
+    places = np.where(lost[:, np.newaxis], 0.0, seen.positions)
+    joints = motion(np.minimum(joint_times, end))
+    hear(
+        session,
+        (joint_times, stamps(joint_times), joints),
+        (times + 0.005, stamps(times), places, seen.rotations),
+    )
+    session.finish()
+    told = [each for each in session.warnings if 'joint states stood still' in each]
+    assert len(told) == (last is not None)
+    assert ('are joint states frozen?' in session.status()) == (last is not None)
+
+
+@pytest.mark.parametrize(
     ('lag', 'settings', 'said'),
     [
         (0.09, {}, None),  # within settle

@@ -102,6 +102,28 @@ def test_a_drift_within_the_noise_is_not_refused(rng):
         assert average(noisy(rng) + drift)[0].all()
 
 
+@pytest.mark.parametrize('late', np.arange(0.3, 1.3, 0.1).round(1))
+@pytest.mark.parametrize('sigma_given', [SIGMA, SIGMA / 10.0])
+def test_an_arrival_is_no_noise(rng, late, sigma_given):
+    """Of stamps that late the most of a stop is a move of 1 m, smooth as that of a controller."""
+    share = np.clip(1.0 + (np.arange(0.1, 1.2, 0.02) - late) / 1.5, 0.0, 1.0)
+    left = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    found = average(noisy(rng, len(left)) + left[:, np.newaxis] * [0.6, 0.48, 0.64], sigma_given)
+    assert found is None or np.linalg.norm(found[1] - PLACE) < 10.0 * SIGMA
+
+
+@pytest.mark.parametrize('count', range(FEW, 8))
+def test_a_steady_motion_of_few_measurements_is_refused(rng, count):
+    motion = np.arange(count)[:, np.newaxis] * [60.0 * SIGMA, 48.0 * SIGMA, 64.0 * SIGMA]
+    assert average(noisy(rng, count) + motion) is None
+
+
+@pytest.mark.parametrize('count', [5, 10, 60])
+def test_noise_larger_than_the_sigma_given_is_no_motion(rng, count):
+    refused = sum(average(noisy(rng, count), SIGMA / 10.0) is None for _ in range(200))
+    assert refused <= 14
+
+
 def vibrating(rng, count, rate, amplitude, frequency, decay):
     """Return measurements after a stop, and how far the vibration still was at each [m]."""
     times = np.arange(count) / rate
