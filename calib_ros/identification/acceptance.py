@@ -46,7 +46,7 @@ def refusals(
     """Return the rules of acceptance that fail, in words.
 
     By the result, by what else explains the gain (`misfits.py`, `rounding.py`), and by whether
-    anything that was measured tells the size of the arm.
+    what was measured tells the size and shape of the arm.
     """
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
@@ -132,8 +132,8 @@ def _of_the_gain(
         )
         if not sized:
             text += (
-                '; measure something that fixes the size of the arm: positions, or two sockets a '
-                'known distance apart'
+                '; measure something that fixes the size and shape of the arm: positions, or two '
+                'sockets a known distance apart'
             )
         yield Reason(Rule.REGION, text)
 

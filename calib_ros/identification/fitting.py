@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import identifiability
@@ -56,8 +57,8 @@ class Fitted:
     """A robust fit with what follows from its residuals.
 
     `problem` has the last priors; `size` [sigma given] is that of the noise before the data told
-    any. Where nothing tells the size of the arm, `held` is the length kept nominal for that, and
-    the growth (P,) of the fitted parameters with it.
+    any. `held` are K parameters kept nominal that only other kinds of measurement would tell, and
+    how the fitted ones (P, K) follow them.
     """
 
     problem: Problem
@@ -67,7 +68,7 @@ class Fitted:
     noise: Noise
     uncertainty: identifiability.Uncertainty
     size: float
-    held: tuple[str, FloatArray] | None = None
+    held: tuple[tuple[str, ...], FloatArray] | None = None
 
     @property
     def chain(self) -> Chain:
@@ -97,38 +98,30 @@ class Fitted:
 def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
     """Return what arbitrary poses would determine, the nominal chain in its frames, the fit."""
     model, separations = problem.model, problem.system(problem.sets).separation_rows
-    structural = identifiability.structurally_independent(
+    structural, held = identifiability.told_and_held(
         model, problem.free, problem.kinds, separations
     )
-    held = identifiability.untold_size(model, problem.free, problem.kinds, structural)
-    if held is not None:
-        structural = identifiability.structurally_independent(
-            model, [n for n in problem.free if n != held], problem.kinds, separations
-        )
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
     sigmas = (problem.sigma_position, problem.sigma_orientation)
     start = start_frames(model, problem.sets, *sigmas, problem.loss)
     names, factor = _excited_names(problem, structural, start)
     fitted = _fit_all(problem, names, start, factor, simpler)
-    return structural, start, fitted if held is None else _sized(fitted, held)
+    held = tuple(name for name in held if name not in names)  # unless a prior tells them
+    return structural, start, _widened(fitted, held) if held else fitted
 
 
-def _sized(fitted: Fitted, held: str) -> Fitted:
-    """Return a fit with the size of the arm as uncertain as the length that was held nominal."""
-    first, chain = fitted.problem.sets[0], fitted.chain
-    every = [n for joint in chain.joints for n in joint.parameters if n.is_length]
-    size = chain.value(held)
-    grown = {str(n): chain.value(n) / size for n in every if n != held}
-    ends = (first.base, first.tool)
-    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    slope = identifiability.growth(chain, fitted.names, grown, ends, joints, False)
-    std = fitted.posterior(fitted.size, judging=False).sizes['length']
-    shared = std**2 * np.outer(slope, slope)
+def _widened(fitted: Fitted, held: tuple[str, ...]) -> Fitted:
+    """Return a fit with K parameters that were held nominal as uncertain as others of the arm."""
+    count = len(fitted.names)
+    factor = factor_of(fitted.chain, (*fitted.names, *held), fitted.system)
+    slopes = -solve_triangular(factor[:count, :count], factor[:count, count:])
+    stds = fitted.posterior(fitted.size, judging=False).stds_of(held)
+    shared = (slopes * stds**2) @ slopes.T
     uncertainty = identifiability.Uncertainty(
         np.concatenate([fitted.uncertainty.parts, shared[np.newaxis]]),
         np.append(fitted.uncertainty.freedom, np.inf),
     )
-    return replace(fitted, uncertainty=uncertainty, held=(held, slope))
+    return replace(fitted, uncertainty=uncertainty, held=(held, slopes))
 
 
 def _excited_names(

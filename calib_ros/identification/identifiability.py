@@ -131,25 +131,35 @@ def structurally_independent(
     return independent(np.asarray(np.linalg.qr(np.concatenate(rows), mode='r')), names)
 
 
-def untold_size(
-    chain: Chain, names: Sequence[str], kinds: Sequence[Kind], told: Sequence[str]
-) -> Parameter | None:
-    """Return the longest length of the arm where nothing that is measured tells its size.
+def told_and_held(
+    chain: Chain,
+    names: Sequence[str],
+    kinds: Sequence[Kind],
+    extra: Callable[[Chain, Sequence[str]], tuple[FloatArray, FloatArray]] | None = None,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what arbitrary poses would determine, and what of the arm positions would besides.
 
-    Sockets and planes alone would be met as well by a larger arm in a larger cell: a gauge of what
-    is measured, but not of positions elsewhere. Of all lengths the longest, kept nominal, spoils
-    the size least. `told` are the parameters that arbitrary poses would determine.
+    What is measured may not tell all that shows in positions: sockets and planes alone would be
+    met as well by a larger arm in a larger cell, and planes by a gantry whose axes are askew. That
+    is held nominal; if the size is, it is the longest length, which spoils it least.
     """
-    if not all(kind.socket or kind.plane for kind in kinds):
-        return None
+    told = structurally_independent(chain, names, kinds, extra)
+    if not all(kind.distance or kind.socket for kind in kinds):
+        return told, ()
     base, tool = kinds[0].base, kinds[0].tool
     arm = {name for name in names if not chain.owns_frame(name)}
     every = [*parameters_of(base), *parameters_of(tool), *(name for name in names if name in arm)]
     seen = structurally_independent(chain, every, (Kind(False, base=base, tool=tool),))
-    if arm & {*seen} <= {*told}:
-        return None
-    lengths = [Parameter(name) for name in seen if name in arm and Parameter(name).is_length]
-    return max(lengths, key=lambda name: abs(chain.value(name)), default=None)
+    shown = [Parameter(name) for name in seen if name in arm]
+    held = [name for name in shown if name not in told]
+    sized = not all(kind.socket or kind.plane for kind in kinds)
+    if not sized and any(name.is_length for name in held):
+        lengths = [name for name in shown if name.is_length]
+        longest = max(lengths, key=lambda name: abs(chain.value(name)))
+        others = [name for name in names if name != longest]
+        told = structurally_independent(chain, others, kinds, extra)
+        held = [longest, *(name for name in shown if name not in (*told, longest))]
+    return told, tuple(held)
 
 
 def growth(
