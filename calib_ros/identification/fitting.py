@@ -29,12 +29,12 @@ from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Learned, Problem
-from calib_ros.identification.robust import Robust, reweighted, thorough_fit
+from calib_ros.identification.robust import SUSPICIOUS, Robust, reweighted, thorough_fit
 from calib_ros.identification.start import start_frames
 from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray, left_jacobian_inverse
 
 SOME = 2 * SOME_POSES
 """Pairs that are enough for a first fit, or for a linear model of them."""
@@ -163,18 +163,24 @@ def _fit_all(
     if guarded is not problem:  # without its outliers a session tells less
         problem = guarded
         fitted = _fit(*_some(problem, simpler), rough, names)
-    size = _told_by(fitted.noise, simpler)
+    size, first = _told_by(fitted.noise, simpler), fitted.size
     told = fitted.posterior(size, judging=False)
     if not _matter(problem, names, told):
         return fitted
-    priors = {
-        name: min(told.priors[name], problem.common_sense(name))
-        for name in names
-        if not problem.model.owns_frame(name)
-    }
-    problem = replace(problem, learned=Learned(priors, size))
-    again = _fit(problem, simpler, fitted.chain, names, again=True)
-    return replace(again, size=fitted.size)
+    for _ in range(ROUNDS):
+        priors = {
+            name: min(told.priors[name], problem.common_sense(name))
+            for name in names
+            if not problem.model.owns_frame(name)
+        }
+        problem = replace(problem, learned=Learned(priors, size))
+        fitted = _fit(problem, simpler, fitted.chain, names, again=True)
+        less = _told_by(fitted.noise, simpler)
+        if simpler is None or SUSPICIOUS * less > size:
+            break
+        size = less  # priors that were too narrow had made it larger
+        told = fitted.posterior(size, judging=False)
+    return replace(fitted, size=first)
 
 
 def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
