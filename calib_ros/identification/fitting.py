@@ -4,7 +4,8 @@
 
 A first fit to some samples comes close; common-sense priors keep it from going astray where these
 samples carry little information. The robust fit to all samples follows. If its data yield priors
-that would change it (`evidence.py`), it is repeated with them.
+that would change it (`evidence.py`), it is repeated with them; with effects, until the noise no
+longer falls.
 """
 
 from __future__ import annotations

@@ -141,7 +141,8 @@ def told_and_held(
 
     What is measured may not tell all that shows in positions: sockets and planes alone would be
     met as well by a larger arm in a larger cell, and planes by a gantry whose axes are askew. That
-    is held nominal; if the size is, it is the longest length, which spoils it least.
+    is held nominal; if the size is, it is the longest length, which spoils it least. `extra`
+    returns further equations (R, P) at a chain.
     """
     told = structurally_independent(chain, names, kinds, extra)
     if not all(kind.distance or kind.socket for kind in kinds):
