@@ -32,8 +32,8 @@ def refusals(
     """Return the acceptance rules that fail.
 
     `own_behaviour` describes outliers that are the arm's own (`misfits.py`), `may_be_rounding` is
-    the verdict of `rounding.py`, and `sized` tells whether the measurements fix the size of the
-    arm.
+    the verdict of `rounding.py`, and `sized` tells whether the measurements fix the size and
+    shape of the arm.
     """
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
@@ -118,8 +118,8 @@ def _of_the_gain(
         )
         if not sized:
             text += (
-                '; measure something that fixes the size of the arm: positions, or two sockets a '
-                'known distance apart'
+                '; measure something that fixes the size and shape of the arm: positions, or two '
+                'sockets a known distance apart'
             )
         yield Reason(Rule.REGION, text)
 

@@ -107,24 +107,33 @@ class Posterior(Shown):
         rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
         return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
 
-    def held_at(self, name: str, slope: FloatArray) -> Posterior:
-        """Return the posterior with a length held at nominal, as uncertain as lengths are.
+    def stds_of(self, names: Sequence[str]) -> FloatArray:
+        """Return the standard deviations (K,) of undetermined parameters of the arm."""
+        groups = [_group(name) for name in names]
+        return np.array([self.sizes.get(group, TYPICAL[group]) for group in groups])
 
-        The first F fitted parameters grow with it by `slope` (F,).
+    def held_at(self, names: Sequence[str], slopes: FloatArray) -> Posterior:
+        """Return the posterior with K parameters held at nominal, as uncertain as others.
+
+        The first F fitted parameters follow them by `slopes` (F, K).
         """
-        along = np.concatenate([slope, np.zeros(len(self.names) - len(slope)), [1.0]])
-        more = self.sizes['length'] ** 2 * np.outer(along, along)
+        count, between = len(names), len(self.names) - len(slopes)
+        along = np.concatenate([slopes, np.zeros((between, count)), np.eye(count)])
+        more = (along * self.stds_of(names) ** 2) @ along.T
+
+        def padded(matrix: FloatArray) -> FloatArray:
+            return np.asarray(np.pad(matrix, (0, count)) + more)
+
+        none = np.zeros(count)
         return replace(
             self,
-            names=(*self.names, name),
-            offsets=np.append(self.offsets, 0.0),
-            shift=np.append(self.shift, 0.0),
-            covariance=np.pad(self.covariance, (0, 1)) + more,
-            device=np.pad(self.device, ((0, 1), (0, 0))),
+            names=(*self.names, *names),
+            offsets=np.append(self.offsets, none),
+            shift=np.append(self.shift, none),
+            covariance=padded(self.covariance),
+            device=np.pad(self.device, ((0, count), (0, 0))),
             rival=None,  # nothing measures the scale
-            doubted=tuple(
-                (w, np.append(m, 0.0), np.pad(c, (0, 1)) + more) for w, m, c in self.doubted
-            ),
+            doubted=tuple((w, np.append(m, none), padded(c)) for w, m, c in self.doubted),
         )
 
     def held(self, name: str) -> float:

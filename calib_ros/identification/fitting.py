@@ -4,7 +4,7 @@
 
 A first fit to some samples, guarded by common-sense priors, comes close. The robust fit to all
 samples follows. If its data yield priors that would change it (`evidence.py`), it is repeated with
-them.
+them; with effects, until the noise no longer falls.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import identifiability
@@ -28,12 +29,12 @@ from calib_ros.identification.levels import CONFIDENT
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Learned, Problem
-from calib_ros.identification.robust import Robust, reweighted, thorough_fit
+from calib_ros.identification.robust import SUSPICIOUS, Robust, reweighted, thorough_fit
 from calib_ros.identification.start import start_frames
 from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray, left_jacobian_inverse
 
 SOME = 2 * SOME_POSES
 """Samples for a first fit or a linear model."""
@@ -55,9 +56,9 @@ class Simpler:
 class Fitted:
     """A robust fit with what follows from its residuals.
 
-    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors. If
-    nothing measures the size of the arm, `held` is the length held at nominal and the growth (P,)
-    of the fitted parameters with it.
+    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors.
+    `held` are K parameters held at nominal that only other kinds of measurement determine, and how
+    the fitted ones follow them (P, K).
     """
 
     problem: Problem
@@ -67,7 +68,7 @@ class Fitted:
     noise: Noise
     uncertainty: identifiability.Uncertainty
     size: float
-    held: tuple[str, FloatArray] | None = None
+    held: tuple[tuple[str, ...], FloatArray] | None = None
 
     @property
     def chain(self) -> Chain:
@@ -97,38 +98,30 @@ class Fitted:
 def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
     """Return the structurally identifiable names, the chain with start frames, and the fit."""
     model, separations = problem.model, problem.system(problem.sets).separation_rows
-    structural = identifiability.structurally_independent(
+    structural, held = identifiability.identifiable_and_held(
         model, problem.free, problem.kinds, separations
     )
-    held = identifiability.undetermined_size(model, problem.free, problem.kinds, structural)
-    if held is not None:
-        structural = identifiability.structurally_independent(
-            model, [n for n in problem.free if n != held], problem.kinds, separations
-        )
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
     sigmas = (problem.sigma_position, problem.sigma_orientation)
     start = start_frames(model, problem.sets, *sigmas, problem.loss)
     names, factor = _excited_names(problem, structural, start)
     fitted = _fit_all(problem, names, start, factor, simpler)
-    return structural, start, fitted if held is None else _sized(fitted, held)
+    held = tuple(name for name in held if name not in names)  # unless a prior tells them
+    return structural, start, _widened(fitted, held) if held else fitted
 
 
-def _sized(fitted: Fitted, held: str) -> Fitted:
-    """Return a fit with the size of the arm as uncertain as the length held at nominal."""
-    first, chain = fitted.problem.sets[0], fitted.chain
-    every = [n for joint in chain.joints for n in joint.parameters if n.is_length]
-    size = chain.value(held)
-    grown = {str(n): chain.value(n) / size for n in every if n != held}
-    ends = (first.base, first.tool)
-    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    slope = identifiability.growth(chain, fitted.names, grown, ends, joints, False)
-    std = fitted.posterior(fitted.size, judging=False).sizes['length']
-    shared = std**2 * np.outer(slope, slope)
+def _widened(fitted: Fitted, held: tuple[str, ...]) -> Fitted:
+    """Return a fit with K parameters held at nominal, as uncertain as others of the arm."""
+    count = len(fitted.names)
+    factor = factor_of(fitted.chain, (*fitted.names, *held), fitted.system)
+    slopes = -solve_triangular(factor[:count, :count], factor[:count, count:])
+    stds = fitted.posterior(fitted.size, judging=False).stds_of(held)
+    shared = (slopes * stds**2) @ slopes.T
     uncertainty = identifiability.Uncertainty(
         np.concatenate([fitted.uncertainty.parts, shared[np.newaxis]]),
         np.append(fitted.uncertainty.freedom, np.inf),
     )
-    return replace(fitted, uncertainty=uncertainty, held=(held, slope))
+    return replace(fitted, uncertainty=uncertainty, held=(held, slopes))
 
 
 def _excited_names(
@@ -170,18 +163,24 @@ def _fit_all(
     if guarded is not problem:  # outliers carried the information
         problem = guarded
         fitted = _fit(*_some(problem, simpler), rough, names)
-    size = _noise_for_priors(fitted.noise, simpler)
+    size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
     posterior = fitted.posterior(size, judging=False)
     if not _priors_matter(problem, names, posterior):
         return fitted
-    priors = {
-        name: min(posterior.priors[name], problem.common_sense(name))
-        for name in names
-        if not problem.model.owns_frame(name)
-    }
-    problem = replace(problem, learned=Learned(priors, size))
-    again = _fit(problem, simpler, fitted.chain, names, again=True)
-    return replace(again, size=fitted.size)
+    for _ in range(ROUNDS):
+        priors = {
+            name: min(posterior.priors[name], problem.common_sense(name))
+            for name in names
+            if not problem.model.owns_frame(name)
+        }
+        problem = replace(problem, learned=Learned(priors, size))
+        fitted = _fit(problem, simpler, fitted.chain, names, again=True)
+        less = _noise_for_priors(fitted.noise, simpler)
+        if simpler is None or SUSPICIOUS * less > size:
+            break
+        size = less  # too narrow priors had made it larger
+        posterior = fitted.posterior(size, judging=False)
+    return replace(fitted, size=first)
 
 
 def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:

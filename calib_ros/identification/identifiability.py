@@ -127,25 +127,35 @@ def structurally_independent(
     return independent(np.asarray(np.linalg.qr(np.concatenate(rows), mode='r')), names)
 
 
-def undetermined_size(
-    chain: Chain, names: Sequence[str], kinds: Sequence[Kind], structural: Sequence[str]
-) -> Parameter | None:
-    """Return the longest length of the arm if nothing measures its size, else None.
+def identifiable_and_held(
+    chain: Chain,
+    names: Sequence[str],
+    kinds: Sequence[Kind],
+    extra: Callable[[Chain, Sequence[str]], tuple[FloatArray, FloatArray]] | None = None,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the structurally identifiable parameters, and those that only positions determine.
 
-    Sockets and planes alone fit a larger arm in a larger cell as well: a gauge of what is
-    measured, but not of positions elsewhere. Holding the longest length at nominal distorts the
-    size least. `structural` are the structurally identifiable parameters.
+    Sockets and planes alone fit a larger arm in a larger cell as well, and planes a gantry with
+    skewed axes. Such parameters of the arm are held at nominal; if the size is one, by the longest
+    length, which distorts it least. `extra` returns further equations (R, P) at a chain.
     """
-    if not all(kind.socket or kind.plane for kind in kinds):
-        return None
+    found = structurally_independent(chain, names, kinds, extra)
+    if not all(kind.distance or kind.socket for kind in kinds):
+        return found, ()
     base, tool = kinds[0].base, kinds[0].tool
     arm = {name for name in names if not chain.owns_frame(name)}
     every = [*parameters_of(base), *parameters_of(tool), *(name for name in names if name in arm)]
     seen = structurally_independent(chain, every, (Kind(False, base=base, tool=tool),))
-    if arm & {*seen} <= {*structural}:
-        return None
-    lengths = [Parameter(name) for name in seen if name in arm and Parameter(name).is_length]
-    return max(lengths, key=lambda name: abs(chain.value(name)), default=None)
+    visible = [Parameter(name) for name in seen if name in arm]
+    held = [name for name in visible if name not in found]
+    sized = not all(kind.socket or kind.plane for kind in kinds)
+    if not sized and any(name.is_length for name in held):
+        lengths = [name for name in visible if name.is_length]
+        longest = max(lengths, key=lambda name: abs(chain.value(name)))
+        others = [name for name in names if name != longest]
+        found = structurally_independent(chain, others, kinds, extra)
+        held = [longest, *(name for name in visible if name not in (*found, longest))]
+    return found, tuple(held)
 
 
 def growth(

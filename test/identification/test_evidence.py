@@ -224,21 +224,23 @@ def told(rng, size=3):
     )
 
 
-def test_a_length_held_nominal_is_as_uncertain_as_lengths_are(rng):
-    """What grows with it, the fitted parameters before considered ones, errs with it."""
-    before, slope = told(rng), np.array([0.5, -2.0])
-    after = before.held_at('wrist_1_joint.d', slope)
-    assert after.names == (*before.names, 'wrist_1_joint.d')
-    along = 3e-4 * np.array([0.5, -2.0, 0.0, 1.0])
-    change = after.covariance - np.pad(before.covariance, (0, 1))
-    np.testing.assert_allclose(change, np.outer(along, along), atol=1e-15)
+def test_what_is_held_nominal_is_as_uncertain_as_others_are(rng):
+    """The fitted parameters, before considered ones, follow; of usual size if no size is known."""
+    before, slopes = told(rng), np.array([[0.5, 1.0], [-2.0, 0.0]])
+    before = replace(before, sizes={'length': 3e-4})
+    after = before.held_at(('wrist_1_joint.d', 'wrist_1_joint.beta'), slopes)
+    assert after.names == (*before.names, 'wrist_1_joint.d', 'wrist_1_joint.beta')
+    along = np.array([[0.5, -2.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0, 1.0]])
+    change = after.covariance - np.pad(before.covariance, (0, 2))
+    wanted = along.T @ np.diag([3e-4**2, 1e-3**2]) @ along
+    np.testing.assert_allclose(change, wanted, atol=1e-15)
     for (w, m, c), (weight, mean, covariance) in zip(after.doubted, before.doubted, strict=True):
         assert w == weight
-        np.testing.assert_array_equal(m, [*mean, 0.0])
-        np.testing.assert_allclose(c - np.pad(covariance, (0, 1)), change, atol=1e-12)
+        np.testing.assert_array_equal(m, [*mean, 0.0, 0.0])
+        np.testing.assert_allclose(c - np.pad(covariance, (0, 2)), change, atol=1e-12)
     for whole, part in ((after.offsets, before.offsets), (after.shift, before.shift)):
-        np.testing.assert_array_equal(whole, [*part, 0.0])
-    np.testing.assert_array_equal(after.device, [*before.device, [0.0, 0.0]])
+        np.testing.assert_array_equal(whole, [*part, 0.0, 0.0])
+    np.testing.assert_array_equal(after.device, [*before.device, [0.0, 0.0], [0.0, 0.0]])
 
 
 def test_the_expected_error_is_that_of_shift_and_covariance(rng):

@@ -12,12 +12,11 @@ from fits import UR10E, measured_arm
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.identification import fitting
-from calib_ros.identification.fitting import SOME, Fitted, Simpler, parameter_rows
+from calib_ros.identification.fitting import SOME, Simpler, parameter_rows
 from calib_ros.identification.identifiability import Uncertainty
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.jacobian import ErrorModel
 
 
 def seen(count=12):
@@ -195,49 +194,14 @@ def test_a_fit_is_repeated_with_guards_and_with_what_it_tells(monkeypatch):
     assert calls == [(None, UR10E, False), (Learned(priors, 3.0), 'a', True)]
 
 
-@pytest.mark.parametrize('held', ['elbow_joint.a', None])
-def test_where_nothing_tells_the_size_of_the_arm_a_length_is_held(held, monkeypatch):
-    asked, problem = [], Problem(UR10E, seen())
-
-    def independent(chain, names, *_):
-        asked.append(tuple(names))
-        return tuple(names[:20])
-
-    monkeypatch.setattr(fitting.identifiability, 'structurally_independent', independent)
-    monkeypatch.setattr(fitting.identifiability, 'undetermined_size', lambda *_: held)
+@pytest.mark.parametrize('held', [('elbow_joint.a', 'base.x'), ('base.x',), ()])
+def test_what_other_kinds_of_measurement_would_tell_is_held(held, monkeypatch):
+    """Unless a prior tells it, so that it is fitted."""
+    told = ('base.x',)
+    monkeypatch.setattr(fitting.identifiability, 'identifiable_and_held', lambda *_: (told, held))
     monkeypatch.setattr(fitting, 'start_frames', lambda *_: 'start')
-    monkeypatch.setattr(fitting, '_excited_names', lambda *_: (('base.x',), np.eye(1)))
+    monkeypatch.setattr(fitting, '_excited_names', lambda *_: (told, np.eye(1)))
     monkeypatch.setattr(fitting, '_fit_all', lambda *_: 'fitted')
-    monkeypatch.setattr(fitting, '_sized', lambda fitted, name: (fitted, name))
-    others = tuple(name for name in problem.free if name != held)
-    assert len(others) == len(problem.free) - bool(held)
-    found = ('fitted', held) if held else 'fitted'
-    assert fitting.fit(problem) == (others[:20], 'start', found)
-    assert asked == ([problem.free, others] if held else [problem.free])
-
-
-def test_a_length_held_for_the_size_of_the_arm_makes_all_others_uncertain():
-    """As all lengths grow with it: each by its own size."""
-    held = 'shoulder_lift_joint.a'
-    every = [n for j in UR10E.joints for n in j.parameters if n.is_length and n != held]
-
-    class Told(Fitted):
-        def posterior(self, noise, more=(), doubts=None, judging=True):
-            assert (noise, judging) == (3.0, False)
-            return SimpleNamespace(sizes={'length': 3e-4})
-
-    before = Uncertainty(np.eye(len(every))[np.newaxis], np.array([7.0]))
-    robust = SimpleNamespace(fit=SimpleNamespace(chain=UR10E))
-    problem = Problem(UR10E, seen())
-    told = Told(problem, tuple(every), robust, None, noise(1.0), before, 3.0)
-    after = fitting._sized(told, held)
-    name, slope = after.held
-    assert name == held
-    q = UR10E.random_joints(20, np.random.default_rng(1))
-    columns = ErrorModel(UR10E, [*every, held]).jacobian(q)[:, :3]
-    grown = UR10E.forward(q)[:, :3, 3] / UR10E.value(held)
-    np.testing.assert_allclose(columns @ [*slope, 1.0], grown, atol=1e-9)
-    shared = 3e-4**2 * np.outer(slope, slope)
-    np.testing.assert_allclose(after.uncertainty.parts[1], shared, atol=1e-15)
-    np.testing.assert_array_equal(after.uncertainty.parts[0], before.parts[0])
-    assert after.uncertainty.freedom.tolist() == [7.0, np.inf]
+    monkeypatch.setattr(fitting, '_widened', lambda fitted, names: (fitted, names))
+    found = ('fitted', held[:1]) if len(held) == 2 else 'fitted'
+    assert fitting.fit(Problem(UR10E, seen())) == (told, 'start', found)

@@ -51,6 +51,22 @@ def chosen(result):
     return {group_of(name) for name, _ in result.chain.effects}
 
 
+@pytest.mark.parametrize('seed', range(2))
+def test_effects_larger_than_usual_are_not_taken_for_noise(seed):
+    """The first fit holds them at their usual size; what it leaves is no noise."""
+    rng = np.random.default_rng(seed)
+    names = effects.members(UR10E, 'eccentricity')
+    values = dict(zip(names, rng.normal(scale=7e-4, size=len(names)).tolist(), strict=True))
+    true = faulty(UR10E, Cell(), rng).with_effect_values(values)
+    q, unseen = UR10E.random_joints(60, rng), UR10E.random_joints(300, rng)
+    positions = true.forward(q)[:, :3, 3] + rng.normal(scale=1e-5, size=(60, 3))
+    problem = Problem(UR10E, Observations.from_arrays(q, positions), sigma_position=1e-5)
+    result = identify(replace(problem, effects=('eccentricity',)), identify(problem))
+    assert result.accepted
+    assert 0.8 < result.noise.position < 1.2
+    assert rms(result.chain, true, unseen) < 2e-5
+
+
 @pytest.mark.parametrize(
     ('group', 'oriented'),
     [

@@ -111,7 +111,7 @@ def test_a_place_is_left_out_of_an_arm_whose_axes_are_all_parallel():
     result = identify(Problem(scara, sets[0], more=sets[1:], sigma_position=2e-5))
     before, after = result.validation.figures
     assert after.rms_mm < min(before.rms_mm, 0.05)
-    assert 'something that fixes the size of the arm' in result.refusals[-1]
+    assert 'something that fixes the size and shape of the arm' in result.refusals[-1]
 
 
 def test_well_determined_parameters_are_not_named():

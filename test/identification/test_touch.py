@@ -14,19 +14,31 @@ from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.tables import read_table
 from calib_ros.identification import start
+from calib_ros.identification.fitting import fit
 from calib_ros.identification.identification import identify
+from calib_ros.identification.leastsquares import System, triangular_factor
 from calib_ros.identification.observations import Observations
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.samples import Samples, residual_arrays
 from calib_ros.identification.suspicions import _apart
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 
 UR = replace(load_chain('ur10e'), base=None, tool=None)
 SIGMA = 5e-5
 TIP = np.array([0.03, -0.02, 0.15])
+GANTRY = Chain(
+    'gantry',
+    'standard',
+    (
+        Joint('x', 'prismatic', alpha=-np.pi / 2, lower=-0.8, upper=0.8),
+        Joint('y', 'prismatic', alpha=np.pi / 2, theta=-np.pi / 2, lower=-1.0, upper=1.0),
+        Joint('z', 'prismatic', lower=0.0, upper=1.5),
+        Joint('turn', d=0.1),
+    ),
+)
 PLANES = (
     se3.transform(np.eye(3), np.array([0.0, 0.0, -0.1])),
     se3.transform(se3.exp_rotation(np.array([0.0, 1.2, 0.3])), np.array([0.1, 0.0, 0.4])),
@@ -50,11 +62,11 @@ def touched(true, plane, count, rng, noise=0.0):
     return q[met]
 
 
-def cell(seed, noise=SIGMA, count=40, planes=3):
+def cell(seed, noise=SIGMA, count=40, planes=3, nominal=UR):
     """Return a true arm and what it touched, set by set."""
     rng = np.random.default_rng(seed)
     tool = Frame(se3.transform(np.eye(3), TIP))
-    true = replace(faulty(UR, Cell(), rng), base=Frame(), tool=tool)
+    true = replace(faulty(nominal, Cell(), rng), base=Frame(), tool=tool)
     return true, [
         Observations.touching(touched(true, plane, count, rng, noise), f'base_{k}')
         for k, plane in enumerate(PLANES[:planes])
@@ -112,6 +124,52 @@ def test_the_size_that_planes_do_not_tell_is_as_uncertain_as_lengths_are(seed):
     before, after = (_apart(chain, true, q) for chain in (UR, result.chain))
     assert after < 0.6 * before
     assert after < 2.0 * np.median(result.region.sigma(q))
+
+
+@pytest.mark.parametrize(
+    ('nominal', 'held'),
+    [(UR, ['shoulder_lift_joint.a']), (GANTRY, ['z.alpha', 'z.beta'])],
+    ids=['size', 'axes askew'],
+)
+def test_what_planes_do_not_tell_is_held_and_uncertain(nominal, held):
+    """Touches are met as well by other values of it, with what follows it."""
+    _, sets = cell(2, nominal=nominal)
+    _, _, fitted = fit(Problem(nominal, sets[0], more=sets[1:], sigma_touch=SIGMA))
+    names, slopes = fitted.held
+    assert list(names) == held
+    assert not {*names} & {*fitted.names}
+    bare = System(fitted.system.sets)
+    factor = triangular_factor(fitted.chain, (*fitted.names, *names), bare)
+    left = factor @ np.concatenate([slopes, np.eye(len(names))])
+    alone = np.linalg.norm(factor[:, len(slopes) :], axis=0)
+    assert (np.linalg.norm(left, axis=0) < 0.03 * alone).all()
+    stds = fitted.posterior(fitted.size, judging=False).stds_of(names)
+    shared = sum(std**2 * np.outer(s, s) for std, s in zip(stds, slopes.T, strict=True))
+    np.testing.assert_allclose(fitted.uncertainty.parts[-1], shared, rtol=1e-9)
+    assert fitted.uncertainty.freedom[-1] == np.inf
+
+
+@pytest.mark.parametrize('seed', [2, 3, 6])
+def test_planes_alone_do_not_tell_a_gantry_whose_axes_are_askew(seed):
+    _, sets = cell(seed, nominal=GANTRY)
+    result = identify(Problem(GANTRY, sets[0], more=sets[1:], sigma_touch=SIGMA))
+    assert not result.accepted
+
+
+def test_an_arm_whose_only_length_is_held_is_judged():
+    """Its size is the usual one."""
+    planar = Chain('planar', 'standard', (Joint('a', a=0.4), Joint('b', a=0.3)))
+    planes = [se3.exp_rotation(np.array([x, 1.2, 0.3])) for x in (1.4, 0.2, -0.7)]
+    rng = np.random.default_rng(0)
+    true = replace(faulty(planar, Cell(), rng), base=Frame(), tool=Frame())
+    sets = [
+        Observations.touching(
+            touched(true, se3.transform(turn, np.full(3, 0.1)), 40, rng, SIGMA), f'base_{k}'
+        )
+        for k, turn in enumerate(planes)
+    ]
+    result = identify(Problem(planar, sets[0], more=sets[1:], sigma_touch=SIGMA))
+    assert 'a.a' in result.unidentifiable
 
 
 @pytest.mark.parametrize('seed', range(2))
