@@ -94,10 +94,6 @@ class Filer:
         return ''
 
 
-ANSWER_LENGTH = LONGEST // 2
-"""Most characters of an answer: a few lines of a terminal; the rest is in a file and the log."""
-
-
 class Snapshot(NamedTuple):
     """The input of an identification, and its settings."""
 
@@ -195,6 +191,7 @@ class Identifying:
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples
             )
+            self.last += '; to keep it call ~/save'
         else:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
@@ -218,12 +215,12 @@ class Identifying:
         All of it is in the log, and beside the journal.
         """
         success, text = answer
-        if len(text) > ANSWER_LENGTH:
+        if len(text) > LONGEST:
             path = self._archive.note(f'{text}\n')
             path = self._report or path
             more = f' ... full text: {path.name if path else "in the log"}'
             before, advice, _ = text.partition(self._advice or text)
-            text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
+            text = _without_middle(before + advice, LONGEST - len(more)) + more
         return success, text
 
 

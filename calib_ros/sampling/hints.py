@@ -73,6 +73,18 @@ class Hint(NamedTuple):
     text: str
 
 
+def unheard(received: Mapping[str, int]) -> list[Hint]:
+    """Tell that nothing has come, or only joint states."""
+    if not received:
+        return [Hint('', 'nothing was received: check the topics (joint_topics, sources)')]
+    if received[POSES] or received[JOINTS] < NO_ACCIDENT:
+        return []
+    words = (
+        'no measurements received: is the device on, and its topic measured_pose or in sources?'
+    )
+    return [Hint('no measurements received: check sources', words)]
+
+
 def restless(needed: float, still: float) -> Hint:
     """Tell that joints stand, but hardly ever within `still`; how much is `needed` [rad or m].
 

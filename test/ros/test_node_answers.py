@@ -15,6 +15,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from calib_ros.apply.simulation import measure
+from calib_ros.errors import LONGEST
 from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.identification.problem import Problem
@@ -68,7 +69,7 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
         step = identifying._advice = rules()[rule].steps[0]
         text = f'NOT accepted: {reasons}. To do first: {step} {figures}'
         _, found = identifying.shortened((False, text))
-        assert len(found) <= 200
+        assert len(found) <= LONGEST
         assert found.startswith('NOT accepted: no gain')
         said, _, name = found.partition(' ... full text: ')
         assert said.endswith(step)
@@ -101,7 +102,7 @@ def test_a_refusal_leaves_its_report(unsearched, cell, recording):
         message.pose.position.x += x
     cell.play(topics(recording, measured_pose=moved))
     answer = cell.refused('identify')
-    assert len(answer.message) <= 200
+    assert len(answer.message) <= LONGEST
     assert cell.node._identifying._advice
     assert cell.node._identifying._advice in answer.message
     (page,) = cell.node._archive.folder.glob('*.identified.html')
