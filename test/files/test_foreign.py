@@ -369,25 +369,45 @@ def test_a_table_of_semicolons_says_what_to_give(tmp_path, row):
         (['shoulder', 'Elbow', 'x', 'y', 'z'], ',', 'q1 = shoulder, q2 = elbow'),
         (['Q1', 'Q2', 'X', 'Y', 'Z'], ',', 'no units are given'),
         (['q1', 'q2', 'x', 'y', 'z'], ';', 'semicolon'),
+        (['q1', 'q2', 'x', 'y', 'z', 'Prüfung'], ',', 'Windows-1252'),
+        (['q1', 'q2', 'x', 'y', 'z', 'UTF-16'], ',', 'no units are given'),
     ],
 )
 def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
     tmp_path, names, separator, noted
 ):
     path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, names=names).replace(',', separator))
+    text = text_of(JOINTS, PLACES, names=names).replace(',', separator)
+    path.write_bytes(text.encode('utf-16' if 'UTF-16' in names else 'cp1252'))
     joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
     found = loading.table(path, Chain('arm', 'standard', joints), Settings())
     np.testing.assert_array_equal(found.fitted[0].joints, JOINTS)
     assert noted in ' '.join(found.warnings)
 
 
-def test_columns_that_count_the_joints_are_proposed(tmp_path):
+@pytest.mark.parametrize(
+    ('names', 'proposed'),
+    [
+        (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*_rad"'),
+        (
+            ['Joint 1 [rad]', 'Joint 2 [rad]', 'X [m]', 'y', 'z'],
+            '--columns "q*={Joint * [rad]},x={X [m]}"',
+        ),
+        (
+            ['x', 'y', 'z', 'a', 'b'],
+            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+        ),
+        (['q1', 'a', 'x', 'y', 'z'], '--columns "q2=NAME"'),
+        (['0.1', '-2', '3', '4e-5', '5'], 'numbers, not names: --columns "q1=#1,q2=#2,..."'),
+    ],
+)
+def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
     path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, names=['A1_rad', 'A2_rad', 'x', 'y', 'z']))
+    path.write_text(text_of(JOINTS, PLACES, names=names))
     joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
-    with pytest.raises(InputError, match=r'expected q1, q2, .* --columns "q\*=A\*_rad,x=NAME'):
+    with pytest.raises(InputError) as told:
         loading.table(path, Chain('arm', 'standard', joints), Settings())
+    assert str(told.value).endswith(proposed)
 
 
 def test_workbooks(tmp_path):
