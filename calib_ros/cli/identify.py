@@ -186,7 +186,9 @@ def _source(options: argparse.Namespace) -> str:
         )
     for name in OF_BAGS if source == 'table' else OF_TABLES:
         if getattr(options, name):
-            raise InputError(f'--{name.replace("_", "-")} does not apply to a {source}')
+            instead = ': add eye_in_hand=true to its --sources' if name == 'eye_in_hand' else ''
+            option = f'--{name.replace("_", "-")}'
+            raise InputError(f'{option} does not apply to a {source}{instead}')
     return source
 
 

@@ -151,6 +151,10 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Tell what must be given, what is wrong, and what is right."""
+        for kind, what in (('int', 'a whole number'), ('float', 'a number such as 0.1')):
+            message = message.replace(f'invalid {kind} value:', f'must be {what}, not')
+        if message.endswith(': --chain'):
+            message += ' (calib_ros robots lists the arms supplied)'
         self.print_usage(sys.stderr)
         self.exit(2, f'{self.prog}: error: {message}\nexample: {self.example.lstrip()}\n')
 

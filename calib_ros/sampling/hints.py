@@ -60,8 +60,8 @@ class Account:
                 text += f'; {label}: {parts}'
         if self.foreign_names:
             text += (
-                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints '
-                'of the chain under other names, set joint_names (--joint-names)'
+                f'; joint states name {", ".join(self.foreign_names)}: give the chain of this arm '
+                '(--chain) or, if only the names differ, joint_names (--joint-names)'
             )
         return text
 

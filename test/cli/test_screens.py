@@ -131,9 +131,11 @@ def test_help_of_a_command_is_that_command_with_help(shown):
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
         (('robots', 'ur5e'), 'unexpected argument "ur5e"'),
         (('chain',), 'required: ROBOT'),
+        (('identify', 'measured.csv'), '--chain (calib_ros robots lists the arms supplied)'),
+        (('verify', 'a.csv', '--tolerance', '0,2'), "must be a number such as 0.1, not '0,2'"),
         (
             ('identify', 'measured.csv', '--chain', 'ur5e', '--folds', 'five'),
-            "invalid int value: 'five'",
+            "must be a whole number, not 'five'",
         ),
         (
             ('simulate', 'bag', '--chain', 'ur5e', '--storage', 'rosbag1'),
