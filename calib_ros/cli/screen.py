@@ -34,6 +34,7 @@ class Screen:
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
+        self._bar: Any = None  # the console of a bar: what else is printed there goes above it
 
     def data(self, text: str) -> None:
         """Print what was asked for, to be read by a program or a person; also when quiet."""
@@ -84,7 +85,7 @@ class Screen:
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
         line = _fitted(f'{kind}: {text}', '  ', sys.stderr)
-        console = _console(sys.stderr)
+        console = self._bar or _console(sys.stderr)
         if console is not None:
             console.print(_rich_text(line, 'yellow'))
         else:
@@ -99,11 +100,13 @@ class Screen:
             return
         watch = threading.Thread(target=work.watch, daemon=True)
         watch.start()
+        self._bar = work.console
         try:
             yield work
         finally:
             work.done.set()
             watch.join()
+            self._bar = None
 
 
 class Work(Progress):
@@ -112,20 +115,20 @@ class Work(Progress):
     def __init__(self, what: str) -> None:
         super().__init__(what)
         self.done = threading.Event()
+        self.console = _console(sys.stderr)
         self.begin()
 
     def watch(self) -> None:
         """Show that the work goes on until it is done."""
-        console = _console(sys.stderr)
-        if console is None:
+        if self.console is None:
             pause = EVERY_S
             while not self.done.wait(pause):
                 print(f'calib_ros: {_printable(str(self))}', file=sys.stderr, flush=True)
                 pause = min(2.0 * pause, 16.0 * EVERY_S)
         elif not self.done.wait(FIRST_S):
-            self._as_bar(console)
+            self._as_bar()
 
-    def _as_bar(self, console: Any) -> None:
+    def _as_bar(self) -> None:
         from rich import progress
 
         columns = (
@@ -134,7 +137,7 @@ class Work(Progress):
             progress.BarColumn(bar_width=20),
             progress.TextColumn('{task.fields[told]}'),
         )
-        with progress.Progress(*columns, console=console, transient=True) as bar:
+        with progress.Progress(*columns, console=self.console, transient=True) as bar:
             task = bar.add_task('', total=None, told='')
             while True:
                 total = 1.0 if 0.0 < self.share < 1.0 else None

@@ -302,6 +302,20 @@ def test_on_a_terminal_the_sign_is_a_bar_that_vanishes(shown, monkeypatch):
     assert said.endswith('\x1b[2K')
 
 
+def test_a_warning_goes_above_the_bar(monkeypatch):
+    """A missing extra was told behind the bar, on its line."""
+    pytest.importorskip('rich')
+    monkeypatch.setenv('TERM', 'xterm-256color')
+    monkeypatch.setattr(screen, 'FIRST_S', 1e-4)
+    monkeypatch.setattr(sys, 'stderr', Terminal())
+    made = screen.Screen()
+    with made.work('counting'):
+        while 'counting' not in sys.stderr.getvalue():
+            pass
+        made.warn('no jinja2', 'note')
+    assert re.search(r'\x1b\[2K(\x1b\[33m)?note: no jinja2', sys.stderr.getvalue())
+
+
 def test_work_tells_the_time_left(monkeypatch):
     monkeypatch.setattr(time, 'monotonic', lambda: 10.0)
     work = screen.Work('reading bag')
