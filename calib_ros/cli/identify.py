@@ -287,7 +287,9 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         if each.steps:
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
-        screen.bullet('The report lists the likely consequences')
+        screen.bullet(
+            'What else was found probably follows from that: the report (--out) lists it'
+        )
     elif 1.0 < result.noise.position < FAR and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
 

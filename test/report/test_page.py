@@ -214,6 +214,7 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
             (True, True, False),
             'LARGEST_ERROR; GAIN',
         ),
+        ((Rule.MISTAKE, Rule.ENCODER), (True, False), 'ENCODER'),
         ((Rule.MOVED, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
