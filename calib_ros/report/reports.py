@@ -184,11 +184,11 @@ def _steps(
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': beyond,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
-        'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '
-        'poses where it is not valid.': result.region is not None and not result.region.whole,
         f'{BRING[0].upper()}{BRING[1:]}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': True,
+        'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '
+        'poses where it is not valid.': result.region is not None and not result.region.whole,
     }
     return tuple(step for step, needed in found.items() if needed)
 
