@@ -46,7 +46,7 @@ class Screen:
             return
         for line in text.splitlines() or ['']:
             indent = ' ' * (len(line) - len(line.lstrip()) + 2)
-            print(_fitted(line, indent, sys.stdout), flush=True)
+            print(fitted(line, indent, sys.stdout), flush=True)
 
     def title(self, text: str, good: bool | None = None) -> None:
         """Print a verdict; the colour of a good or bad one never says more than the words."""
@@ -84,7 +84,7 @@ class Screen:
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
-        line = _fitted(f'{kind}: {text}', '  ', sys.stderr)
+        line = fitted(f'{kind}: {text}', '  ', sys.stderr)
         console = self._bar or _console(sys.stderr)
         if console is not None:
             console.print(_rich_text(line, 'yellow'))
@@ -181,7 +181,7 @@ def _printable(text: str) -> str:
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
 
 
-def _fitted(line: str, indent: str, stream: TextIO) -> str:
+def fitted(line: str, indent: str, stream: TextIO) -> str:
     """Return a line as a terminal takes it; in a file it stays one."""
     return wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
 
