@@ -440,3 +440,16 @@ def test_workbooks(tmp_path):
     path.write_bytes(b'no workbook')
     with pytest.raises(InputError, match='cannot read'):
         read_table(path, 2, foreign=Foreign(Layout()))
+
+
+def test_columns_of_joints_are_those_of_their_log(tmp_path, capsys):
+    """They were ignored, and the other table was blamed."""
+    (tmp_path / 'log.csv').write_text(text_of(JOINTS, names=['J1', 'J2']))
+    (tmp_path / 'table.csv').write_text(text_of(PLACES, names=['x', 'y', 'z']))
+    files = [str(tmp_path / name) for name in ('table.csv', 'log.csv', 'out.csv')]
+    given = ['import', files[0], '--joints', files[1], '--out', files[2]]
+    assert main(given) == 1
+    told = f'{files[1]} has no column q1; it has J1, J2: give --columns "q*=NAME*"'
+    assert told in capsys.readouterr().err
+    assert main([*given, '--columns', 'q*=J*']) == 0
+    assert_same(read_table(tmp_path / 'out.csv', 2), None)
