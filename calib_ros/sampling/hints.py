@@ -61,7 +61,7 @@ class Account:
         if self.foreign_names:
             text += (
                 f'; joint states name {", ".join(self.foreign_names)}: give the chain of this arm '
-                '(--chain) or, if only the names differ, joint_names (--joint-names)'
+                '(--chain) or, if only the names differ, set joint_names (--joint-names)'
             )
         return text
 
