@@ -64,8 +64,11 @@ class UnknownNameError(ConfigError):
         self.what = what
         self.name = name
         self.alternatives = tuple(alternatives)
-        hints = (near(str(name), self.alternatives), f'valid are {", ".join(self.alternatives)}')
-        super().__init__(f'unknown {what} "{name}": {" ".join(filter(None, hints))}')
+        hint, listed = near(str(name), self.alternatives), ', '.join(self.alternatives)
+        if not hint or len(listed) <= LONGEST_NAME:
+            hint = f'{hint} valid: {listed}'.strip()
+        *place, of = what.rpartition(': ')
+        super().__init__(f'{"".join(place)}unknown {of} "{name}": {hint}')
 
 
 class ColumnsError(InputError):
@@ -79,8 +82,8 @@ class TooFewObservationsError(InputError):
         self.configurations = configurations
         self.needed = needed
         super().__init__(
-            f'{configurations} measured poses are too few, at least {needed} are '
-            f'needed: {why}; measure more poses or hold parameters (fixed)'
+            f'too few different poses: {configurations} measured, at least {needed} needed '
+            f'({why}); measure 30 or more, or hold parameters (fixed)'
         )
 
 

@@ -92,7 +92,7 @@ class Settings:
         0.05, 'distance between the two sockets of a location [m]', 1e-6
     )
     max_gap: float = _setting(
-        0.1, 'longest time between the two joint states that bracket a measurement [s]', 0.0
+        0.1, 'longest time between the two joint states that bracket a measurement [s]', 1e-6
     )
     joint_buffer: int = _setting(
         200_000, 'joint states kept waiting; when full, the older half is dropped', 2

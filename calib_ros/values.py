@@ -91,7 +91,7 @@ def parse_mapping(
         )
     for key in value:
         if key not in keys:
-            raise UnknownNameError(f'key in {where}', str(key), keys)
+            raise UnknownNameError(f'{where}: key', str(key), keys)
     for key in needed:
         if value.get(key) is None:
             raise ConfigError(f'{where}: key "{key}" is missing')

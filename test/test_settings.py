@@ -27,5 +27,5 @@ def test_a_setting_out_of_range_is_refused(name, value):
 
 
 def test_settings_at_the_edge_are_taken():
-    settings = Settings(max_gap=0.0, joint_buffer=2, pose_buffer=1, folds=2, sigma_position=1e-9)
+    settings = Settings(max_gap=1e-6, joint_buffer=2, pose_buffer=1, folds=2, sigma_position=1e-9)
     assert (settings.joint_buffer, settings.pose_buffer, settings.folds) == (2, 1, 2)

@@ -60,7 +60,7 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
     if options.joints_preset and options.joints is None:
         raise InputError('--joints-preset needs --joints FILE')
     units = {name: given[name] for name in ('length', 'angle', 'joint_angle')}
-    log = layout_of(options.joints_preset, (), {} if options.joints_preset else units)
+    log = layout_of(options.joints_preset, options.columns, {} if options.joints_preset else units)
     layout = layout_of(options.preset, options.columns, given)
     return Foreign(layout, chain, options.joints, log if options.joints else Layout())
 

@@ -181,7 +181,9 @@ def _source(options: argparse.Namespace) -> str:
         )
     for name in OF_BAGS if source == 'table' else common.OF_TABLES:
         if getattr(options, name):
-            raise InputError(f'--{name.replace("_", "-")} does not apply to a {source}')
+            instead = ': add eye_in_hand=true to its --sources' if name == 'eye_in_hand' else ''
+            option = f'--{name.replace("_", "-")}'
+            raise InputError(f'{option} does not apply to a {source}{instead}')
     return source
 
 
@@ -278,7 +280,9 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         if each.steps:
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
-        screen.bullet('The report lists the likely consequences')
+        screen.bullet(
+            'What else was found probably follows from that: the report (--out) lists it'
+        )
     elif 1.0 < result.noise.position < FAR and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
 

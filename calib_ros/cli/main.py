@@ -26,7 +26,7 @@ from typing import Any, NoReturn
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
-from calib_ros.cli.screen import Screen, help_width, wrapped
+from calib_ros.cli.screen import Screen, fitted, help_width, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 
 GROUPS = {
@@ -155,8 +155,13 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Report what is required, what is wrong, and an example."""
+        for kind, what in (('int', 'a whole number'), ('float', 'a number such as 0.1')):
+            message = message.replace(f'invalid {kind} value:', f'must be {what}, not')
+        if message.endswith(': --chain'):
+            message += ' (calib_ros robots lists the arms supplied)'
         self.print_usage(sys.stderr)
-        self.exit(2, f'{self.prog}: error: {message}\nexample: {self.example.lstrip()}\n')
+        said = fitted(f'{self.prog}: error: {message}', '  ', sys.stderr)
+        self.exit(2, f'{said}\nexample: {self.example.lstrip()}\n')
 
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:

@@ -33,6 +33,7 @@ class Screen:
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
+        self._bar: Any = None  # the console of a bar: what else is printed there goes above it
 
     def data(self, text: str) -> None:
         """Print requested data, even if quiet."""
@@ -44,7 +45,7 @@ class Screen:
             return
         for line in text.splitlines() or ['']:
             indent = ' ' * (len(line) - len(line.lstrip()) + 2)
-            print(_fitted(line, indent, sys.stdout), flush=True)
+            print(fitted(line, indent, sys.stdout), flush=True)
 
     def title(self, text: str, good: bool | None = None) -> None:
         """Print a verdict; the colour never says more than the words."""
@@ -82,8 +83,8 @@ class Screen:
 
     def warn(self, text: str, kind: str = 'warning') -> None:
         """Print a warning; to a file as one line."""
-        line = _fitted(f'{kind}: {text}', '  ', sys.stderr)
-        console = _console(sys.stderr)
+        line = fitted(f'{kind}: {text}', '  ', sys.stderr)
+        console = self._bar or _console(sys.stderr)
         if console is not None:
             console.print(_rich_text(line, 'yellow'))
         else:
@@ -98,11 +99,13 @@ class Screen:
             return
         watch = threading.Thread(target=work.watch, daemon=True)
         watch.start()
+        self._bar = work.console
         try:
             yield work
         finally:
             work.done.set()
             watch.join()
+            self._bar = None
 
 
 class Work(Progress):
@@ -111,20 +114,20 @@ class Work(Progress):
     def __init__(self, what: str) -> None:
         super().__init__(what)
         self.done = threading.Event()
+        self.console = _console(sys.stderr)
         self.begin()
 
     def watch(self) -> None:
         """Show progress until the work is done."""
-        console = _console(sys.stderr)
-        if console is None:
+        if self.console is None:
             pause = EVERY_S
             while not self.done.wait(pause):
                 print(f'calib_ros: {_printable(str(self))}', file=sys.stderr, flush=True)
                 pause = min(2.0 * pause, 16.0 * EVERY_S)
         elif not self.done.wait(FIRST_S):
-            self._as_bar(console)
+            self._as_bar()
 
-    def _as_bar(self, console: Any) -> None:
+    def _as_bar(self) -> None:
         from rich import progress
 
         columns = (
@@ -133,7 +136,7 @@ class Work(Progress):
             progress.BarColumn(bar_width=20),
             progress.TextColumn('{task.fields[times]}'),
         )
-        with progress.Progress(*columns, console=console, transient=True) as bar:
+        with progress.Progress(*columns, console=self.console, transient=True) as bar:
             task = bar.add_task('', total=None, times='')
             while True:
                 total = 1.0 if 0.0 < self.share < 1.0 else None
@@ -179,7 +182,7 @@ def _printable(text: str) -> str:
     return ''.join(c if c.isprintable() or c == '\n' else '?' for c in text)
 
 
-def _fitted(line: str, indent: str, stream: TextIO) -> str:
+def fitted(line: str, indent: str, stream: TextIO) -> str:
     """Return a line wrapped for a terminal; in a file it stays one."""
     return wrapped(line, '', indent, _width(stream)) if stream.isatty() else _printable(line)
 

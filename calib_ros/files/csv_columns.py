@@ -136,12 +136,12 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
     """
     if (place := data.find(b'\0')) >= 0:
         line = above + 1 + data.count(b'\n', 0, place)
-        raise InputError(
+        raise ColumnsError(
             f'{path} is not UTF-8 text, line {line} has zero bytes: is it damaged? Save it as '
             'UTF-8'
         )
     if not data.isascii():
-        data = decoded(data, str(path), InputError).encode()
+        data = decoded(data, str(path), ColumnsError).encode()
     found = regular(path, data, above=above)
     return found or _irregular(path, data.decode(), progress, above)
 
@@ -244,11 +244,31 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
             )
 
 
-def like_joints(header: Sequence[str], joints: int) -> str:
-    """Return the option for numbered joint names in a header, or an example."""
+def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
+    """Return the option that names missing columns: with those of a header like them, or NAME."""
+    if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
+        return 'Its first line holds numbers, not names: --columns "q1=#1,q2=#2,..."'
+    found = {
+        name: next((each for each in header if re.match(rf'{name}\b', each, re.I)), 'NAME')
+        for name in missing
+    }
+    of_joints = [f'q{k}' for k in range(1, joints + 1)]
+    more = ''
+    if found.keys() >= {*of_joints}:
+        like = _like_joints(header, joints)
+        more = '' if like else '; joint values in another file: --joints FILE'
+        others = {name: found[name] for name in found if name not in of_joints}
+        found = {'q*': like or 'NAME*', **others}
+    plain = {name: re.fullmatch(r'[\w.*]+', each) for name, each in found.items()}
+    given = (f'{name}={each if plain[name] else f"{{{each}}}"}' for name, each in found.items())
+    return f'Columns of other names: --columns "{",".join(given)}"{more}'
+
+
+def _like_joints(header: Sequence[str], joints: int) -> str:
+    """Return the names that count the joints in a header, with a star for the number."""
     for name in header:
         for one in re.finditer('1', name):
             before, after = name[: one.start()], name[one.end() :]
             if all(f'{before}{k}{after}' in header for k in range(1, joints + 1)):
-                return '' if before + after == 'q' else f'q*={before}*{after},'
-    return 'q*=joint_*,'
+                return f'{before}*{after}'
+    return ''

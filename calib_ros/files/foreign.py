@@ -59,7 +59,13 @@ class Foreign:
         values, notes, lines = table.values(), table.notes, table.lines
         if self.log is not None:
             log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
-            values = log.values() | values
+            joints = log.values()
+            if 'q1' not in joints:
+                raise InputError(
+                    f'{self.log} has no column q1; {log.has}: give --columns "q*=NAME*" or '
+                    '--joints-preset'
+                )
+            values = joints | values
             if len(log.lines) != len(lines):
                 raise InputError(
                     f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: each '
@@ -146,7 +152,7 @@ class _Table:
             if missing := [name for name in names if name not in kept]:
                 raise InputError(
                     f'{self._path} has no column for {", ".join(missing)}: name it by --columns '
-                    f'{missing[0]}=NAME; {self._has()}'
+                    f'{missing[0]}=NAME; {self.has}'
                 )
         return kept
 
@@ -159,7 +165,7 @@ class _Table:
                 kept[ours] = each
             elif not set(missing) <= self._optional:
                 raise InputError(
-                    f'{self._path} has no column {", ".join(missing)} for {ours}; {self._has()}'
+                    f'{self._path} has no column {", ".join(missing)} for {ours}; {self.has}'
                 )
             else:
                 absent.append(f'{ours} ({", ".join(missing)})')
@@ -167,7 +173,9 @@ class _Table:
             self.notes.append(f'it has no {", ".join(absent)}: left out')
         return kept
 
-    def _has(self) -> str:
+    @property
+    def has(self) -> str:
+        """Return in words which columns there are."""
         return f'it has {", ".join(filter(None, self._sheet.header))}'
 
     def words(self) -> dict[str, list[str]]:

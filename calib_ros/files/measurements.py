@@ -23,7 +23,7 @@ from calib_ros.files.columns import (
     lines_in_words,
     numbered,
 )
-from calib_ros.files.csv_columns import like_joints, refuse_separator
+from calib_ros.files.csv_columns import named_by_option, refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
@@ -286,10 +286,9 @@ def _check_header(columns: Columns, joints: int) -> None:
         expected = ', '.join([*needed[:joints], *POSITION])
         raise ColumnsError(
             f'{columns.path} has no column {", ".join(missing)}; expected {expected} '
-            f'and, with orientation, {", ".join(QUATERNION)} as well (or '
-            'distance, plane, or location and socket); found '
+            '(or distance, plane, or location and socket); found '
             f'{", ".join(columns.header) or "nothing"}. '
-            f'Columns of other names: --columns "{like_joints(columns.header, joints)}x=NAME,..."'
+            f'{named_by_option(columns.header, missing, joints)}'
         )
 
 

@@ -25,7 +25,7 @@ def opencv() -> Any:
         import cv2
     except ImportError as err:
         raise ConfigError(
-            'photographs need OpenCV: sudo apt install python3-opencv, or pip install '
+            'boards need OpenCV: sudo apt install python3-opencv, or pip install '
             '"calib_ros[camera]"'
         ) from err
     if not hasattr(cv2, 'aruco'):

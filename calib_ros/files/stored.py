@@ -134,6 +134,8 @@ def check(path: Path) -> None:
     metadata = path / 'metadata.yaml'
     if metadata.exists():
         parse_yaml(read_text(metadata), str(metadata))
+    elif not _files(path):
+        raise ValueError('no .mcap or .db3 file is in it')
     for file in _files(path):
         if file.suffix == '.db3':
             with closing(_open(file)) as connection:

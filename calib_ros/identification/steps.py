@@ -78,12 +78,12 @@ class Step:
         if line < 10**6 and not fraction:  # row numbers instead of a clock
             when = f'line {line}, if rows are in the order of measurement'
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
-        text = f'something moved before {where}'
-        text += f' of set {self.set + 1} ({when}): ' if self.set else f' ({when}): '
-        size = f'{1e3 * self.size:.2g} m{self.unit}'
+        where += f' of set {self.set + 1}' if self.set else ''
+        size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+        thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':
-            return f'{text}the zero of {self.what} ({size})'
-        text += f'{self.thing} ({self.what}, {size})'
+            thing, of = f'the zero of {self.what}', ''
+        text = f'{thing} moved {size}{of} before {where} ({when})'
         if self.unused:
             text += f'; measurements {self.unused} carry no weight'
         return text

@@ -326,7 +326,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
         alike = [joint.type for joint in ours.joints] == types
         if alike and not np.allclose(ours.table, chain.table, atol=1e-6):
             what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'
-            published = f'set chain to {ours.name}'
+            published = f'set chain (--chain) to {ours.name}'
             arm = replace(ours, base=chain.base, tool=chain.tool)
             yield Suspect(what, remedy, rank=2, chain=arm, published=published)
 

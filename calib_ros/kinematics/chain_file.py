@@ -61,7 +61,9 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     if not path.suffix and not path.is_file():
         robots = shipped_robots()
         if str(name_or_path) not in robots:
-            raise UnknownNameError('robot', str(name_or_path), robots)
+            raise UnknownNameError(
+                'robot (or path of a chain file or URDF)', str(name_or_path), robots
+            )
         path = robots[path.name]
     return parse_chain(read_text(path), str(path))
 

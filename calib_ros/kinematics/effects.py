@@ -121,8 +121,9 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
         return members(chain, name)
     joint = Parameter(name).owner
     if joint not in chain.joint_names:
-        known = name if '.' not in name else joint
-        raise UnknownNameError('effect or joint', known, (*GROUPS, *chain.joint_names))
+        if '.' not in name:
+            raise UnknownNameError('model', name, ('geometric', 'auto', *GROUPS))
+        raise UnknownNameError(f'joint in effect {name}', joint, chain.joint_names)
     check(name, chain.joint_names)
     return (name,)
 

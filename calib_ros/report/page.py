@@ -218,6 +218,8 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
         lines += _listed(reason.steps) if reason.steps else []
     if report.advice:
         lines += _paragraphs(*report.steps)
+    elif report.steps:
+        lines += [*_section('What to do next'), *_listed(report.steps)]
     for each in (report.accuracy, *report.sections):
         if each is None:
             continue
@@ -230,8 +232,7 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     pairs = [*report.identity, *((COUNTED.get(k, k), v) for k, v in samples.items() if v)]
     pairs += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
     identity = [f'{name}: {value}' for name, value in pairs]
-    steps = () if report.advice else report.steps
-    lists = {'What to do next': steps, 'Please note': report.remarks, 'Identity': identity}
+    lists = {'Please note': report.remarks, 'Identity': identity}
     for title, points in lists.items():
         lines += [*_section(title), *_listed(points)] if points else []
     return '\n'.join(lines)

@@ -37,8 +37,8 @@ from calib_ros.shown import some
 
 NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
-    'calib_ros export (~/export of the node) writes the correction for its controller, calib_ros '
-    'compensate corrects its programs'
+    'give the correction to its controller (calib_ros export, or ~/export of the node), or '
+    'correct its programs (calib_ros compensate)'
 )
 UNPROVEN = (
     'All these poses were used to compute the correction: a small error "after" proves nothing.'
@@ -196,11 +196,11 @@ def _steps(
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': beyond,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
-        'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '
-        'poses where it is not valid.': result.region is not None and not result.region.whole,
-        f'{BRING}.': True,
+        f'{BRING[0].upper()}{BRING[1:]}.': True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': True,
+        'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '
+        'poses where it is not valid.': result.region is not None and not result.region.whole,
     }
     return tuple(step for step, needed in found.items() if needed)
 

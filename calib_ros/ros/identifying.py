@@ -195,6 +195,7 @@ class Identifying:
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples
             )
+            self.last += '; to keep it call ~/save'
         else:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'

@@ -59,8 +59,8 @@ class Account:
                 text += f'; {label}: {parts}'
         if self.foreign_names:
             text += (
-                f'; joint states name {", ".join(self.foreign_names)}: if these are the joints '
-                'of the chain under other names, set joint_names (--joint-names)'
+                f'; joint states name {", ".join(self.foreign_names)}: give the chain of this arm '
+                '(--chain) or, if only the names differ, set joint_names (--joint-names)'
             )
         return text
 
@@ -70,6 +70,18 @@ class Hint(NamedTuple):
 
     status: str
     text: str
+
+
+def unheard(received: Mapping[str, int]) -> list[Hint]:
+    """Tell that nothing has come, or only joint states."""
+    if not received:
+        return [Hint('', 'nothing was received: check the topics (joint_topics, sources)')]
+    if received[POSES] or received[JOINTS] < NO_ACCIDENT:
+        return []
+    words = (
+        'no measurements received: is the device on, and its topic measured_pose or in sources?'
+    )
+    return [Hint('no measurements received: check sources', words)]
 
 
 def restless(needed: float, still: float) -> Hint:

@@ -104,7 +104,9 @@ def in_frames_of(
     frames = Frames(calibration.owners) if calibration.owners else named(usable)
     sets = [each for part in collect(since, sigmas, frames) for each in part]
     if not sets:
-        raise InputError('no poses have been measured since: measure some new poses first')
+        raise InputError(
+            'no poses since the calibration was identified or loaded: measure some new poses'
+        )
     known = calibration.chain.frame_names
     if not all(each.base in known and each.tool in known for each in sets):
         raise InputError(

@@ -21,7 +21,7 @@ from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
-from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress
+from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.problems import (
@@ -234,7 +234,7 @@ class CalibrationSession:
     @property
     def hints(self) -> list[Hint]:
         """Return what looks wrong in the received messages."""
-        found: list[Hint] = []
+        found = [] if self.samples else unheard(self.received)
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):

@@ -19,11 +19,11 @@ def bad_inputs():
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
     yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'
-    yield 'too few rows', (*csv_of, 'few.csv'), '3 measured poses are too few'
+    yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
     yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
-    yield 'an empty bag folder', (*bag_of, 'folder'), 'folder is not a readable rosbag2'
+    yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
     yield 'an empty bag file', (*bag_of, 'empty.mcap'), 'empty.mcap is not a readable rosbag2'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
     yield 'no such chain', (*chain_of, 'missing.yaml'), 'missing.yaml'
@@ -79,7 +79,7 @@ def bad_inputs():
         'is a report, but identify takes',
     )
     yield 'demo, into a file', ('demo', '--out', 'empty', '--poses', '5'), 'empty'
-    yield 'demo, too few', ('demo', '--poses', '2'), '2 measured poses are too few'
+    yield 'demo, too few', ('demo', '--poses', '2'), 'too few different poses: 2 measured'
 
 
 @pytest.mark.parametrize(

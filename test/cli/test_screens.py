@@ -124,9 +124,11 @@ def test_the_help_of_a_command(shown, name):
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
         (('robots', 'ur5e'), 'unexpected argument "ur5e"'),
         (('chain',), 'required: ROBOT'),
+        (('identify', 'measured.csv'), '--chain (calib_ros robots lists the arms supplied)'),
+        (('verify', 'a.csv', '--tolerance', '0,2'), "must be a number such as 0.1, not '0,2'"),
         (
             ('identify', 'measured.csv', '--chain', 'ur5e', '--folds', 'five'),
-            "invalid int value: 'five'",
+            "must be a whole number, not 'five'",
         ),
         (
             ('simulate', 'bag', '--chain', 'ur5e', '--storage', 'rosbag1'),
@@ -291,6 +293,20 @@ def test_on_a_terminal_the_sign_is_a_bar_that_vanishes(shown, monkeypatch):
     said = sys.stderr.getvalue()
     assert 'identifying' in said
     assert said.endswith('\x1b[2K')
+
+
+def test_a_warning_goes_above_the_bar(monkeypatch):
+    """A missing extra was told behind the bar, on its line."""
+    pytest.importorskip('rich')
+    monkeypatch.setenv('TERM', 'xterm-256color')
+    monkeypatch.setattr(screen, 'FIRST_S', 1e-4)
+    monkeypatch.setattr(sys, 'stderr', Terminal())
+    made = screen.Screen()
+    with made.work('counting'):
+        while 'counting' not in sys.stderr.getvalue():
+            pass
+        made.warn('no jinja2', 'note')
+    assert re.search(r'\x1b\[2K(\x1b\[33m)?note: no jinja2', sys.stderr.getvalue())
 
 
 def test_work_tells_the_time_left(monkeypatch):

@@ -12,10 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Expression, Layout, load_layout, parse_columns, presets
 from calib_ros.files.tables import read_table
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.settings import Settings
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
@@ -352,6 +355,31 @@ def test_axes_called_like_accelerations_are_none(tmp_path):
     assert out.read_text().splitlines()[0] == 'q1,q2,x,y,z'
 
 
+@pytest.mark.parametrize(
+    ('names', 'proposed'),
+    [
+        (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*_rad"'),
+        (
+            ['Joint 1 [rad]', 'Joint 2 [rad]', 'X [m]', 'y', 'z'],
+            '--columns "q*={Joint * [rad]},x={X [m]}"',
+        ),
+        (
+            ['x', 'y', 'z', 'a', 'b'],
+            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+        ),
+        (['q1', 'a', 'x', 'y', 'z'], '--columns "q2=NAME"'),
+        (['0.1', '-2', '3', '4e-5', '5'], 'numbers, not names: --columns "q1=#1,q2=#2,..."'),
+    ],
+)
+def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES, names=names))
+    joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
+    with pytest.raises(InputError) as told:
+        loading.table(path, Chain('arm', 'standard', joints), Settings())
+    assert str(told.value).endswith(proposed)
+
+
 def test_workbooks(tmp_path):
     openpyxl = pytest.importorskip('openpyxl')
     book = openpyxl.Workbook()
@@ -382,3 +410,16 @@ def test_workbooks(tmp_path):
     path.write_bytes(b'no workbook')
     with pytest.raises(InputError, match='cannot read'):
         read_table(path, 2, foreign=Foreign(Layout()))
+
+
+def test_columns_of_joints_are_those_of_their_log(tmp_path, capsys):
+    """They were ignored, and the other table was blamed."""
+    (tmp_path / 'log.csv').write_text(text_of(JOINTS, names=['J1', 'J2']))
+    (tmp_path / 'table.csv').write_text(text_of(PLACES, names=['x', 'y', 'z']))
+    files = [str(tmp_path / name) for name in ('table.csv', 'log.csv', 'out.csv')]
+    given = ['import', files[0], '--joints', files[1], '--out', files[2]]
+    assert main(given) == 1
+    told = f'{files[1]} has no column q1; it has J1, J2: give --columns "q*=NAME*"'
+    assert told in capsys.readouterr().err
+    assert main([*given, '--columns', 'q*=J*']) == 0
+    assert_same(read_table(tmp_path / 'out.csv', 2), None)

@@ -240,7 +240,7 @@ def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(st
 
 def test_another_robot_in_messages_is_named_as_the_chain_to_set():
     problem = Problem(load_chain('ur5e'), seen_of(), of_messages=True)
-    assert 'set chain to ur10e (' in str(explained(problem))
+    assert 'set chain (--chain) to ur10e (' in str(explained(problem))
 
 
 def test_large_errors_of_an_arm_are_no_mistake():

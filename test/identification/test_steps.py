@@ -194,8 +194,8 @@ def test_without_stamps_the_order_of_the_rows_is_said():
     true, seen = session(3)
     result = identify(Problem(UR10E, moved(seen, true, 'tool', 8e-4), **SIGMAS))
     assert result.refusals[0].startswith(
-        'something moved before pose 27 (line 27, if rows are in the order of measurement): the '
-        'target (tool, 0.8'
+        'the target moved by 0.8 mm (tool) before pose 27 (line 27, if rows are in the order of '
+        'measurement)'
     )
 
 

@@ -186,9 +186,9 @@ def test_defaults_and_numbers_without_a_dot():
 BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\n'
 WRONG = [
     ('alpha:', 'alpha: 0.0, alpha:', 'key "alpha" appears twice'),
-    ('theta: 0.0', 'theat: 0.0', 'joint 1 "theat": did you mean "theta"'),
+    ('theta: 0.0', 'theat: 0.0', 'joint 1: unknown key "theat": did you mean "theta"'),
     ('convention:', 'konvention:', '"konvention": did you mean "convention"'),
-    ('quat_xyzw:', 'quat:', 'base "quat": did you mean "quat_xyzw"'),
+    ('quat_xyzw:', 'quat:', 'base: unknown key "quat": did you mean "quat_xyzw"'),
     ('convention: standard', 'convention: standart', '"standart": did you mean "standard"'),
     ('type: revolute', 'type: revolut', '"joint_1" "revolut": did you mean "revolute"'),
     ('a: 0.0', 'a: .nan', 'joint 1: a must be a finite number, not nan'),

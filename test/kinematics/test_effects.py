@@ -254,7 +254,7 @@ def test_unknown_effects_are_named_with_the_alternatives(name, alternative, rng)
     with pytest.raises(UnknownNameError) as caught:
         Problem(UR10E, seen, effects=(name,))
     assert caught.value.name not in caught.value.alternatives
-    assert alternative in str(caught.value).partition('valid are')[2]
+    assert alternative in str(caught.value).partition('valid:')[2]
 
 
 def rich(rng):

@@ -221,6 +221,7 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
             (True, True, False),
             'LARGEST_ERROR; GAIN',
         ),
+        ((Rule.MISTAKE, Rule.ENCODER), (True, False), 'ENCODER'),
         ((Rule.MOVED, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
@@ -247,7 +248,7 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
     near = replace(result, region=replace(result.region, limit=1e-3, share=0.1))
     report = report_of(problem, near)
     assert report.verdict.heading == 'Accepted near the measured poses'
-    assert report.steps[0].startswith('To use it beyond the measured poses')
+    assert report.steps[-1].startswith('To use it beyond the measured poses')
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
     verdict = report_of(problem, doubtful).verdict
     assert 'ur3' in verdict.text[1]

@@ -39,7 +39,7 @@ def test_errors_are_answers(cell, recording):
         {'joint_states': some['joint_states'][:120], 'measured_pose': some['measured_pose'][:8]}
     )
     few = cell.refused('identify')
-    assert '2 measured poses are too few, at least 5' in few.message
+    assert 'too few different poses: 2 measured, at least 5' in few.message
 
 
 @pytest.mark.parametrize(
@@ -86,7 +86,7 @@ def test_what_made_poses_too_few_is_said_with_it(cell, recording):
     cell.spin_until(lambda: cell.node.session.received['measurements'] == len(poses))
     answer = cell.refused('identify')
     said = cell.in_full(answer)
-    assert '4 measured poses are too few, at least 5 are needed' in said
+    assert 'too few different poses: 4 measured, at least 5 needed' in said
     assert '1200 joint states and 96 measurements gave 4 poses' in said
     assert said.endswith('or hold parameters (fixed)')
     for words in (answer.message, said):

@@ -43,7 +43,7 @@ def test_the_parameter_file_holds_every_parameter_with_its_default(idle):
 @pytest.mark.parametrize(
     ('name', 'value', 'said'),
     [
-        ('model', 'nonsense', 'unknown effect or joint "nonsense"'),
+        ('model', 'nonsense', 'unknown model "nonsense"'),
         ('model', 'gear', 'nothing to fit in "gear"'),
         ('loss', 'hubert', 'did you mean "huber"'),
         ('fixed', ['joint_7.a'], 'unknown parameter "joint_7.a"'),

@@ -63,7 +63,7 @@ def test_the_status_tells_what_the_arm_does(cell, recording):
     assert session.state == 'the arm is moving'
     few = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
-    assert few[-1].data == 'the arm is moving; 0 poses'
+    assert few[-1].data == 'the arm is moving; no measurements received: check sources; 0 poses'
 
 
 def test_the_status_is_short_and_its_first_words_are_those_that_matter(

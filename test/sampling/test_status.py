@@ -8,6 +8,7 @@ import pytest
 from sessions import SIGMAS, UR5E, drive, samples, session, tracker
 from streams import POSE, TRACKER, joint_state, of_joints, pose, take
 
+from calib_ros.errors import InputError
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -153,3 +154,18 @@ def test_the_status_is_never_an_error():
     assert CalibrationSession(UR5E).status('identifying') == (
         'waiting for joint states; identifying; 0 poses'
     )
+
+
+def test_a_silent_device_is_told():
+    """The status said only "0 poses"; a wrong topic is the most frequent first mistake."""
+    made = CalibrationSession(UR5E, Settings())
+    assert made.warnings == ('nothing was received: check the topics (joint_topics, sources)',)
+    where = UR5E.random_joints(3, np.random.default_rng(1))
+    drive(made, where, [])
+    assert 'no measurements received: check sources' in made.status()
+    (words,) = made.warnings
+    with pytest.raises(InputError, match=re.escape(words)):
+        made.identify()
+    drive(made, where, [tracker()], start=20.0)
+    made.finish()
+    assert made.warnings == ()
