@@ -52,7 +52,7 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
                     os.fsync(file.fileno())
             try:
                 for k, path in enumerate(contents if overwrite and len(contents) > 1 else ()):
-                    if path.is_file():
+                    with suppress(FileNotFoundError):  # none, or another process has it
                         (os.replace if k else _link)(path, earlier[path])
                         placed.append(path)
                 for path, partial in partials.items():

@@ -158,7 +158,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             *ends,
         )
     except UnknownNameError as err:
-        what = f'{err.what} in {where}: calibration.region'
+        what = f'{where}: calibration.region: {err.what}'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
         raise damaged('region', where, err) from err

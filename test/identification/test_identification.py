@@ -87,10 +87,10 @@ def test_standard_deviations_are_honest():
 def test_too_few_pairs_say_how_many_are_needed():
     rng = np.random.default_rng(13)
     seen = measure(UR10E, UR10E.random_joints(4, rng), rng)
-    with pytest.raises(TooFewObservationsError, match=r'^4 measured .* at least 5'):
+    with pytest.raises(TooFewObservationsError, match=r': 4 measured, at least 5'):
         identify(Problem(UR10E, seen))
     same = seen.select(np.zeros(50, dtype=int))
-    with pytest.raises(TooFewObservationsError, match=r'^1 measured'):
+    with pytest.raises(TooFewObservationsError, match=r': 1 measured'):
         identify(Problem(UR10E, same))
 
 

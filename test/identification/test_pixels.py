@@ -207,7 +207,10 @@ def test_gross_errors_of_corners_and_images_are_named(rng):
 
 @pytest.mark.parametrize(
     ('on_flange', 'named'),
-    [(True, 'the camera or its lens (tool'), (False, "the camera, its lens or the robot's foot")],
+    [
+        (True, 'the camera or its lens moved by'),
+        (False, "the camera, its lens or the robot's foot"),
+    ],
 )
 def test_a_zoom_in_the_session_is_one_of_the_camera(on_flange, named):
     _, seen = scene(4, on_flange)
