@@ -29,6 +29,7 @@ from calib_ros.identification import records
 from calib_ros.identification.levels import ALIKE
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.observations import Observations
+from calib_ros.identification.packing import packed
 from calib_ros.identification.region import Region, region_of_record, sigma_of
 from calib_ros.identification.result import Identification
 from calib_ros.kinematics import se3
@@ -124,7 +125,7 @@ class Calibration(Shown):
             record['covariance'] = {
                 'names': list(self.names),
                 'freedom': None if np.isinf(self.freedom) else self.freedom,
-                'root': records.packed(self.covariance),
+                'root': packed(self.covariance),
             }
         if self.rows is not None:
             record['rows'] = self.rows.document()

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import special
 from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
@@ -25,15 +26,14 @@ from calib_ros.identification.leastsquares import (
     minimise,
     triangular_factor,
 )
-from calib_ros.identification.levels import CONFIDENT
+from calib_ros.identification.levels import CONFIDENT, KNOWN
 from calib_ros.identification.noise import Noise, noise_of
 from calib_ros.identification.observations import SOME_POSES
 from calib_ros.identification.problem import Learned, Problem
 from calib_ros.identification.robust import SUSPICIOUS, Robust, reweighted, thorough_fit
 from calib_ros.identification.start import start_frames
-from calib_ros.identification.validation import ParameterRow
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray, left_jacobian_inverse
 
 SOME = 2 * SOME_POSES
@@ -41,6 +41,34 @@ SOME = 2 * SOME_POSES
 FOLLOWED = 2.0
 """Inverse share of the unmodelled error that the geometric model does not follow
 (benchmarks/real_robots.py)."""
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter of the model: m for lengths, rad for angles.
+
+    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses do
+    not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
+    degrees of freedom of `std`; infinite if the noise is known.
+    """
+
+    name: Parameter
+    value: float
+    offset: float
+    std: float | None
+    status: str
+    freedom: float = np.inf
+
+    def half_width(self, level: float = CONFIDENT) -> float | None:
+        """Return the half width of the confidence interval, by Student's t."""
+        if self.std is None:
+            return None
+        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
+
+    def beyond(self, length: float, angle: float) -> bool:
+        """Tell whether a DH parameter is certainly further from nominal than a limit."""
+        limit = length if self.name.is_length else angle
+        return self.std is not None and self.name.of_dh and abs(self.offset) - 3 * self.std > limit
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,14 @@ from calib_ros.identification.acceptance import refusals, remarks
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.considered import considered
 from calib_ros.identification.drift import chance_of_gain
-from calib_ros.identification.fitting import SOME, Fitted, Simpler, fit, parameter_rows
+from calib_ros.identification.fitting import (
+    SOME,
+    Fitted,
+    ParameterRow,
+    Simpler,
+    fit,
+    parameter_rows,
+)
 from calib_ros.identification.leastsquares import System, minimise, normal_equations
 from calib_ros.identification.misfits import arms_own, outliers_of
 from calib_ros.identification.problem import Problem
@@ -30,7 +37,7 @@ from calib_ros.identification.result import Identification
 from calib_ros.identification.robust import Robust
 from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.identification.steps import find_step
-from calib_ros.identification.validation import ParameterRow, compare, validate
+from calib_ros.identification.validation import compare, validate
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXCEPTION

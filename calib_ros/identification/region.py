@@ -27,7 +27,7 @@ from calib_ros.identification.drift import inverse_root
 from calib_ros.identification.evidence import Mixed, Posterior
 from calib_ros.identification.levels import KNOWN, UNUSUAL
 from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.records import damaged, packed, parse_rows, unpacked
+from calib_ros.identification.packing import damaged, packed, parse_rows, unpacked
 from calib_ros.identification.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -13,13 +13,14 @@ from scipy import special
 from calib_ros.errors import ConfigError
 from calib_ros.identification import identifiability
 from calib_ros.identification.evidence import Posterior
+from calib_ros.identification.fitting import ParameterRow
 from calib_ros.identification.levels import CONFIDENT, KNOWN
 from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.noise import Noise
 from calib_ros.identification.reasons import Reason
 from calib_ros.identification.region import Region
 from calib_ros.identification.steps import Step
-from calib_ros.identification.validation import Comparison, ParameterRow
+from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -16,46 +16,18 @@ from scipy import special
 from calib_ros.identification.configurations import distinct
 from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.identification.leastsquares import System, minimise, without_each
-from calib_ros.identification.levels import CONFIDENT, KNOWN, TELLING
+from calib_ros.identification.levels import CONFIDENT, TELLING
 from calib_ros.identification.observations import Observations, numbered
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.robust import OUTLIER, Robust, distances_of
 from calib_ros.identification.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame, of_them
 
 COUNTS = 0.005
 """Relative change of an RMS error that counts; less is chance (benchmarks/real_robots.py)."""
-
-
-@dataclass(frozen=True)
-class ParameterRow:
-    """One parameter of the model: m for lengths, rad for angles.
-
-    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses do
-    not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
-    degrees of freedom of `std`; infinite if the noise is known.
-    """
-
-    name: Parameter
-    value: float
-    offset: float
-    std: float | None
-    status: str
-    freedom: float = np.inf
-
-    def half_width(self, level: float = CONFIDENT) -> float | None:
-        """Return the half width of the confidence interval, by Student's t."""
-        if self.std is None:
-            return None
-        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
-
-    def beyond(self, length: float, angle: float) -> bool:
-        """Tell whether a DH parameter is certainly further from nominal than a limit."""
-        limit = length if self.name.is_length else angle
-        return self.std is not None and self.name.of_dh and abs(self.offset) - 3 * self.std > limit
 
 
 @dataclass(frozen=True)

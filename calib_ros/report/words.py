@@ -15,6 +15,7 @@ import calib_ros
 from calib_ros.apply.confidence import interval_of
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.changes import FALSE, changes_in_words
+from calib_ros.identification.fitting import ParameterRow
 from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.noise import Noise
@@ -22,7 +23,7 @@ from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
 from calib_ros.identification.region import Region
 from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
+from calib_ros.identification.validation import Comparison, ErrorFigures
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter

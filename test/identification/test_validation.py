@@ -11,10 +11,10 @@ from fits import UR10E, measured_arm
 from scipy import stats
 
 from calib_ros.identification import validation
+from calib_ros.identification.fitting import ParameterRow
 from calib_ros.identification.problem import Problem
 from calib_ros.identification.validation import (
     Comparison,
-    ParameterRow,
     Residuals,
     compare,
     left_out,
