@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 
 import calib_ros
+from calib_ros.decision.packing import packed
+from calib_ros.decision.region import Region, region_of_record, sigma_of
+from calib_ros.decision.result import Identification
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.estimation.levels import ALIKE
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification import records
-from calib_ros.identification.levels import ALIKE
-from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.packing import packed
-from calib_ros.identification.region import Region, region_of_record, sigma_of
-from calib_ros.identification.result import Identification
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (

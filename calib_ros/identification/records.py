@@ -17,11 +17,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.decision.packing import damaged, unpacked
 from calib_ros.errors import ConfigError
-from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.packing import damaged, unpacked
-from calib_ros.identification.start import fit_to_arm, movable
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.start import fit_to_arm, movable
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
     calibration_record,
