@@ -32,8 +32,8 @@ from scipy.optimize import least_squares, root
 
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain

@@ -26,9 +26,9 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification.identifiability import independent
-from calib_ros.identification.leastsquares import System, stacked, triangular_factor
-from calib_ros.identification.samples import Samples
+from calib_ros.estimation.identifiability import independent
+from calib_ros.estimation.leastsquares import System, stacked, triangular_factor
+from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 

@@ -37,13 +37,13 @@ sys.path[:0] = [str(ROOT / 'test')]
 import plants
 import psutil
 
+from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, run
 from calib_ros.fleet.standing import standings, write_report
 from calib_ros.fleet.work import Outcome, Task, sources, work
-from calib_ros.identification.identifiability import structurally_independent
 from calib_ros.kinematics.chain_file import load_chain
 
 POSES, BEFORE = 60, 3

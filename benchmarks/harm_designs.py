@@ -10,8 +10,8 @@ from cell_simulator import RIPPLE, Arm, bent, poses, resized
 from harm_sensors import SENSORS, in_view
 from scipy.spatial.transform import Rotation
 
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 
 NOISE = (5e-5, 2e-4)

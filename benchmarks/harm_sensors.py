@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib_ros.identification.observations import Observations
+from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.lens import Lens
 

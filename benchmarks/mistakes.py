@@ -29,9 +29,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision import mistakes, suspects
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.tables import read_table
-from calib_ros.identification import mistakes, suspects
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
 

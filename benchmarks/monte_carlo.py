@@ -21,10 +21,10 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.identification import identifiability
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.leastsquares import triangular_factor
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.leastsquares import triangular_factor
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 
 SIGMA_POSITION, SIGMA_ORIENTATION = 5e-5, 2e-4

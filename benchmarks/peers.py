@@ -42,9 +42,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.export import converted
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 

@@ -25,11 +25,11 @@ import numpy as np
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
 from calib_ros.errors import InputError
-from calib_ros.identification import identifiability
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.leastsquares import normal_equations, triangular_factor
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.resection import board_poses
 from calib_ros.identification.identification import identify
-from calib_ros.identification.leastsquares import normal_equations, triangular_factor
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.resection import board_poses
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain

@@ -47,9 +47,9 @@ from calib_ros.apply.design import Candidates, Design, accuracy, predicted
 from calib_ros.apply.planning import choose
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.workspace import place
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import transform

@@ -41,13 +41,13 @@ from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.changes import Columns
+from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.samples import Samples
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import Columns
 from calib_ros.identification.identification import identify
-from calib_ros.identification.leastsquares import System, minimise
-from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate
-from calib_ros.identification.samples import Samples
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of

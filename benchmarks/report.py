@@ -28,8 +28,8 @@ from browser import browser
 
 from calib_ros.apply import simulation
 from calib_ros.cli.main import main as calib_ros
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of

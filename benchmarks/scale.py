@@ -24,9 +24,9 @@ import numpy as np
 from cell_simulator import misfit, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 

@@ -53,7 +53,7 @@ def _split(numbers):
 
 
 def _observations(given, samples):
-    from calib_ros.identification.observations import Observations
+    from calib_ros.estimation.observations import Observations
 
     joints, positions, rotations = samples
     return Observations.from_arrays(joints, positions, rotations if given.oriented else None)
@@ -65,8 +65,8 @@ def _positions(given):
 
 def ours(given):
     """Identify with everything: frames, rank, gross errors, covariance, residuals, judgement."""
+    from calib_ros.estimation.problem import Problem
     from calib_ros.identification.identification import identify
-    from calib_ros.identification.problem import Problem
     from calib_ros.kinematics.chain_file import load_chain
 
     judge = np.fromfile(given.folder / 'judge.bin')
@@ -93,8 +93,8 @@ def _start(given):
 
 def fit(given):
     """Only fit, from a start with frames: what the others below do, too."""
-    from calib_ros.identification.leastsquares import System, minimise
-    from calib_ros.identification.samples import Samples
+    from calib_ros.estimation.leastsquares import System, minimise
+    from calib_ros.estimation.samples import Samples
 
     start, names, sigmas = _start(given)
     system = System((Samples(_observations(given, given.samples), *sigmas),))
@@ -111,21 +111,21 @@ class Streamed:
 
     def blocks(self, chain, names):
         """Yield weighted rows of Jacobian and residual; see `leastsquares.Samples`."""
-        from calib_ros.identification.samples import Samples
+        from calib_ros.estimation.samples import Samples
 
         for chunk in self.given.chunks():
             yield from Samples(_observations(self.given, chunk), *self.sigmas).blocks(chain, names)
 
     def products(self, *which):
         """Return the products of all rows."""
-        from calib_ros.identification.samples import Samples
+        from calib_ros.estimation.samples import Samples
 
         return Samples.products(self, *which)
 
 
 def streamed(given):
     """Only fit, and read the samples from the disk in each iteration."""
-    from calib_ros.identification.leastsquares import System, minimise
+    from calib_ros.estimation.leastsquares import System, minimise
 
     start, names, sigmas = _start(given)
     system = System((Streamed(given, sigmas),))
@@ -134,8 +134,8 @@ def streamed(given):
 
 def one_by_one(given):
     """Only fit, with the same code, one sample at a time."""
-    from calib_ros.identification.leastsquares import System, minimise
-    from calib_ros.identification.samples import Samples
+    from calib_ros.estimation.leastsquares import System, minimise
+    from calib_ros.estimation.samples import Samples
 
     start, names, sigmas = _start(given)
     joints, positions, rotations = given.samples
@@ -149,7 +149,7 @@ def scipy(given):
     """Fit with scipy's least squares; the Jacobian is that of our error model, all at once."""
     from scipy.optimize import least_squares
 
-    from calib_ros.identification.validation import residuals
+    from calib_ros.decision.validation import residuals
     from calib_ros.kinematics.jacobian import ErrorModel
 
     start, names, sigmas = _start(given)

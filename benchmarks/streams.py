@@ -29,8 +29,8 @@ import numpy as np
 from cell_simulator import misfit, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import CalibrationError
-from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.entry import Part

@@ -6,7 +6,10 @@ from calib_ros.apply.compensation import Compensator as Compensator, compensate 
 from calib_ros.apply.planning import Plan as Plan, plan as plan
 from calib_ros.apply.program import Program as Program
 from calib_ros.apply.verification import Verification as Verification, verify as verify
+from calib_ros.decision.result import Identification as Identification
 from calib_ros.errors import CalibrationError as CalibrationError
+from calib_ros.estimation.observations import Observations as Observations
+from calib_ros.estimation.problem import Problem as Problem
 from calib_ros.files.bags import replay as replay
 from calib_ros.files.tables import read_table as read_table
 from calib_ros.identification.calibration import (
@@ -19,11 +22,8 @@ from calib_ros.identification.difference import (
 )
 from calib_ros.identification.identification import identify as identify
 from calib_ros.identification.model_choice import identify_model as identify_model
-from calib_ros.identification.observations import Observations as Observations
-from calib_ros.identification.problem import Problem as Problem
 from calib_ros.identification.recalibrated import Recalibration as Recalibration
 from calib_ros.identification.recalibration import recalibrate as recalibrate
-from calib_ros.identification.result import Identification as Identification
 from calib_ros.kinematics.chain import Chain as Chain
 from calib_ros.kinematics.chain_file import dump_chain as dump_chain, load_chain as load_chain
 from calib_ros.kinematics.urdf import (

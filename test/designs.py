@@ -8,7 +8,7 @@ import numpy as np
 
 from calib_ros.apply import simulation
 from calib_ros.apply.design import Design
-from calib_ros.identification.problem import Problem
+from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 
 from calib_ros.apply.simulation import Cell, faulty
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain

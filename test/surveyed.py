@@ -7,9 +7,9 @@ import functools
 import numpy as np
 
 from calib_ros.apply import simulation
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import transform
 

@@ -14,7 +14,10 @@ import pytest
 from calib_ros.cli.main import TEXTS
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
-ORDER = 'kinematics < identification < sampling < apply < files < report < fleet < ros, cli'
+ORDER = (
+    'kinematics < estimation < decision < identification < sampling < apply < files < report < '
+    'fleet < ros, cli'
+)
 LEVEL = {name: k for k, names in enumerate(ORDER.split(' < ')) for name in names.split(', ')}
 MODULES = {
     '.'.join(path.relative_to(PACKAGE).with_suffix('').parts): path

@@ -15,7 +15,7 @@ import calib_ros
 from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
-from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.shown import Shown
 
 CHAIN = calib_ros.load_chain('ur10e')
@@ -70,7 +70,13 @@ def test_values_are_frozen_and_those_of_arrays_equal_themselves_alone():
     """Comparison of arrays has no truth value, and what has changed since cannot be a key."""
     found = set()
     for module in pkgutil.walk_packages(calib_ros.__path__, 'calib_ros.'):
-        if module.name.split('.')[1] not in ('kinematics', 'identification', 'apply'):
+        if module.name.split('.')[1] not in (
+            'kinematics',
+            'estimation',
+            'decision',
+            'identification',
+            'apply',
+        ):
             continue
         for value in vars(importlib.import_module(module.name)).values():
             if not (isinstance(value, type) and is_dataclass(value)):

@@ -12,7 +12,7 @@ import yaml
 
 import calib_ros
 from calib_ros.cli.main import main
-from calib_ros.identification.reasons import Rule
+from calib_ros.decision.reasons import Rule
 from calib_ros.report.advice import rules
 
 ROOT = Path(__file__).parents[1]

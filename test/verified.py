@@ -5,8 +5,8 @@
 import numpy as np
 
 from calib_ros.apply import simulation
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 
 UR = load_chain('ur10e')

@@ -21,8 +21,8 @@ from functools import cached_property
 
 import numpy as np
 
+from calib_ros.decision.region import Region
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.identification.region import Region
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray

@@ -31,8 +31,8 @@ from functools import cache
 import numpy as np
 from scipy import optimize, special
 
+from calib_ros.decision.validation import Comparison
 from calib_ros.errors import InputError
-from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg
 
+from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
-from calib_ros.identification.identifiability import independent, structurally_independent
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.result import Identification
+from calib_ros.estimation.identifiability import independent, structurally_independent
+from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.jacobian import ErrorModel

@@ -27,8 +27,8 @@ from scipy import linalg
 from calib_ros.apply.candidates import travel_times, visit_order
 from calib_ros.apply.design import Candidates, Design, accuracy, information_of, predicted, times
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.identification.configurations import STILL
-from calib_ros.identification.identifiability import indices_of
+from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.identifiability import indices_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import CRITERIA, Criterion

@@ -30,15 +30,15 @@ import numpy as np
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.commanded import meant
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
+from calib_ros.decision.validation import Comparison, compare
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
+from calib_ros.estimation.configurations import configurations
+from calib_ros.estimation.identifiability import excited
+from calib_ros.estimation.leastsquares import System, minimise, triangular_factor
+from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.samples import Samples
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.configurations import configurations
-from calib_ros.identification.identifiability import excited
-from calib_ros.identification.leastsquares import System, minimise, triangular_factor
-from calib_ros.identification.levels import CONFIDENT
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.samples import Samples
-from calib_ros.identification.validation import Comparison, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of

@@ -15,6 +15,7 @@ from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.options import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
+from calib_ros.estimation.observations import Observations
 from calib_ros.files import loading
 from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
@@ -29,7 +30,6 @@ from calib_ros.files.history import (
 from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.files.tables import Table
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
-from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
 from calib_ros.sampling.session import CalibrationSession

@@ -14,18 +14,18 @@ from typing import Any
 from calib_ros.cli import given, options as common
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
+from calib_ros.decision.changes import reason_in_words
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards
 from calib_ros.files.history import identified as row_of
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import reason_in_words
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate, years_since
-from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of

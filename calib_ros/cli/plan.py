@@ -18,8 +18,8 @@ from calib_ros.atomic import write_together
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.programs import joints_csv, read_joints
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify

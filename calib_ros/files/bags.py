@@ -11,10 +11,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
-from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.hints import LOST, Account, lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of

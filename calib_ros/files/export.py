@@ -28,8 +28,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import CalibrationError
-from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.start import fit_to_arm
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash

@@ -29,11 +29,11 @@ import calib_ros
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.identification.levels import INTERVAL
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import ErrorFigures
+from calib_ros.estimation.levels import INTERVAL
+from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_document, parse_chain
 from calib_ros.kinematics.se3 import FloatArray

@@ -10,16 +10,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from calib_ros.decision.reasons import Reason
+from calib_ros.decision.result import Identification
 from calib_ros.errors import CalibrationError, ColumnsError, TooFewObservationsError
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import Table, read_table
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Reason
 from calib_ros.identification.records import Owner
-from calib_ros.identification.result import Identification
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.sample import named

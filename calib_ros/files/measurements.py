@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import ColumnsError, ConfigError, InputError
+from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
@@ -25,7 +26,6 @@ from calib_ros.files.columns import (
 )
 from calib_ros.files.csv_columns import named_by_option, refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
-from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.sample import socket_place

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.atomic import whole_folder, write_file
+from calib_ros.estimation.observations import Observations
 from calib_ros.files.bags import rosbag2, typestore
-from calib_ros.identification.observations import Observations
 from calib_ros.kinematics.se3 import FloatArray, to_quat
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.messages import JOINT_STATE, VALIDATION

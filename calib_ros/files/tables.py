@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError, unreadable
+from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct, joints_left_out
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
@@ -34,7 +35,6 @@ from calib_ros.files.measurements import (
     joined,
     measurements,
 )
-from calib_ros.identification.observations import Observations
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens

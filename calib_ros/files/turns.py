@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.estimation.observations import Observations
 from calib_ros.files import layouts
 from calib_ros.files.columns import MadeColumns, check_quaternions
-from calib_ros.identification.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.se3 import FloatArray

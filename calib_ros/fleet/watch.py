@@ -32,8 +32,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from scipy import special
 
-from calib_ros.files.history import Row
-from calib_ros.identification.changes import (
+from calib_ros.decision.changes import (
     Columns,
     Explanation,
     Information,
@@ -41,7 +40,8 @@ from calib_ros.identification.changes import (
     likely,
     reason_in_words,
 )
-from calib_ros.identification.levels import CLEARLY, KNOWN, TELLING
+from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
+from calib_ros.files.history import Row
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Observations and a chain in, an identified chain out: accepted or refused, and why."""
+"""The method: `identify`, the choice of a model, the calibration, and what changed since."""

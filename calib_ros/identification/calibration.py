@@ -24,13 +24,14 @@ from typing import Any
 import numpy as np
 
 import calib_ros
+from calib_ros.decision.packing import packed
+from calib_ros.decision.region import Region, region_of_record, sigma_of
+from calib_ros.decision.result import Identification
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.estimation.levels import ALIKE
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification import records
-from calib_ros.identification.levels import ALIKE
-from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.region import Region, region_of_record, sigma_of
-from calib_ros.identification.result import Identification
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
@@ -124,7 +125,7 @@ class Calibration(Shown):
             record['covariance'] = {
                 'names': list(self.names),
                 'freedom': None if np.isinf(self.freedom) else self.freedom,
-                'root': records.packed(self.covariance),
+                'root': packed(self.covariance),
             }
         if self.rows is not None:
             record['rows'] = self.rows.document()

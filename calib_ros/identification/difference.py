@@ -24,16 +24,16 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from calib_ros.decision import changes
+from calib_ros.decision.changes import Columns, Explanation, Information
 from calib_ros.errors import InputError
-from calib_ros.identification import changes
+from calib_ros.estimation.evidence import group_of
+from calib_ros.estimation.identifiability import structurally_independent
+from calib_ros.estimation.levels import CONFIDENT, SEVERAL, chance_of
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.sizes import TYPICAL
+from calib_ros.estimation.start import fit_to_arm
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import Columns, Explanation, Information
-from calib_ros.identification.evidence import group_of
-from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.levels import CONFIDENT, SEVERAL, chance_of
-from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.sizes import TYPICAL
-from calib_ros.identification.start import fit_to_arm
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray

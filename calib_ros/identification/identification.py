@@ -15,22 +15,30 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.decision import mistakes, suspicions
+from calib_ros.decision.acceptance import refusals, remarks
+from calib_ros.decision.drift import chance_of_gain
+from calib_ros.decision.misfits import arms_own, outliers_of
+from calib_ros.decision.region import region_of
+from calib_ros.decision.result import Identification
+from calib_ros.decision.rounding import may_be_rounding, rounded, rounding_errors
+from calib_ros.decision.steps import find_step
+from calib_ros.decision.validation import compare, validate
 from calib_ros.errors import InputError
-from calib_ros.identification import identifiability, mistakes, suspicions
-from calib_ros.identification.acceptance import refusals, remarks
-from calib_ros.identification.configurations import distinct
-from calib_ros.identification.considered import considered
-from calib_ros.identification.drift import chance_of_gain
-from calib_ros.identification.fitting import SOME, Fitted, Simpler, fit, parameter_rows
-from calib_ros.identification.leastsquares import System, minimise, normal_equations
-from calib_ros.identification.misfits import arms_own, outliers_of
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.region import region_of
-from calib_ros.identification.result import Identification
-from calib_ros.identification.robust import Robust
-from calib_ros.identification.rounding import may_be_rounding, rounded, rounding_errors
-from calib_ros.identification.steps import find_step
-from calib_ros.identification.validation import ParameterRow, compare, validate
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.considered import considered
+from calib_ros.estimation.fitting import (
+    SOME,
+    Fitted,
+    ParameterRow,
+    Simpler,
+    fit,
+    parameter_rows,
+)
+from calib_ros.estimation.leastsquares import System, minimise, normal_equations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXCEPTION

@@ -16,15 +16,15 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from calib_ros.identification.drift import Columns, Shifts, chance
-from calib_ros.identification.evidence import group_of
-from calib_ros.identification.leastsquares import owners, stacked
-from calib_ros.identification.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
-from calib_ros.identification.observations import SOME_POSES, numbered
-from calib_ros.identification.problem import Learned, Problem
-from calib_ros.identification.result import Identification
-from calib_ros.identification.sizes import TYPICAL
-from calib_ros.identification.validation import COUNTS, log_gain
+from calib_ros.decision.drift import Columns, Shifts, chance
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import COUNTS, log_gain
+from calib_ros.estimation.evidence import group_of
+from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
+from calib_ros.estimation.observations import SOME_POSES, numbered
+from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter

@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib_ros.decision.result import Identification
+from calib_ros.estimation.levels import SEVERAL
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.levels import SEVERAL
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.result import Identification
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import Notify, quiet, share_of

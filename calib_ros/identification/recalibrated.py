@@ -7,12 +7,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from calib_ros.identification import changes
+from calib_ros.decision import changes
+from calib_ros.decision.changes import Explanation
+from calib_ros.decision.validation import ErrorFigures
+from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import Explanation
-from calib_ros.identification.levels import ALIKE, CLEARLY
 from calib_ros.identification.records import reused_in_words
-from calib_ros.identification.validation import ErrorFigures
 from calib_ros.shown import Shown
 
 

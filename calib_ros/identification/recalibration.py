@@ -21,21 +21,21 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.decision import changes
+from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
+from calib_ros.decision.validation import ErrorFigures, left_out, residuals
 from calib_ros.errors import InputError
-from calib_ros.identification import changes
+from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.considered import products_with_doubts
+from calib_ros.estimation.leastsquares import System, minimise, products_of
+from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import OUTLIER
 from calib_ros.identification.calibration import Calibration, about, made
-from calib_ros.identification.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
-from calib_ros.identification.configurations import distinct
-from calib_ros.identification.considered import products_with_doubts
-from calib_ros.identification.leastsquares import System, minimise, products_of
-from calib_ros.identification.levels import SCALE, SEVERAL, TRIED, chance_of
-from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import SOME_POSES, Observations, numbered
-from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import Fingerprint
-from calib_ros.identification.robust import OUTLIER
-from calib_ros.identification.validation import ErrorFigures, left_out, residuals
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of

@@ -17,10 +17,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.decision.packing import damaged, unpacked
 from calib_ros.errors import ConfigError
-from calib_ros.identification.noise import Noise
-from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.start import fit_to_arm, movable
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.start import fit_to_arm, movable
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import (
     calibration_record,
@@ -29,7 +30,7 @@ from calib_ros.kinematics.chain_file import (
     table_hash,
 )
 from calib_ros.kinematics.parameter import DH_KINDS
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
 from calib_ros.values import parse_number, parse_numbers
 
@@ -44,40 +45,6 @@ KEPT = 256
 Part of the file format, as GRID."""
 GRID = 1.618e-6
 """Cell size [rad, m or px] of equal values; no decimal number is near an edge."""
-
-
-def packed(square: FloatArray) -> list[str]:
-    """Return the rows of the lower Cholesky factor of a positive matrix (P, P) as text."""
-    scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-    scaled = square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
-    root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
-    return [' '.join(f'{x:.9e}' for x in row[: k + 1]) for k, row in enumerate(root)]
-
-
-def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
-    """Return the matrix (P, K) of rows of numbers, up to the diagonal if `triangular`.
-
-    Raises
-    ------
-    ValueError
-        If the number or length of the rows is wrong, or a value is not finite.
-    """
-    numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
-    widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
-    matrix = np.zeros((count, max(widths, default=0)))
-    whole = True
-    for row, given, width in zip(matrix, numbers, widths, strict=True):
-        whole = whole and len(given) == width
-        row[:width] = given if whole else np.nan
-    if not np.isfinite(matrix).all():
-        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
-    return matrix
-
-
-def unpacked(rows: Sequence[str], size: int) -> FloatArray:
-    """Return the matrix (P, P) from the rows of `packed`."""
-    root = parse_rows(rows, size, triangular=True)
-    return np.asarray(root @ root.T)
 
 
 def nominal_document(nominal: Chain) -> dict[str, Any]:
@@ -312,12 +279,6 @@ def _differing(chain: Chain, nominal: Chain, length: float, angle: float) -> lis
             if abs(chain.value(name) - nominal.value(name)) > limit:
                 names.append(name)
     return names
-
-
-def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
-    """Return the error for a damaged part of a record."""
-    kind = '' if err is None else f' ({type(err).__name__})'
-    return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
 
 
 def hashes(sets: Sequence[Observations]) -> Hashes:

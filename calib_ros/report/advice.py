@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 
-from calib_ros.identification.reasons import Reason, Rule
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.settings import EXCEPTION
 
 AGAIN = (

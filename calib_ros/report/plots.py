@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calib_ros.apply.workspace import Placements, Survey, rms_map
-from calib_ros.identification.result import Identification
+from calib_ros.decision.result import Identification
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.levels import CONFIDENT
-from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.pixels import samples_of
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.result import Identification
-from calib_ros.identification.robust import MANY
-from calib_ros.identification.samples import Samples
-from calib_ros.identification.validation import Comparison
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import Comparison
+from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.pixels import samples_of
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import MANY
+from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray

@@ -11,15 +11,15 @@ import numpy as np
 
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.workspace import survey
+from calib_ros.decision.reasons import Rule
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import Comparison
+from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.levels import INTERVAL
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.configurations import distinct
-from calib_ros.identification.levels import INTERVAL
 from calib_ros.identification.linear_model import COMPARED
-from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Rule
-from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import Comparison
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words

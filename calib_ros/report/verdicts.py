@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from calib_ros.apply.verification import DECIDING, Verification
-from calib_ros.identification.levels import NEARER
+from calib_ros.estimation.levels import NEARER
 from calib_ros.identification.records import reused_in_words
 from calib_ros.settings import Settings
 

@@ -13,16 +13,17 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import interval_of
+from calib_ros.decision.changes import FALSE, changes_in_words
+from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.region import Region
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import Comparison, ErrorFigures
+from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.levels import INTERVAL
+from calib_ros.estimation.noise import Noise
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import FALSE, changes_in_words
-from calib_ros.identification.levels import INTERVAL
-from calib_ros.identification.misfits import Outlier
-from calib_ros.identification.noise import Noise
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
-from calib_ros.identification.region import Region
-from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import Comparison, ErrorFigures, ParameterRow
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter

@@ -34,11 +34,11 @@ from calib_ros.apply.planning import choose
 from calib_ros.apply.program import compensate_program
 from calib_ros.apply.workspace import survey
 from calib_ros.errors import MOST_ENTRIES, CalibrationError, InputError
+from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.programs import RATES, trajectory_program
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.configurations import STILL
-from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.ros import to_ros

@@ -13,6 +13,9 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
+from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import (
     LONGEST,
     CalibrationError,
@@ -20,6 +23,7 @@ from calib_ros.errors import (
     TooFewObservationsError,
     shortened,
 )
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import (
     Filing,
@@ -32,11 +36,7 @@ from calib_ros.files.history import (
     settings_hash,
 )
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.misfits import Outlier
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.progress import Progress

@@ -29,11 +29,11 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from calib_ros.errors import CalibrationError
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.report import words
 from calib_ros.ros.advisor import Guide

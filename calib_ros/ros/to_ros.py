@@ -20,10 +20,10 @@ from sensor_msgs.msg import JointState, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Float64MultiArray, MultiArrayDimension
 from visualization_msgs.msg import Marker, MarkerArray
 
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import residuals
 from calib_ros.errors import MOST_ENTRIES
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import residuals
+from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray, invert, to_quat

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib_ros.identification.levels import ALIKE, MOST_OUTLIERS, TELLING
+from calib_ros.estimation.levels import ALIKE, MOST_OUTLIERS, TELLING
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib_ros.identification.configurations import SCATTER, configurations, distinct
-from calib_ros.identification.levels import NEARER
+from calib_ros.estimation.configurations import SCATTER, configurations, distinct
+from calib_ros.estimation.levels import NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import START, Estimate, barely_moved

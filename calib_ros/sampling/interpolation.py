@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib_ros.identification.configurations import STILL
+from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.slices import Rows, Stamps
 

@@ -25,21 +25,21 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.errors import CalibrationError
-from calib_ros.identification.configurations import configurations, distinct
-from calib_ros.identification.fitting import SOME
-from calib_ros.identification.identifiability import structurally_independent
-from calib_ros.identification.leastsquares import (
+from calib_ros.estimation.configurations import configurations, distinct
+from calib_ros.estimation.fitting import SOME
+from calib_ros.estimation.identifiability import structurally_independent
+from calib_ros.estimation.leastsquares import (
     SMALL_STEP,
     STEP_TOLERANCE,
     Prior,
     System,
     normal_equations,
 )
-from calib_ros.identification.observations import SOME_POSES, Observations
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.robust import OUTER, robust_fit, thorough_fit
-from calib_ros.identification.samples import Samples, residual_arrays
-from calib_ros.identification.start import start_frames
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import OUTER, robust_fit, thorough_fit
+from calib_ros.estimation.samples import Samples, residual_arrays
+from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from calib_ros.errors import InputError
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.resection import board_poses, uncertainty
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.resection import board_poses, uncertainty
 from calib_ros.kinematics import se3
 from calib_ros.sampling.sample import Sample, View
 from calib_ros.texts import LARGEST_TABLE

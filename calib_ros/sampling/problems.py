@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.messages import parse_sources

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.identification.observations import Observations
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray

@@ -10,14 +10,14 @@ from functools import partial
 
 import numpy as np
 
+from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import ErrorFigures, compare
 from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.estimation.configurations import configurations
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.configurations import configurations
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.result import Identification
-from calib_ros.identification.validation import ErrorFigures, compare
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part

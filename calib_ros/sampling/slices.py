@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.identification.levels import CONFIDENT
+from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES

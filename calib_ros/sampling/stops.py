@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib_ros.identification.levels import FEW, MOST_OUTLIERS
+from calib_ros.estimation.levels import FEW, MOST_OUTLIERS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.slices import Rows, Stamps

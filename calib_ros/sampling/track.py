@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from calib_ros.identification.levels import FEW, TELLING
+from calib_ros.estimation.levels import FEW, TELLING
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.slices import Rows, Series, Stamps

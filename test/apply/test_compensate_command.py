@@ -14,10 +14,10 @@ from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.programs import joints_csv, read_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain

@@ -20,10 +20,10 @@ from calib_ros.apply.design import (
 )
 from calib_ros.apply.planning import choose
 from calib_ros.errors import InputError
-from calib_ros.identification.identifiability import observability
+from calib_ros.estimation.identifiability import observability
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.observations import SOME_POSES
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.sampling.live import LiveEstimate

@@ -12,9 +12,9 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.history import Filing, History, Row, identified, measured_at, settings_hash
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import Settings
 

@@ -9,12 +9,12 @@ import numpy as np
 import plants
 
 from calib_ros.apply.confidence import drift
+from calib_ros.decision.changes import Explanation
 from calib_ros.files.history import Row
 from calib_ros.fleet.plant import Measured, Robot
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.standing import STATES, Standing, counts, page_of
 from calib_ros.fleet.watch import Change, Night, Watched
-from calib_ros.identification.changes import Explanation
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
 

@@ -97,14 +97,14 @@ def corpus(name):
 
 @target('.csv')
 def table(path):
+    from calib_ros.estimation.problem import Problem
     from calib_ros.files.tables import read_table
-    from calib_ros.identification.problem import Problem
 
     read = read_table(path, len(ARM.joints))
     problem = Problem(ARM, read.fitted[0], read.held_out, more=read.fitted[1:])
     for observations in (*read.fitted, *read.held_out):
         if observations.distances is None:
-            from calib_ros.identification.samples import Samples
+            from calib_ros.estimation.samples import Samples
 
             Samples(observations, problem.sigma_position, problem.sigma_orientation)
 

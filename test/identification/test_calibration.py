@@ -10,11 +10,12 @@ import pytest
 import yaml
 
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.packing import unpacked
 from calib_ros.errors import ConfigError
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.records import nominal_document, unpacked
+from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings

@@ -11,13 +11,13 @@ from robots import DATA, needs_data
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
+from calib_ros.decision.changes import gauged
 from calib_ros.errors import InputError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.changes import gauged
 from calib_ros.identification.difference import difference
 from calib_ros.identification.identification import identify
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.identification.observations import Observations
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification.records import KEPT, Fingerprint, reused_in_words
 
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings, strategies as st
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, InputError, TooFewObservationsError, UnknownNameError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import LOSSES
 from calib_ros.identification.identification import identify
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.robust import LOSSES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 

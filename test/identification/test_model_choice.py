@@ -9,12 +9,12 @@ from fits import NOISE, SIGMAS, UR10E, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification import model_choice
 from calib_ros.identification.identification import identify
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.effects import Verdict, group_of
 from calib_ros.kinematics.parameter import Parameter

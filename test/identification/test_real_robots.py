@@ -12,10 +12,10 @@ import pytest
 from robots import DATA, needs_data
 
 from calib_ros.cli.main import main
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.bags import replay
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
 

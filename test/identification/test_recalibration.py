@@ -12,12 +12,12 @@ from robots import DATA, needs_data
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.cli.main import main
+from calib_ros.decision.changes import SCALE_OF_DEVICE, Explanation
 from calib_ros.errors import InputError
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.tables import read_table
 from calib_ros.identification.calibration import Calibration, parse_calibration
-from calib_ros.identification.changes import SCALE_OF_DEVICE, Explanation
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.kinematics.chain_file import load_chain
 

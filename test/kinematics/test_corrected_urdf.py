@@ -28,8 +28,8 @@ from urdfs import (
 
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 

@@ -9,9 +9,9 @@ from fits import NOISE, UR10E
 
 from calib_ros.apply.simulation import Cell, faulty, random_frame
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain

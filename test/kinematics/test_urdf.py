@@ -30,7 +30,7 @@ from urdfs import (
 
 from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.identification.identifiability import structurally_independent
+from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain
 from calib_ros.kinematics.chain_file import load_chain, parse_chain

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import numpy as np
 from measured import TEST, TRAIN, UR, measured
 
-from calib_ros.identification.problem import Problem
+from calib_ros.estimation.problem import Problem
 from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report

@@ -14,8 +14,8 @@ from measured import measured, rows_of, write_csv
 from pages import report_of
 
 from calib_ros.cli.main import main
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import poses
 from calib_ros.report.page import render

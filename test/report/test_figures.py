@@ -11,9 +11,9 @@ from pages import page_of, problem_of, report_of
 from plotly import graph_objects
 
 from calib_ros.apply.simulation import Camera, before_camera, photograph
+from calib_ros.decision.validation import compare
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification.identification import identify
-from calib_ros.identification.observations import Observations
-from calib_ros.identification.validation import compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain

@@ -17,10 +17,10 @@ from plotly import graph_objects
 from calib_ros.apply import simulation
 from calib_ros.apply.verification import verify
 from calib_ros.apply.workspace import survey
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import verification_report, workspace_report

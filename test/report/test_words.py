@@ -8,11 +8,11 @@ from pages import problem_of
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
+from calib_ros.decision.validation import ErrorFigures
 from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
-from calib_ros.identification.validation import ErrorFigures
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.applied import verification_report
 from calib_ros.report.page import Origin

@@ -15,10 +15,10 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
 from calib_ros.apply.simulation import measure
+from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.problem import Problem
 from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
-from calib_ros.identification.problem import Problem
-from calib_ros.identification.reasons import Rule
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
 from calib_ros.ros.identifying import Snapshot, _page, _without_middle

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from calib_ros.identification.levels import FEW
+from calib_ros.estimation.levels import FEW
 from calib_ros.sampling.stops import MOST_SPREAD, averages
 
 SIGMA = 5e-5

@@ -1,0 +1,181 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The rules of acceptance: what a result must show before it may replace the nominal parameters.
+
+docs/model.md (Judgement) lists and explains them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.result import Identification
+from calib_ros.decision.steps import Step
+from calib_ros.decision.validation import COUNTS, Comparison, log_gain, mean_squares
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
+from calib_ros.estimation.problem import Problem
+from calib_ros.shown import some
+
+
+def refusals(
+    problem: Problem,
+    result: Identification,
+    own_behaviour: str | None,
+    may_be_rounding: bool,
+    sized: bool,
+) -> tuple[Reason, ...]:
+    """Return the acceptance rules that fail.
+
+    `own_behaviour` describes outliers that are the arm's own (`misfits.py`), `may_be_rounding` is
+    the verdict of `rounding.py`, and `sized` tells whether the measurements fix the size and
+    shape of the arm.
+    """
+    failed = [*_of_the_fit(problem, result, own_behaviour)]
+    validation = result.validation
+    if validation is None:
+        text = 'too few poses to hold some out and test the result on them'
+        return (*failed, Reason(Rule.CONFIGURATIONS, text))
+    share = validation.outliers / len(validation.judged)
+    if share > MOST_OUTLIERS:
+        if result.step is not None and not result.step.harmful:
+            failed.append(result.step.reason)
+        text = (
+            f'{100.0 * share:.0f} % of the judged poses are outliers: their measurements and '
+            'predictions do not belong together'
+        )
+        return (*failed, Reason(Rule.OUTLIERS, text))
+    gained = _of_the_gain(problem, result, validation, sized)
+    return (*failed, *gained, *_of_harm(validation, may_be_rounding))
+
+
+def _of_the_fit(
+    problem: Problem, result: Identification, own_behaviour: str | None
+) -> Iterator[Reason]:
+    """Yield failed rules that do not depend on held-out poses."""
+    if result.step is not None and result.step.harmful:
+        yield result.step.reason
+    if own_behaviour is not None:
+        yield Reason(Rule.OWN_BEHAVIOUR, own_behaviour)
+    if not result.converged:
+        yield Reason(Rule.CONVERGENCE, 'the fit has not converged')
+    if missing := result.not_excited:
+        kinds: dict[str, list[str]] = {}
+        for each in missing:
+            kinds.setdefault(each.owner, []).append(each.kind)
+        named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
+        yield Reason(Rule.EXCITATION, f'the poses do not determine {named}')
+    limits = (problem.largest_length, problem.largest_angle)
+    if beyond := [p for p in result.parameters if p.beyond(*limits)]:
+        far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
+        text = f'{", ".join(far)} off, more than even a faulty robot of this kind'
+        yield Reason(Rule.COMMON_SENSE, text)
+
+
+def _gain(
+    validation: Comparison, part: str, which: NDArray[np.bool_], *confidence: float
+) -> tuple[float, float]:
+    """Return the `log_gain` in `position` or `orientation` of pairs by a mask (N,)."""
+    before, after = (getattr(each, part)[which] for each in (validation.before, validation.after))
+    return log_gain(before, after, validation.after.configurations[which], *confidence)
+
+
+def _of_the_gain(
+    problem: Problem, result: Identification, validation: Comparison, sized: bool
+) -> Iterator[Reason]:
+    before, after = validation.figures
+    if after.rms_mm > 1e3 * problem.largest_error:
+        yield Reason(
+            Rule.LARGEST_ERROR,
+            f'RMS {after.rms_mm:.1f} mm remains on held-out poses, more than '
+            f'{1e3 * problem.largest_error:g} mm (largest_error)',
+        )
+    judged = validation.deciding
+    gain, limit = _gain(validation, 'position', judged)
+    if not gain > limit:
+        text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
+        if gain > 0.0:
+            count = len(np.unique(validation.after.configurations[judged]))
+            kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
+            chance = before.rms_mm * np.exp(-limit)
+            text += f'; with {count} {kind} chance alone may give {chance:.3f} mm'
+        yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
+    elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
+        yield Reason(
+            Rule.DRIFT,
+            'a slow drift of the measuring device could explain the improvement: time-shifted '
+            f'residuals are explained just as well in {100.0 * result.chance:.0f} % of cases '
+            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
+        )
+    elif result.region is None:
+        text = (
+            'what the correction removes is not larger than its own uncertainty, even at the '
+            'poses measured'
+        )
+        if not sized:
+            text += (
+                '; measure something that fixes the size and shape of the arm: positions, or two '
+                'sockets a known distance apart'
+            )
+        yield Reason(Rule.REGION, text)
+
+
+def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
+    if validation.outliers:
+        first, second = validation.figures_of_all
+        gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
+        limit = max(limit, _loss_by_chance(validation), COUNTS)
+        if second.mean_mm > first.mean_mm or gain < -limit:
+            yield Reason(
+                Rule.GAIN_WITH_OUTLIERS,
+                f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
+                f'mm before, {second.rms_mm:.3f} mm after; mean {first.mean_mm:.3f} and '
+                f'{second.mean_mm:.3f} mm)',
+            )
+    if may_be_rounding:
+        text = 'the improvement may only come from rounded joint values that repeat in many poses'
+        yield Reason(Rule.ROUNDING, text)
+    before, after = validation.figures
+    if after.rms_mrad is not None:
+        gain, limit = _gain(validation, 'orientation', validation.deciding)
+        if gain < -limit:
+            yield Reason(
+                Rule.ORIENTATION,
+                f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '
+                f'before, {after.rms_mrad:.3f} mrad after)',
+            )
+
+
+def _loss_by_chance(validation: Comparison) -> float:
+    """Return the log of RMS after / RMS before, outliers included, that chance could cause.
+
+    A correction makes a much larger gross error bigger or smaller at random. Student's t of the
+    differences of squares accounts for that, even with a single outlier.
+    """
+    before, after = validation.before, validation.after
+    means = mean_squares(before.position, after.position, after.configurations)
+    count = means.shape[1]
+    if count < 2:
+        return np.inf
+    error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(count)
+    likely = special.stdtrit(count - 1, CERTAIN) * error
+    return 0.5 * float(likely / max(means[0].mean(), 1e-300))
+
+
+def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+    """Return what is suspicious about a result but no reason to refuse it.
+
+    `coarse` holds the steps [rad or m] of rounded joint values.
+    """
+    found = [] if step is None or step.harmful else [str(step)]
+    units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
+    steps = [f'{name} ({1e3 * size:.3g} m{units[name]})' for name, size in coarse.items()]
+    if steps:
+        found.append(
+            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
+        )
+    return tuple(found)

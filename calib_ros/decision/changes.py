@@ -1,0 +1,284 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Search for the few parameters of an arm that have changed.
+
+Information about the change x of all parameters is a normal likelihood with matrix A and vector
+b = A x^ (A may be singular: some poses determine only some parameters). Expected changes
+x ~ N(0, K), such as the uncertainty of an earlier calibration, are marginalised first:
+
+    A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
+
+An explanation is x = G z: one parameter, all of a joint (a bent link) or of a frame (a moved
+device or target), or the scale of the device has changed. It reduces chi-squared, with as many
+degrees of freedom as z, by
+
+    (G^T b')^T (G^T A' G)^-1 (G^T b')
+
+A change is claimed if chance gains as much, over all explanations tried, with probability FALSE at
+most (Bonferroni). Explanations are compared by their evidence with z ~ N(0, S), S the typical size
+of changes, which penalises additional parameters (MacKay 1992). Those with a share above
+1 - CONFIDENT are indistinguishable from the best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import linalg, special
+
+from calib_ros.estimation.identifiability import followed
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT, INTERVAL, SCALE, chance_of
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.sizes import SPREAD
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.settings import LEVER
+from calib_ros.shown import Shown
+
+FALSE = 0.5 * (1.0 - CERTAIN)
+"""False-alarm probability for an unchanged arm: one side of CERTAIN
+(benchmarks/recalibration.py)."""
+LIKELY = float(special.ndtri(INTERVAL))
+"""Half of a 95 % interval in standard deviations."""
+SIZES = {'m': 1e-3, 'rad': 2e-3}
+"""Typical size [m, rad] of changes by a collision or a replaced motor; a factor of three either
+way costs half a unit of log evidence."""
+SCALE_OF_DEVICE = Parameter('device', 'ratio')
+"""Scale of all measured lengths: of the arm, and of the distance to it."""
+ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
+"""Order in which a joint's parameters are named if two have the same effect."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Explanation(Shown):
+    """A possible change, its size, and how well it explains the measurements.
+
+    The k parameters `names` of a joint or frame (`owner`) change by `change` (k,) with standard
+    deviations `sigma` (k,) [m, rad], which reduces chi-squared by `gain`. `chance` is the
+    probability of such a gain for any explanation if nothing has changed, `share` the share of the
+    evidence of all explanations.
+    """
+
+    owner: str
+    names: tuple[Parameter, ...]
+    gain: float
+    chance: float
+    share: float
+    change: FloatArray
+    sigma: FloatArray
+
+    def in_words(self) -> str:
+        """Return the changed parameter and its size, or the changed parameters."""
+        if len(self.names) > 1:
+            return f'{self.owner} ({", ".join(name.kind for name in self.names)})'
+        what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
+        return f'{what} by {self.size_in_words()}'
+
+    def size_in_words(self) -> str:
+        """Return the size of the change of a single parameter."""
+        (change,), (sigma,) = self.change.tolist(), self.sigma.tolist()
+        if self.names == (SCALE_OF_DEVICE,):
+            return f'{1e6 * change:+.0f} ± {1e6 * LIKELY * sigma:.0f} ppm (95 %)'
+        return with_limits(change, sigma, self.names[0].unit)
+
+
+def with_limits(change: float, sigma: float, unit: str) -> str:
+    """Return a change [m, rad] in thousandths, with its 95 % interval."""
+    return f'{1e3 * change:+.3f} ± {1e3 * LIKELY * sigma:.3f} m{unit} (95 %)'
+
+
+def reason_in_words(reasons: Sequence[Explanation]) -> str:
+    """Return the best explanation and those indistinguishable from it."""
+    first, *others = (each.in_words() for each in reasons)
+    text = f'changed: {first}'
+    return f'{text}, indistinguishable from {" or ".join(others)}' if others else text
+
+
+def changes_in_words(changed: Sequence[Sequence[Explanation]]) -> str:
+    """Return several changes, each with its indistinguishable explanations."""
+    return '; '.join(map(reason_in_words, changed))
+
+
+def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
+    """Return explanations as plain values."""
+    return [
+        {
+            'owner': each.owner,
+            'parameters': [str(name) for name in each.names],
+            'change': each.change.tolist(),
+            'sigma': each.sigma.tolist(),
+            'chance': each.chance,
+            'share': each.share,
+        }
+        for each in reasons
+    ]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Information(Shown):
+    """Matrix (P, P) and vector (P,) of the information about changes of parameters `names`."""
+
+    names: tuple[Parameter, ...]
+    matrix: FloatArray
+    vector: FloatArray
+
+    def marginalised(self, square: FloatArray) -> Information:
+        """Return the information after marginalising expected changes of covariance (P, P)."""
+        mean, covariance = self.mean(square)
+        left = self.matrix - self.matrix @ covariance @ self.matrix
+        return Information(self.names, left, self.vector - self.matrix @ mean)
+
+    def mean(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return posterior mean (P,) and covariance (P, P) of changes with prior N(0, square)."""
+        scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
+        sizes, directions = linalg.eigh(square / np.outer(scale, scale))
+        root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
+        inner = np.eye(len(scale)) + root.T @ self.matrix @ root
+        factor = linalg.cholesky(inner, lower=True)
+        left = linalg.solve_triangular(factor, root.T, lower=True)
+        return left.T @ (left @ self.vector), left.T @ left
+
+    def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
+        """Return gain, changes, their covariance and its rank for columns (P, k)."""
+        inner = columns.T @ self.matrix @ columns
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
+        covariance = scale[:, np.newaxis] * linalg.pinvh(inner * np.outer(scale, scale), rtol=1e-9)
+        covariance = covariance * scale
+        seen = columns.T @ self.vector
+        values = covariance @ seen
+        rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
+        return float(seen @ values), values, covariance, rank
+
+    def evidence(self, columns: FloatArray, sizes: FloatArray) -> float:
+        """Return the log evidence of changes along columns (P, k) of sizes (k,)."""
+        scaled = columns * sizes
+        inner = np.eye(len(sizes)) + scaled.T @ self.matrix @ scaled
+        seen = scaled.T @ self.vector
+        gain = float(seen @ np.linalg.solve(inner, seen))
+        return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
+
+
+def explanations(
+    information: Information, columns: Columns, freedom: float
+) -> tuple[Explanation, ...]:
+    """Return the possible explanations of a change, best first.
+
+    `freedom` are the degrees of freedom of the noise estimate.
+    """
+    if not columns.sets:
+        return ()
+    logs = [information.evidence(columns.of(names), _sizes(names)) for _, names in columns.sets]
+    found = []
+    for (owner, names), share in zip(columns.sets, special.softmax(logs).tolist(), strict=True):
+        gain, change, covariance, rank = information.explained(columns.of(names))
+        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        chance = min(1.0, len(logs) * chance_of(gain, rank, freedom))
+        found.append(Explanation(owner, names, gain, chance, share, change, sigma))
+    return tuple(sorted(found, key=lambda each: -each.share))
+
+
+def reasons_of(
+    information: Information, columns: Columns, freedom: float
+) -> tuple[Explanation, ...]:
+    """Return the likely explanations; none if the change may be chance."""
+    found = explanations(information, columns, freedom)
+    return likely(found) if any(each.chance <= FALSE for each in found) else ()
+
+
+def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
+    """Return the best explanation and those indistinguishable from it."""
+    return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or tuple(found[:1])
+
+
+def _sizes(names: Sequence[Parameter]) -> FloatArray:
+    return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES[n.unit] for n in names])
+
+
+class Columns:
+    """Effects of an arm's changes on the P parameters `names` with information.
+
+    Changes of others show in these if they are gauge freedoms beside them, otherwise not at all.
+    `frames` may have moved; others are free and absorb what they can. `scaled` allows another
+    scale of the device.
+    """
+
+    def __init__(
+        self,
+        chain: Chain,
+        names: Sequence[Parameter],
+        frames: Sequence[str] = (),
+        scaled: bool = False,
+    ) -> None:
+        arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
+        mapped, left = gauged(chain, names, arm, free=not frames)
+        shows = np.abs(mapped).max(axis=0, initial=0.0) > HALF_THE_DIGITS
+        seen = shows & (left < HALF_THE_DIGITS)
+        self._columns = {n: c for n, c, yes in zip(arm, mapped.T, seen, strict=True) if yes}
+        self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
+        sets: list[tuple[str, tuple[Parameter, ...]]] = []
+        for joint in chain.joint_names:
+            own = self._distinct(parameters_of(joint, ORDER))
+            sets += [(joint, (name,)) for name in own]
+            sets += [(joint, own)] if len(own) > 1 else []
+        for frame in frames:
+            own = tuple(name for name in parameters_of(frame) if name in self._columns)
+            sets += [(frame, own)] if own else []
+        lengths = [name for name in self._columns if name.is_length]
+        if scaled and lengths:
+            grown = [chain.value(name) * self._columns[name] for name in lengths]
+            self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
+            sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
+        self.sets = tuple(sets)
+
+    def _distinct(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:
+        """Return the observable parameters, without those equivalent to an earlier one."""
+        units: dict[Parameter, FloatArray] = {}
+        for name in names:
+            if name in self._columns:
+                unit = self._columns[name] / np.linalg.norm(self._columns[name])
+                if all(abs(unit @ other) <= 1.0 - HALF_THE_DIGITS for other in units.values()):
+                    units[name] = unit
+        return tuple(units)
+
+    def of(self, names: Sequence[Parameter]) -> FloatArray:
+        """Return the columns (P, k) of k parameters."""
+        return np.array([self._columns[name] for name in names]).T
+
+    def spread(self, reasons: Sequence[Explanation]) -> FloatArray:
+        """Return the prior covariance (P, P) of changes whose sizes the data determine."""
+        parts = [self.of(each.names) * (SPREAD * _sizes(each.names)) for each in reasons]
+        square = np.hstack(parts)
+        return np.asarray(square @ square.T)
+
+
+def gauged(
+    chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter], free: bool
+) -> tuple[FloatArray, FloatArray]:
+    """Return how changes of other parameters show in the named ones, with `free` frames.
+
+    The first array (P, K) holds the changes of P parameters that best reproduce a unit change of
+    each of K others over the joint range, the second (K,) the share that is left.
+    """
+    rng = np.random.default_rng(0)
+    q = chain.random_joints(SOME_POSES, rng)
+    frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
+    fitted = list(dict.fromkeys([*frames, *names]))
+    approach = rng.choice([-1.0, 1.0], q.shape)
+    taken, wanted, left = followed(chain, fitted, others, q, LEVER, approach=approach)
+    size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
+    return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size
+
+
+def predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
+    """Return V (P, P) [m^2], where d^T V d is the mean squared position change by d.
+
+    Over the joint range, in the best frames.
+    """
+    joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
+    _, _, left = followed(chain, frames, names, joints, 0.0)
+    return np.asarray(left.T @ left) / len(joints)

@@ -1,0 +1,208 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Can drift of the device explain a gain? A randomisation test by shifts in time.
+
+Of residuals r, columns A added to the columns F of the previous model explain the share
+
+    (e(F, A) - e(F)) / (|r|^2 - e(F))        e(X) = r^T X (X^T X + L)^-1 X^T r
+
+where L holds the inverse variances of priors. It is compared with the share of residuals shifted
+in time (docs/model.md, Judgement). Each series is closed to a circle by its mirror image, and its
+slowest, non-stationary part is removed: a few cosines over the session. Samples of one stop move
+together, as their sum; pixels also with their first moments. All shifts of X^T r are one circular
+correlation, computed by fast Fourier transforms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from calib_ros.estimation.leastsquares import System
+from calib_ros.estimation.levels import SEVERAL
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+
+SLOW = SEVERAL
+"""Cosines removed from a series at most, one per ten stops (benchmarks/drift.py)."""
+SHIFTS = 2 * SOME_POSES
+"""Shifts tried at most, forwards and backwards; the first is zero (benchmarks/drift.py)."""
+
+
+Columns: TypeAlias = tuple[FloatArray, FloatArray]
+"""X^T X (P, P) of detrended columns X plus the normal matrix of priors, and X^T r (P, S) by
+shift."""
+
+
+class Shifts:
+    """Residuals shifted in time, every set by the same share of its length.
+
+    The system's samples are in the order in which they were taken; those of one stop move
+    together. The residuals (c, N) of each set are weighted.
+    """
+
+    def __init__(self, system: System, residuals: Sequence[FloatArray]) -> None:
+        numbers = [samples.observations.stops for samples in system.sets]
+        self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
+        count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
+        self._share = np.arange(count) / count
+        self._weights = [
+            _weights(samples.observations, begins)
+            for samples, begins in zip(system.sets, self._begins, strict=True)
+        ]
+        self._circles: list[NDArray[np.complex128]] = []
+        self._energy = np.zeros(count)
+        for begins, weights, residual in zip(self._begins, self._weights, residuals, strict=True):
+            series = _by_stop(residual, begins, weights)
+            circle = np.concatenate([series, series[:, ::-1]], axis=1)
+            length = len(begins)
+            again = np.concatenate([circle, series], axis=1)  # the reach of a shifted series
+            self._circles.append(fft.rfft(again, _period(length)))
+            squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
+            slow = _correlated(slow_cosines(length)[:, np.newaxis], self._circles[-1], each=True)
+            energy = squares[length : 3 * length] - squares[: 2 * length]
+            self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
+
+    def columns(self, columns: Iterable[Sequence[FloatArray]], inverse: FloatArray) -> Columns:
+        """Return the products of weighted columns, (P, c, N) for each set, in one or more lots.
+
+        `inverse` (P,) is 1 / sigma of the priors of all columns, zero without a prior.
+        """
+        rows, products = [], []
+        for lot in columns:
+            parts = []
+            products.append(np.zeros((len(lot[0]), len(self._share))))
+            for begins, weights, circle, column in zip(
+                self._begins, self._weights, self._circles, lot, strict=True
+            ):
+                series = _by_stop(column, begins, weights)
+                whole = np.linalg.norm(series, axis=(1, 2))
+                slow = slow_cosines(len(begins))
+                series -= series @ slow.T @ slow
+                rounding = np.linalg.norm(series, axis=(1, 2)) <= HALF_THE_DIGITS * whole
+                series[rounding] = 0.0
+                products[-1] += self._sampled(_correlated(series, circle))
+                parts.append(series.reshape(len(series), -1))
+            rows.append(np.concatenate(parts, axis=1))
+        every = np.concatenate(rows)
+        return every @ every.T + np.diag(inverse**2), np.concatenate(products)
+
+    def shares(
+        self, columns: Columns, known: Sequence[int], groups: Sequence[Sequence[int]]
+    ) -> FloatArray:
+        """Return the share (G, S), by shift, that each group (G, K) explains beside known columns.
+
+        Each group is taken alone.
+        """
+        every, moved = columns
+        matrix = every[np.ix_(known, known)]
+        root = inverse_root(matrix, np.diag(matrix))
+        removed = root.T @ moved[known]
+        which = np.array(groups)
+        cross = every[which][:, :, known] @ root  # (G, K, P)
+        products = moved[which] - cross @ removed
+        own = every[which[:, :, np.newaxis], which[:, np.newaxis]]
+        size = np.einsum('gkk->gk', own)
+        roots = inverse_root(own - cross @ np.swapaxes(cross, 1, 2), size)
+        explained = ((np.swapaxes(roots, 1, 2) @ products) ** 2).sum(axis=1)
+        left = np.maximum(self._energy - (removed**2).sum(axis=0), 1e-300)
+        return np.asarray(explained / left)
+
+    def _sampled(self, shifted: FloatArray) -> FloatArray:
+        """Return the shifts to try (..., S) of all shifts (..., 2 n) of a set."""
+        return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
+
+
+def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) -> FloatArray:
+    """Return sums over each stop (..., m c, n) of values (..., c, N) with weights (m, N)."""
+    parts = [each * values for each in weights]
+    if len(begins) < values.shape[-1]:
+        parts = [np.add.reduceat(part, begins, axis=-1) for part in parts]
+    return np.asarray(np.concatenate(parts, axis=-2))
+
+
+def _weights(observations: Observations, begins: NDArray[np.intp]) -> FloatArray:
+    """Return the weights (m, N) of the rows of each stop: the inverse root of their number.
+
+    Pixels also get their image coordinates as weights, with mean square 1 in each stop: sums
+    detect only shifts of the camera, first moments its whole pose.
+    """
+    count = np.diff(begins, append=len(observations))
+    number = np.repeat(np.arange(len(begins)), count)
+    root = 1.0 / np.sqrt(count)[number]
+    if observations.pixels is None:
+        return root[np.newaxis]
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray((np.add.reduceat(values, begins) / count[:, np.newaxis])[number])
+
+    centred = observations.pixels - mean(observations.pixels)
+    centred /= np.maximum(np.sqrt(mean(centred**2)), 1e-9)  # corners in a line
+    return np.concatenate([root[np.newaxis], root * centred.T])
+
+
+def slow_cosines(length: int) -> FloatArray:
+    """Return the constant and slowest cosines (K, length) of a series, orthonormal."""
+    order = np.arange(1 + min(SLOW, length // 10))
+    waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
+    return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
+
+
+def _period(length: int) -> int:
+    """Return the period of the transforms: the circle of a series if that length is fast."""
+    circle = 2 * length
+    if fft.next_fast_len(circle, real=True) == circle:
+        return circle
+    return int(fft.next_fast_len(3 * length, real=True))
+
+
+def _correlated(
+    series: FloatArray, circle: NDArray[np.complex128], each: bool = False
+) -> FloatArray:
+    """Return products (P[, c], 2 n) of series (P, c, n) with the circle (c, K) at each shift."""
+    length = _period(series.shape[-1])
+    spectrum = fft.rfft(series, length)
+    np.conj(spectrum, out=spectrum)
+    found = fft.irfft(np.einsum('pck,ck->pck' if each else 'pck,ck->pk', spectrum, circle), length)
+    return np.asarray(found[..., : 2 * series.shape[-1]])
+
+
+def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
+    """Return T (..., P, P) with T T^T the pseudo-inverse of (..., P, P).
+
+    Columns are scaled to squared lengths `size` (..., P); directions lost to rounding are zero.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(size, 1e-300))
+    sizes, vectors = np.linalg.eigh(matrix * (scale[..., np.newaxis] * scale[..., np.newaxis, :]))
+    good = sizes > ROUNDING
+    lengths = good / np.sqrt(np.where(good, sizes, 1.0))
+    return np.asarray(scale[..., np.newaxis] * vectors * lengths[..., np.newaxis, :])
+
+
+def chance(shares: FloatArray) -> float:
+    """Return the share of shifted residuals explained as well as the unshifted, first of (S,)."""
+    return float(np.mean(shares[1:] >= shares[0]))
+
+
+def chance_of_gain(
+    chain: Chain, before: Sequence[str], added: Sequence[str], system: System
+) -> float:
+    """Return the probability that the gain by added parameters is chance.
+
+    The system is linearised at a chain fitted with the parameters before.
+    """
+    if not added:
+        return 1.0
+    names = [*before, *added]
+    rows = system.rows_of(chain, names)
+    shifts = Shifts(system, [each[-1] for each in rows])
+    prior = system.prior
+    inverse = np.zeros(len(names)) if prior is None else prior.rows(chain, names)[0]
+    columns = shifts.columns([[each[:-1] for each in rows]], inverse)
+    numbers = range(len(names))
+    return chance(shifts.shares(columns, numbers[: len(before)], [numbers[len(before) :]])[0])

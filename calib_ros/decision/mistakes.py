@@ -1,0 +1,365 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Usual mistakes, tried out but never corrected: units, conventions, joints, the wrong arm.
+
+If the nominal arm misses the measurements by more than faulty arms do, each suspected mistake is
+undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`);
+the best few are refined by least squares. A mistake is named if undoing it reduces the typical
+error below NEARER times the original and to that of a faulty arm; so are those that explain nearly
+as much. If none does, the positions are tried without the orientations, then several mistakes at
+once.
+
+The typical error is the median over the samples of the distance plus the angle times LEVER.
+Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
+that of the last joint one of the tool.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from typing import Any
+
+import numpy as np
+
+from calib_ros.decision.lost_rows import lost
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.result import Identification
+from calib_ros.decision.suspects import ORIENTATIONS, Sets, Suspect, dead, suspects
+from calib_ros.estimation.identifiability import excited
+from calib_ros.estimation.leastsquares import System, factor_of, minimise
+from calib_ros.estimation.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER, SEVERAL, TRIED
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.resection import board_poses
+from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.start import closed_forms, flange, movable
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import IN_A_FRAME
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import LEVER
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """The mistakes that explain the measurements, and typical errors [m] with and without them.
+
+    The latter is NaN if unknown.
+    """
+
+    suspects: tuple[Suspect, ...]
+    given: float
+    corrected: float
+
+    @property
+    def alone(self) -> bool:
+        """Tell whether this refuses a result by itself."""
+        return not any(each.chain or each.what == ORIENTATIONS.what for each in self.suspects)
+
+    def __str__(self) -> str:
+        whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
+        if np.isnan(self.corrected):
+            return whats[0]
+        return (
+            f'{" -- or ".join(whats)} (so the uncorrected arm is typically '
+            f'{1e3 * self.corrected:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
+        )
+
+
+def remarked(problem: Problem, result: Identification) -> Identification:
+    """Return the result with the mistake that explains its errors, if any.
+
+    It becomes the first refusal; but another arm, and orientations that do not fit, only give a
+    remark if nothing else refuses the result.
+    """
+    found = explained(problem) if _suspicious(problem, result) else None
+    if found is None:
+        return result
+    if result.refusals or found.alone:
+        return replace(result, refusals=(Reason(Rule.MISTAKE, str(found)), *result.refusals))
+    return replace(result, remarks=(str(found), *result.remarks))
+
+
+def _suspicious(problem: Problem, result: Identification) -> bool:
+    """Tell whether errors, before or after, are larger than those of faulty arms.
+
+    Couplings may explain most of any residuals, and a diverging fit everything.
+    """
+    if not result.converged or (not result.refusals and result.coupled):
+        return True
+    judged = result.validation or result.fitted
+    for each in (*judged.figures_of_all, result.fitted.figures_of_all[0]):
+        error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
+        if error > problem.largest_error or angle > problem.largest_angle:
+            return True
+    if judged.outliers > MOST_OUTLIERS * len(judged.judged):
+        return True
+    limits = problem.largest_length, problem.largest_angle
+    return any(each.beyond(*limits) for each in result.parameters)
+
+
+def explained(problem: Problem) -> Explained | None:
+    """Return what explains the measurements much better than the given input, if anything."""
+    sets = tuple(
+        _as_poses(problem, each)
+        for each in problem.sets
+        if each.distances is None and _of_images(problem) == (each.pixels is not None)
+    )
+    if not sets or max(map(len, sets)) < IN_A_FRAME:
+        return None  # base and tool alone explain nearly all of them
+    if not any(each.socket for each in sets):
+        sets = (max(sets, key=len),)
+    base, tool = (
+        frame if frame is not None and frame.fixed else None
+        for frame in (problem.chain.base, problem.chain.tool)
+    )
+    chain = replace(problem.chain, base=base, tool=tool)
+    given = _tried(chain, tuple(each.spread() for each in sets))
+    if given is None:
+        return None
+    given = _polished(problem, given)
+    found = (
+        _of_a_dead_column(problem, chain, given)
+        or _named(problem, chain, sets, given)
+        or _of_a_lost_row(problem, chain, sets, given)
+        or _by_places(problem, chain, sets, given)
+        or _several(problem, chain, given)
+    )
+    if found is None or not problem.of_messages:
+        return found
+    return replace(found, suspects=tuple(replace(e, remedy=e.published) for e in found.suspects))
+
+
+def _of_images(problem: Problem) -> bool:
+    return any(each.pixels is not None for each in problem.sets)
+
+
+def _of_a_dead_column(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
+    """Return a coordinate that was not measured: no change of the input restores it."""
+    found = None if _of_images(problem) else dead(chain, given.sets)
+    return None if found is None else Explained((found,), given.error, np.nan)
+
+
+def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+    rough, tried, bare = [], [], _Bare()
+    for each in suspects(chain, given.sets, _of_images(problem)):
+        few = given.sets
+        if each.rows:
+            few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
+        found = _tried(each.chain or chain, each.undone(few), bare)
+        if found is not None and found.share < given.share:
+            rough.append((found, each))
+    for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
+        polished = _polished(problem, found)
+        # an arm in mm fits places in mm, and is off by metres
+        if polished.error <= _largest(problem):
+            tried.append((polished.share, polished, each))
+    if not tried:
+        return None
+    tried.sort(key=lambda one: one[0])
+    least, best, _ = tried[0]
+    if best.error > NEARER * given.error or least > NEARER * min(given.share, 1.0):
+        return None
+    named = [each for share, _, each in tried if share <= ALIKE * least]
+    lowest = min(each.rank for each in named)
+    named = [each for each in named if each.rank == lowest]
+    named += [each for share, _, each in tried if ALIKE * least < share <= least / NEARER]
+    unlike = {(each.what, each.remedy): each for each in named}
+    return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
+
+
+def _largest(problem: Problem) -> float:  # [m]
+    return problem.largest_error + LEVER * problem.largest_angle / 3.0
+
+
+def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+    """Return a row missing in one of two tables side by side, if that explains all."""
+    if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
+        return None
+
+    def framed(part: Observations) -> Chain | None:
+        found = _tried(chain, (part.spread(),))
+        return None if found is None else _polished(problem, found).chain
+
+    def errors(arm: Chain, each: Observations) -> FloatArray:
+        return _away(arm, each, flange(arm, each))
+
+    found = lost(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
+    if found is None or found.error > NEARER * given.error:
+        return None
+    remedy = 'is a row missing or duplicated in one of two tables? Correct it'
+    return Explained((Suspect(found.what, remedy),), given.error, found.error)
+
+
+def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+    """Return that the orientations are wrong, if the positions are explained."""
+    whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
+    if _of_images(problem) or not whole:
+        return None
+    alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
+    start = _tried(chain, tuple(each.spread() for each in alone))
+    if start is None:
+        return None
+    placed = _polished(problem, start)
+    if placed.error <= min(problem.largest_error, NEARER * given.error):
+        known = placed.error + LEVER * problem.sigma_orientation
+        enough = known < NEARER * given.error
+        return Explained((ORIENTATIONS,), given.error, placed.error) if enough else None
+    found = _named(problem, chain, alone, placed)
+    if found is None or len(found.suspects) > 1:
+        return None
+    what = f'{found.suspects[0].what}, and the orientations do not fit either'
+    return replace(found, suspects=(replace(found.suspects[0], what=what),))
+
+
+def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
+    """Return simultaneous mistakes, each of which explains part of the errors.
+
+    Beam search: another mistake is added to each of the best few, until the arm explains the rest
+    or another is no better. The first may be no better alone: two mistakes can hide each other.
+    """
+    if given.error <= problem.largest_error:
+        return None
+    few = given.sets
+    options = [each for each in suspects(chain, few, _of_images(problem)) if each.part]
+    largest, share = min(_largest(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
+    least = given.share
+    kept: list[tuple[Suspect, ...]] = [()]
+    for _ in range(SEVERAL + 1):  # several of joints, one of the poses
+        found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
+        for some in kept:
+            for each in options:
+                if each.part not in {one.part for one in some}:
+                    more = tuple(sorted((*some, each), key=lambda one: one.part != 'measured'))
+                    trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
+                    if trial is not None:  # keeps the first of equivalent ones
+                        found.setdefault(round(trial.share, 6), (trial, more))
+        best = [found[key] for key in sorted(found)[:TRIED]]
+        if not best or (len(best[0][1]) > 1 and best[0][0].share > CONFIDENT * least):
+            return None
+        least = best[0][0].share
+        polished = _polished(problem, best[0][0])
+        kept = [some for _, some in best]
+        if len(kept[0]) > 1 and polished.error <= largest and polished.share <= share:
+            return Explained((_together(kept[0]),), given.error, polished.error)
+    return None
+
+
+def _together(mistakes: Sequence[Suspect]) -> Suspect:
+    published = [f'{each.what} ({each.published})' for each in mistakes]
+    of_tables = [
+        f'{each.what} ({each.remedy})' if each.part == 'measured' else said
+        for each, said in zip(mistakes, published, strict=True)
+    ]
+    what = 'several mistakes at once'
+    return Suspect(what, '; '.join(of_tables), published='; '.join(published))
+
+
+def _as_poses(problem: Problem, each: Observations) -> Observations:
+    """Return the measurements, boards in images as poses."""
+    if each.pixels is None:
+        return each
+    return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A chain with frames fitted to some samples, and the spread of positions [m].
+
+    The smaller of the spreads of flange and measured positions: if metres are taken for
+    millimetres, or radians for degrees, every error is small. `arms` are the poses (N, 4, 4) of
+    the bare arm.
+    """
+
+    chain: Chain
+    sets: Sets
+    arms: tuple[FloatArray, ...]
+    spread: float = 1.0
+
+    @cached_property
+    def error(self) -> float:
+        """Return the median error [m] of the samples."""
+        pairs = zip(self.sets, self.arms, strict=True)
+        sizes = [_away(self.chain, each, arm) for each, arm in pairs]
+        return float(np.median(np.concatenate(sizes)))
+
+    @property
+    def share(self) -> float:
+        """Return the error in units of the spread."""
+        return self.error / max(self.spread, 1e-9)
+
+
+def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None:
+    """Return the chain with frames for some samples in closed form, set by set.
+
+    `bare` caches the poses of arms tried before.
+    """
+    spreads, arms, bare = [], [], bare or _Bare()
+    for each in sets:
+        alone = replace(each, base='base', tool='tool')
+        arm = bare.poses(chain, alone)
+        starts = [_Trial(start, (alone,), (arm,)) for start in closed_forms(chain, alone, arm)]
+        starts = [start for start in starts if np.isfinite(start.error)]
+        if not starts:
+            return None
+        best = min(starts, key=lambda start: start.error).chain
+        places = arm[:, :3, 3]
+        seen = places if each.socket else each.positions  # sockets measure nothing
+        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
+        chain = chain.with_frame(each.base, best.frame('base'))
+        chain = chain.with_frame(each.tool, best.frame('tool'))
+        arms.append(arm)
+    return _Trial(chain, sets, tuple(arms), float(np.median(spreads)))
+
+
+class _Bare:
+    """Cache of the poses of bare arms, which most suspects leave unchanged."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
+
+    def poses(self, chain: Chain, each: Observations) -> FloatArray:
+        """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
+        key = id(each.joints), id(chain.joints), chain.convention
+        if key not in self._known:  # cached objects keep their ids
+            self._known[key] = flange(chain, each), chain, each.joints
+        return self._known[key][0]
+
+
+def _polished(problem: Problem, trial: _Trial) -> _Trial:
+    chain, sets = trial.chain, trial.sets
+    sigmas = problem.sigma_position, problem.sigma_orientation
+    system = System(tuple(Samples(each, *sigmas) for each in sets))
+    sockets = {each.base for each in sets if each.socket}
+    every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
+    names = [name for name in every if name.is_length or name.owner not in sockets]
+    known = excited(factor_of(chain, names, system), names)
+    fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
+    polished = _Trial(fitted, sets, trial.arms, trial.spread)
+    return min(trial, polished, key=lambda one: one.error)
+
+
+def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
+    """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
+    found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
+    away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
+    if each.oriented.any():
+        turns = se3.angles_between(found[:, :3, :3], each.rotations)
+        away = away + LEVER * np.where(each.oriented, turns, 0.0)
+    return np.asarray(away)
+
+
+def _moved(problem: Problem, each: Observations, rows: int) -> Observations:
+    """Return measurements with the joint values `rows` below, held-out rows included."""
+    same = [e for e in problem.judging if (e.base, e.tool) == (each.base, each.tool)]
+    parts = [each, *(_as_poses(problem, e) for e in same if e.distances is None)]
+    order = np.argsort(np.concatenate([e.stamps_ns for e in parts]), kind='stable')
+    measured, reported = (slice(max(0, n), min(0, n) or None) for n in (-rows, rows))
+    joined: dict[str, Any] = {}
+    for name in ('stamps_ns', 'joints', 'positions', 'rotations', 'oriented'):
+        ordered = np.concatenate([getattr(e, name) for e in parts])[order]
+        joined[name] = ordered[reported if name == 'joints' else measured]
+    return Observations(**joined, base=each.base, tool=each.tool, socket=each.socket)

@@ -1,0 +1,256 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Where a calibration may be used: where it improves the arm, also away from its poses.
+
+By the posterior of the arm (`evidence.py`) its true offsets from nominal are x ~ N(m, C); those of
+the calibration are x^. At poses with the Jacobian A, base and tool frames projected out, it makes
+the arm worse if
+
+    |A (x^ - x)|^2 > |A x|^2    <=>    (A x^)^T (A x) < |A x^|^2 / 2
+
+The probability of that is the *risk*; docs/model.md (Region) describes the poses it is computed
+for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.decision.drift import inverse_root
+from calib_ros.decision.packing import damaged, packed, parse_rows, unpacked
+from calib_ros.errors import UnknownNameError
+from calib_ros.estimation.evidence import Mixed, Posterior
+from calib_ros.estimation.levels import KNOWN, UNUSUAL
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.samples import BLOCK
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+RISK = 0.02
+"""Largest probability that the arm gets worse over the poses of a shell (benchmarks/harm.py)."""
+SHELL = SOME_POSES // 20
+"""Random configurations per shell."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Region(Shown):
+    """The joint values at which a calibration may be used.
+
+    `chain` is the calibrated arm with considered effects, `square` (P, P) the expected squares of
+    the errors of its parameters `names` for the measuring device; another device adds `device` (P,
+    K) times its transpose. Predicted positions may be off by `limit` [m], infinite if the whole
+    joint range is used; `share` is the used share of it. It was measured between `base` and
+    `tool`. `by_scale`, unknown for a loaded region, is the probability that the device is out of
+    scale and makes the arm worse there.
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    square: FloatArray
+    device: FloatArray
+    limit: float
+    share: float
+    base: str = 'base'
+    tool: str = 'tool'
+    by_scale: float = 0.0
+
+    def sigma(self, joints: FloatArray, components: slice = np.s_[:3]) -> FloatArray:
+        """Return the expected error (N,) [m] of positions predicted at joint values (N, n).
+
+        Of orientations [rad] by other `components` of the pose.
+        """
+        model = ErrorModel(self.chain, self.names, self.base, self.tool)
+        return sigma_of(model, self.square, joints, components)
+
+    def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
+        """Tell (N,) whether the calibration may be used at joint values (N, n)."""
+        joints = self.chain.joint_values(joints)
+        if np.isinf(self.limit):
+            return np.ones(len(joints), dtype=bool)
+        return np.asarray(self.sigma(joints) <= self.limit)
+
+    @property
+    def whole(self) -> bool:
+        """Tell whether the region is the whole joint range."""
+        return bool(np.isinf(self.limit))
+
+    def in_words(self) -> str:
+        """Return where the calibration may be used."""
+        if self.whole:
+            return 'valid over the whole joint range'
+        share = f'{min(100.0 * self.share, 99.0):.0f}' if self.share >= 0.01 else 'under 1'
+        return (
+            f'valid near the measured poses, in {share} % of the joint range; elsewhere it may '
+            'make the arm worse'
+        )
+
+    def document(self) -> dict[str, Any]:
+        """Return the region as plain values: a Cholesky factor and the rows of the device."""
+        return {
+            'limit': None if self.whole else self.limit,
+            'share': self.share,
+            'base': self.base,
+            'tool': self.tool,
+            'names': list(self.names),
+            'root': packed(self.square),
+            'device': [' '.join(f'{x:.9e}' for x in row) for row in self.device],
+        }
+
+
+def sigma_of(
+    model: ErrorModel, square: FloatArray, joints: FloatArray, components: slice = np.s_[:3]
+) -> FloatArray:
+    """Return the expected size (N,) of some components of pose errors at joint values (N, n).
+
+    `square` (P, P) are the expected squares of the parameter errors.
+    """
+    found = np.empty(len(joints))
+    for first in range(0, len(joints), BLOCK):
+        part = slice(first, first + BLOCK)
+        found[part] = _sizes(model.jacobian(joints[part])[:, components], square)
+    return found
+
+
+def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
+    """Return the expected sizes (N,) of rows (N, c, P) times errors of squares (P, P)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+
+def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
+    """Return the region in the record of a calibration, or None.
+
+    Raises
+    ------
+    ConfigError
+        If it is not as `Region.document` writes it; `where` names it.
+    """
+    document = record.get('region')
+    if document is None:
+        return None
+    try:
+        names = tuple(str(name) for name in document['names'])
+        geometric = {n for n in names if chain.owns_frame(n) or Parameter(n).of_dh}
+        chain = chain.with_effects([n for n in names if n not in geometric])
+        ends = str(document['base']), str(document['tool'])
+        ErrorModel(chain, names)
+        for frame in ends:
+            if frame not in chain.frame_names:
+                raise UnknownNameError('frame', frame, chain.frame_names)
+        limit = document['limit']
+        region = Region(
+            chain,
+            names,
+            unpacked(document['root'], len(names)),
+            parse_rows(document.get('device', [''] * len(names)), len(names)),
+            np.inf if limit is None else float(limit),
+            float(document['share']),
+            *ends,
+        )
+    except UnknownNameError as err:
+        what = f'{where}: calibration.region: {err.what}'
+        raise UnknownNameError(what, err.name, err.alternatives) from err
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
+        raise damaged('region', where, err) from err
+    if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
+        raise damaged('region', where)
+    return region
+
+
+def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float) -> Region | None:
+    """Return where a calibration may be used; None if not even at the measured poses.
+
+    `freedom` are the degrees of freedom of the noise estimate.
+    """
+    ends = sets[0].base, sets[0].tool
+    measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
+    drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
+    judge, count = _Judge(posterior, *ends, freedom), len(posterior.names)
+    measured_rows, drawn_rows = (judge.rows(each) for each in (measured, drawn))
+    near, far = (
+        _sizes(rows[..., :count], posterior.square) for rows in (measured_rows, drawn_rows)
+    )
+    order, limit = np.argsort(far), float(near.max())
+    own, inside = judge.products(measured_rows), far[order] <= limit
+    inner = own + judge.products(drawn_rows[order[inside]])
+    doubts = judge.of_the_arm(posterior.doubted)
+    if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
+        return None
+    shells = order[~inside]
+    for first in range(0, len(shells), SHELL):
+        shell = shells[first : first + SHELL]
+        added = judge.products(drawn_rows[shell])
+        if not judge.risk(added, inner + added, doubts) < RISK:
+            break
+        inner, limit = inner + added, float(far[shell[-1]])
+    by_scale = 0.0
+    if posterior.rival is not None:
+        more, _, mean, covariance = posterior.rival
+        out = float(special.expit(special.logit(UNUSUAL) + more))
+        doubts = judge.of_the_arm([(1.0, mean, covariance)])
+        by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
+    share = float(np.mean(far <= limit))
+    limit = np.inf if share == 1.0 else limit
+    known = posterior.chain, posterior.names, posterior.square, posterior.device
+    return Region(*known, limit, share, *ends, by_scale)
+
+
+_Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+"""Weights (S,), means (S, A) and covariances (S, A, A) of the arm's A offsets."""
+
+
+class _Judge:
+    """Probability that a calibration makes the arm worse at some poses."""
+
+    def __init__(self, posterior: Posterior, base: str, tool: str, freedom: float) -> None:
+        chain, names = posterior.chain, posterior.names
+        self._arm = [k for k, name in enumerate(names) if not chain.owns_frame(name)]
+        frames = [*parameters_of(base), *parameters_of(tool)[:3]]
+        self._placed, self._freedom = len(frames), freedom
+        every = list(dict.fromkeys([*names, *frames]))
+        self._model = ErrorModel(chain, every, base, tool)
+        self._own = [*map(every.index, frames), *self._arm]
+        self._offsets = posterior.offsets[self._arm]
+
+    def rows(self, joints: FloatArray) -> FloatArray:
+        """Return the position rows (N, 3, P + F) at joint values (N, n).
+
+        Columns are those of the posterior's names, then of further frame parameters.
+        """
+        return self._model.jacobian(joints)[:, :3]
+
+    def products(self, rows: FloatArray) -> FloatArray:
+        """Return products (K, K) of the columns of frames, then of the arm."""
+        flat = rows[..., self._own].reshape(-1, len(self._own))
+        return np.asarray(flat.T @ flat)
+
+    def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
+        """Return plausible offsets, as in `Posterior.doubted`, for the arm only."""
+        weights, means, covariances = (np.array(each) for each in zip(*doubted, strict=True))
+        return weights, means[:, self._arm], covariances[:, self._arm][:, :, self._arm]
+
+    def risk(self, which: FloatArray, around: FloatArray, doubts: _Doubts) -> float:
+        """Return the risk at some poses, in frames fitted to poses around; by their products."""
+        frames, arm = np.s_[: self._placed], np.s_[self._placed :]
+        root = inverse_root(around[frames, frames], np.diag(around)[frames])
+        taken = root @ (root.T @ around[frames, arm])
+        cross = taken.T @ which[frames, arm]
+        left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
+        slope = left @ self._offsets
+        gain = float(slope @ self._offsets)
+        weights, means, covariances = doubts
+        margins = means @ slope - 0.5 * gain
+        spreads = np.sqrt(np.maximum(covariances @ slope @ slope, 0.0))
+        with np.errstate(divide='ignore', invalid='ignore'):
+            risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
+        return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

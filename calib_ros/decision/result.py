@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The result of an identification."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.reasons import Reason
+from calib_ros.decision.region import Region
+from calib_ros.decision.steps import Step
+from calib_ros.decision.validation import Comparison
+from calib_ros.errors import ConfigError
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.evidence import Posterior
+from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.levels import CONFIDENT, KNOWN
+from calib_ros.estimation.noise import Noise
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown, as_frame, as_html
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Shown):
+    """The result of an identification; a poor fit is data in it, not an error."""
+
+    chain: Chain
+    before: Chain
+    """The nominal chain. Both have fitted frames."""
+    parameters: tuple[ParameterRow, ...]
+    names: tuple[str, ...]
+    """Fitted parameters, (P,)."""
+    uncertainty: identifiability.Uncertainty
+    """Of the fitted parameters, for the noise found in the residuals."""
+    fitted: Comparison
+    """Residuals of the fitted pairs."""
+    validation: Comparison | None
+    """Residuals of held-out pairs; None if there are too few poses."""
+    validated_by: str
+    """How these pairs were held out."""
+    noise: Noise
+    distances: tuple[FloatArray, ...]
+    """Residuals (N,) of each set's samples in units of the usual one (`robust.py`)."""
+    outliers: tuple[Outlier, ...]
+    """Samples with gross errors; they carry little or no weight in the fit."""
+    gauges: dict[str, list[str]]
+    """For each omitted parameter, the fitted ones it trades off against."""
+    observability: identifiability.Observability
+    priors: dict[str, float]
+    """Standard deviations [m, rad] known beforehand."""
+    world_frame: str
+    iterations: int
+    converged: bool
+    chance: float | None
+    """Probability that drift of the device, shared by successive measurements, would let the arm's
+    parameters explain as much. None for a target in sockets."""
+    refusals: tuple[Reason, ...]
+    """Failed acceptance rules, in words; empty if the result is accepted."""
+    posterior: Posterior
+    """The posterior of the arm, unmodelled effects included."""
+    region: Region | None
+    """Where the calibration may be used; None if nowhere."""
+    weak: tuple[str, ...] = ()
+    """Parameters that the poses hardly determine, held near nominal by a prior."""
+    verdicts: tuple[effects.Verdict, ...] = ()
+    """Effects tried if the model was chosen."""
+    step: Step | None = None
+    """What moved during the measurement (`steps.py`)."""
+    remarks: tuple[str, ...] = ()
+    """What is suspicious despite good figures, and what to do (`suspicions.py`)."""
+    coupled: bool = False
+    """Whether unfitted couplings of the wrist explain most of the residuals."""
+    images: int = 0
+    """Number of board images fitted."""
+
+    @property
+    def accepted(self) -> bool:
+        """Tell whether the result may replace the nominal parameters."""
+        return not self.refusals
+
+    @property
+    def rank(self) -> int:
+        """Return the number of fitted parameters."""
+        return len(self.names)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Return the covariance (P, P) of the fitted parameters."""
+        return self.uncertainty.covariance
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """Return the parameters that were free but could not be determined."""
+        return tuple(p.name for p in self.parameters if p.status in ('gauge', 'not excited'))
+
+    @property
+    def not_excited(self) -> tuple[Parameter, ...]:
+        """Return the unidentifiable parameters that other poses would determine."""
+        return tuple(p.name for p in self.parameters if p.status == 'not excited')
+
+    def pose_covariance(self, q: FloatArray) -> FloatArray:
+        """Return the expected squares (N, 6, 6) [m, rad] of pose errors at q (N, n).
+
+        In world axes; due to the uncertainty of parameters and to unmodelled effects.
+        """
+        return self.posterior.expected(q)
+
+    def confidence_ellipsoid(self, q: FloatArray, level: float = CONFIDENT) -> FloatArray:
+        """Return (N, 3, 3): rows are the semi-axes [m] of the region of the predicted position.
+
+        By the F distribution if the noise was estimated, by chi-squared (its limit) if it is
+        given.
+        """
+        if not 0.0 < level < 1.0:
+            raise ConfigError(f'level must be between 0 and 1, as 0.95, not {level}')
+        jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
+        sources = self.uncertainty.parts
+        shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
+        freedom = self.uncertainty.freedom_of(shares)
+        values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
+        square = 3.0 * special.fdtri(3, np.minimum(freedom, KNOWN), level)
+        square = np.where(freedom > KNOWN, special.chdtri(3, 1.0 - level), square)
+        length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))
+        return np.asarray(np.swapaxes(vectors * length[:, np.newaxis, :], 1, 2))
+
+    def predicted_sigma(self, count: int = 300) -> FloatArray:
+        """Return standard deviations (count,) [m] of positions over the joint range.
+
+        The root of the trace of the position covariance at seeded random configurations.
+        """
+        q = self.chain.random_joints(count, np.random.default_rng(0))
+        return np.asarray(np.sqrt(np.trace(self.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)))
+
+    def correlated(self, threshold: float = 0.9) -> tuple[tuple[str, str, float], ...]:
+        """Return pairs of parameters whose correlation exceeds a threshold, strongest first."""
+        return identifiability.correlated(self.covariance, self.names, threshold)
+
+    def to_frame(self) -> Any:
+        """Return the parameters as a pandas.DataFrame [m, rad]; `within_95` are half widths."""
+        rows = self.parameters
+        return as_frame(
+            {
+                'parameter': [str(p.name) for p in rows],
+                'value': [p.value for p in rows],
+                'offset': [p.offset for p in rows],
+                'std': [p.std for p in rows],
+                'within_95': [p.half_width() for p in rows],
+                'unit': [p.name.unit for p in rows],
+                'status': [p.status for p in rows],
+            }
+        )
+
+    def _repr_html_(self) -> str:
+        before, after = (self.validation or self.fitted).figures
+        rows = [('parameter', 'offset [mm, mrad]', '± (95 %)')]
+        rows += [
+            (str(p.name), f'{1e3 * p.offset:+.4f}', f'{1e3 * (p.half_width() or 0.0):.4f}')
+            for p in self.parameters
+            if p.std is not None
+        ]
+        figures = f'RMS {before.rms_mm:.3f} → {after.rms_mm:.3f} mm, by {self.validated_by}'
+        verdict = 'accepted' if self.accepted else 'not accepted'
+        notes = (figures, *self.refusals, *self.remarks)
+        return as_html(f'{self.chain.name}: {verdict}', notes, rows)

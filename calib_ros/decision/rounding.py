@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rounded joint values: does the arm explain the gain, or the rounding?
+
+Values that are multiples of a step are off by up to half a step, identically wherever a joint has
+the same value. A model can follow that, even on held-out poses with the same values. So an F test
+decides whether the arm explains more of the nominal residuals y, frames projected out, than chance
+would if rounding explained them all,
+
+    y ~ N(0, k (I + C C^T))        C: a column for each value of each joint, scaled to its error
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from calib_ros.decision.changes import Information
+from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
+from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.values import ROUNDED
+
+STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
+"""Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are intended."""
+
+
+def rounded(problem: Problem) -> dict[str, float]:
+    """Return the joints whose values are multiples of a step [rad or m], with the step."""
+    joints = np.concatenate([each.joints for each in problem.sets])
+    steps = {name: _step(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}
+    return {name: step for name, step in steps.items() if step > 0.0}
+
+
+def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, float]:
+    """Return the error [rad or m] of each joint's zero by rounding, by parameter.
+
+    The RMS of the mean over all values, uniform within a step; a value shared by most poses hardly
+    averages out.
+    """
+    joints = np.concatenate([each.joints for each in problem.sets])
+    found: dict[str, float] = {}
+    for joint, values in zip(problem.chain.joints, joints.T, strict=True):
+        if joint.name in coarse:
+            shares = np.unique(values, return_counts=True)[1] / len(values)
+            size = coarse[joint.name] / np.sqrt(12.0) * np.sqrt(np.sum(shares**2))
+            found[joint.driven] = float(size)
+    return found
+
+
+def _step(values: FloatArray) -> float:
+    few = values[:3, np.newaxis] / STEPS
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
+    step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
+    wider = _are_multiples(values, CLEARLY * step) if step else True
+    return 0.0 if wider or len(np.unique(values)) < 3 else step
+
+
+def _are_multiples(values: FloatArray, step: float) -> bool:
+    return bool(np.abs(values / step - np.round(values / step)).max() < ROUNDED)
+
+
+def may_be_rounding(
+    problem: Problem,
+    before: Chain,
+    names: Sequence[str],
+    steps: Mapping[str, float],
+    good: Sequence[NDArray[np.bool_]],
+) -> bool:
+    """Tell whether rounding of joint values explains the nominal residuals as well.
+
+    `before` is the nominal chain with fitted frames, `names` are fitted, `steps` belong to rounded
+    joints, `good` (N,) excludes outliers of each set.
+    """
+    sets = [each.select(which).spread() for each, which in zip(problem.sets, good, strict=True)]
+    joints = np.concatenate([each.joints for each in sets])
+    levels = {}
+    for number, joint in enumerate(problem.chain.joints):
+        value, level = np.unique(joints[:, number], return_inverse=True)
+        if joint.name in steps and 2 * len(value) <= len(joints):
+            levels[joint.driven] = level
+    arm = [name for name in names if not before.owns_frame(name)]
+    if not (levels and arm):
+        return False
+    frames = [name for name in names if before.owns_frame(name)]
+    chain = before.with_effects([name for name in arm if name in dict(problem.model.effects)])
+    wanted = list(dict.fromkeys([*frames, *arm, *levels]))
+    parts = problem.system(sets).rows_of(chain, wanted)
+    owner, rows = owners(parts), stacked(parts)
+    columns = [rows[:, : len(frames)]]
+    for name, level in levels.items():
+        size = steps[Parameter(name).owner] / np.sqrt(12.0)
+        column = size * rows[:, [wanted.index(name)]]
+        columns.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
+    beside = np.column_stack(columns)
+    every = np.column_stack([beside, rows[:, len(frames) : len(frames) + len(arm)], rows[:, -1]])
+    first, rest = np.s_[: beside.shape[1]], np.s_[beside.shape[1] :]
+    products = every.T @ every
+    prior = np.diag(np.arange(beside.shape[1]) >= len(frames)).astype(float)
+    taken = linalg.solve(products[first, first] + prior, products[first, rest], assume_a='pos')
+    left = products[rest, rest] - products[rest, first] @ taken
+    information = Information(tuple(map(Parameter, arm)), left[:-1, :-1], left[:-1, -1])
+    gain, _, _, rank = information.explained(np.eye(len(arm)))
+    freedom = max(len(rows) - len(frames) - rank, 1)
+    noise = max(float(left[-1, -1]) - gain, 1e-300) / freedom
+    return chance_of(gain / noise, rank, freedom) > 1.0 - SURE

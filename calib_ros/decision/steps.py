@@ -1,0 +1,333 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Something moved during the session: one step in time of a base, a tool or a joint's zero.
+
+Each of these adds a group of columns X to the linear model, switched on at some stop. At the fit,
+with J the columns of the parameters and r the residuals, a group explains, of the remaining
+squares,
+
+    e = v^T S^+ v        v = X^T r - A^T H^+ J^T r    S = X^T X - A^T H^+ A    A = J^T X
+
+Products of all columns are summed from the end of the session and serve every stop. docs/model.md
+(Judgement) describes the search. Known distances between sockets say nothing about time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.decision.drift import inverse_root, slow_cosines
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.estimation.configurations import stops
+from calib_ros.estimation.fitting import SOME
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE, gram
+from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import Robust, weights_of
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+
+EXPLAINED = 0.5
+"""Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """What moved, when and by how much.
+
+    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `thing` names the device
+    or target there. `set`, `sample`, its `image` and `stamp_ns` belong to the first sample after
+    the step. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
+    ('rad'); of a joint that of its zero. `share` is its share of the squared residuals beyond that
+    of as many useless parameters. If all measurements on one side are outliers, `unused` says
+    which: the fit is not affected.
+    """
+
+    what: str
+    kind: str
+    thing: str
+    set: int
+    sample: int
+    stamp_ns: int
+    size: float
+    unit: str
+    share: float
+    unused: str
+    image: int | None = None
+
+    @property
+    def harmful(self) -> bool:
+        """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
+        return self.kind == 'joint' or not self.unused
+
+    @property
+    def reason(self) -> Reason:
+        """Return the reason to refuse a result."""
+        return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
+
+    def __str__(self) -> str:
+        when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
+        line, fraction = divmod(self.stamp_ns, 10**9)
+        if line < 10**6 and not fraction:  # row numbers instead of a clock
+            when = f'line {line}, if rows are in the order of measurement'
+        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
+        where += f' of set {self.set + 1}' if self.set else ''
+        size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+        thing, of = self.thing, f' ({self.what})'
+        if self.kind == 'joint':
+            thing, of = f'the zero of {self.what}', ''
+        text = f'{thing} moved {size}{of} before {where} ({when})'
+        if self.unused:
+            text += f'; measurements {self.unused} carry no weight'
+        return text
+
+
+def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:
+    """Return the step that explains more than half of the residuals of a fit, if any."""
+    scan = _Scan(problem, names, robust)
+    found = scan.best()
+    if found is not None and scan.few_gross(found):
+        scan = _Scan(problem, names, robust, gross=False)
+        found = scan.best()
+    return None if found is None or scan.drifts(found) else scan.described(found)
+
+
+def _some_places(stops: int) -> NDArray[np.intp]:
+    """Return stops for a coarse search: spaced by a tenth of those on the shorter side.
+
+    A step between two of them is still explained to nine tenths.
+    """
+    every = range(LEAST_ASIDE, stops - LEAST_ASIDE + 1)
+    some = [*every[:1]]
+    while some and some[-1] < every[-1]:
+        aside = min(some[-1], stops - some[-1])
+        some.append(min(some[-1] + max(aside // 10, 1), every[-1]))
+    return np.array(some, dtype=np.intp)
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Columns switched on together: a frame of some sets, or the zero of a joint."""
+
+    what: str
+    kind: str
+    names: tuple[str, ...]
+    sets: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A step: its group, its first stop, and its size by parameter.
+
+    `share` is the explained share of the squares, `variance` the rest per degree of freedom.
+    """
+
+    group: _Group
+    stop: int
+    size: FloatArray
+    share: float
+    variance: float
+
+
+class _Scan:
+    """The linear model at a fit, with columns of everything that may have moved."""
+
+    def __init__(
+        self, problem: Problem, names: Sequence[str], robust: Robust, gross: bool = True
+    ) -> None:
+        self._problem, self._chain = problem, robust.fit.chain
+        self._groups = _groups(problem)
+        self._fitted = len(names)
+        self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
+        self._names = list(dict.fromkeys([*names, *self._added]))
+        share = -(-robust.system.count // SOME)
+        self._chosen = [np.arange(0, len(each), share) for each in problem.sets]
+        far = [d[index] for d, index in zip(robust.distances, self._chosen, strict=True)]
+        self._weights = [weights_of(each, robust.loss) for each in far]
+        bounded = 'huber' if gross and robust.loss != 'none' else robust.loss
+        few = robust.system.select(self._chosen).weighted([weights_of(d, bounded) for d in far])
+        self._equations = np.array([float(samples.rows) for samples in few.sets])
+        self._rows = few.rows_of(self._chain, self._names)
+        self._sets = sets = [samples.observations for samples in few.sets]
+        order = np.argsort(np.concatenate([each.stamps_ns for each in sets]), kind='stable')
+        number = np.empty(len(order), dtype=np.intp)
+        number[order] = stops(np.concatenate([each.joints for each in sets])[order])
+        self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
+        self._stops = int(number.max(initial=-1)) + 1
+        extra, offset = replace(few, separations=()).extra_rows(self._chain, names)
+        whole = np.array([gram(rows) for rows in self._rows])
+        matrix = whole.sum(axis=0)[: self._fitted]
+        normal = matrix[:, : self._fitted] + extra.T @ extra
+        self._root = inverse_root(normal, np.diag(normal))
+        self._known = self._root.T @ (matrix[:, -1] + extra.T @ offset)
+        left = np.zeros(len(self._names) + 1)
+        left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
+        self._left = np.einsum('i,sij,j->s', left, whole, left)
+
+    def _budget(self, group: _Group) -> tuple[float, float, float]:
+        """Return equations, degrees of freedom and remaining squares of a group's sets."""
+        sets = list(group.sets)
+        equations = float(self._equations[sets].sum())
+        freedom = equations * (1.0 - self._fitted / float(self._equations.sum()))
+        return equations, freedom, float(self._left[sets].sum())
+
+    def best(self) -> _Found | None:
+        """Return the best step, if it explains most of the squares."""
+        some = _some_places(self._stops)
+        near = self._best_of(some, 0.5 * EXPLAINED) if len(some) else None
+        if near is None:
+            return None
+        before, after = some[some < near.stop], some[some > near.stop]
+        first = before.max(initial=LEAST_ASIDE)
+        last = after.min(initial=self._stops - LEAST_ASIDE)
+        return self._best_of(np.arange(first, last + 1), EXPLAINED)
+
+    def _best_of(self, places: NDArray[np.intp], least: float) -> _Found | None:
+        """Return the best step at some stops, if it explains that share of the squares."""
+        products = self._to_the_end(places)
+        own = products[:, :, [self._names.index(name) for name in self._added]]
+        cross = products[:, :, : self._fitted] @ self._root
+        matrix = own - cross @ np.swapaxes(cross, 1, 2)
+        vector = products[:, :, -1] - cross @ self._known
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum('bii->bi', own), 1e-300))
+        found: _Found | None = None
+        lowest, total = np.inf, float(self._left.sum())
+        for group in self._groups:
+            columns = [self._added.index(name) for name in group.names]
+            size = scale[:, columns]
+            own = matrix[:, columns][:, :, columns] * size[:, :, np.newaxis] * size[:, np.newaxis]
+            values, axes = np.linalg.eigh(own)
+            good = values > ROUNDING
+            rank = good.sum(axis=1)
+            along = np.einsum('bij,bi->bj', axes, size * vector[:, columns]) * good
+            inverse = 1.0 / np.where(good, values, 1.0)
+            equations, freedom, left = self._budget(group)
+            if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
+                continue
+            gain = (along**2 * inverse).sum(axis=1)
+            share = np.minimum(gain / left, 1.0 - 1e-12)
+            k = int(np.argmax(share))
+            rest = (1.0 - share[k]) / (freedom - rank[k])
+            beyond = 1.0 - rest * freedom
+            # over all sets: one with few equations may have no freedom left
+            whole = float(self._equations.sum()) - self._fitted - float(rank[k])
+            squares = float(gain[k]) * whole / max(total - float(gain[k]), 1e-300)
+            trials = self._stops * len(self._groups)
+            by_chance = trials * chance_of(squares, max(int(rank[k]), 1), whole)
+            criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
+            if beyond > least and by_chance < 1.0 - SURE and criterion < lowest:
+                lowest = criterion
+                change = size[k] * (axes[k] @ (along[k] * inverse[k]))
+                found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))
+        return found
+
+    def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
+        """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
+        own = [self._names.index(name) for name in self._added]
+        found = np.zeros((len(places), len(own), len(self._names) + 1))
+        for rows, numbers in zip(self._rows, self._numbers, strict=True):
+            part = np.searchsorted(places, numbers, side='right')
+            order = np.argsort(part, kind='stable')
+            bounds = np.searchsorted(part[order], np.arange(1, len(places) + 2)).tolist()
+            ordered = rows[:, :, order]
+            for k, (first, last) in enumerate(pairwise(bounds)):
+                flat = ordered[:, :, first:last].reshape(len(rows), -1)
+                found[k] += flat[own] @ flat.T
+        return np.asarray(np.cumsum(found[::-1], axis=0)[::-1])
+
+    def few_gross(self, found: _Found) -> bool:
+        """Tell whether stops on the shorter side are gross errors, too few for a step.
+
+        The freedoms of a frame explain one or two positions whatever their errors.
+        """
+        sets = found.group.sets
+        kept = np.concatenate([self._weights[k] > 0.0 for k in sets])
+        numbers = np.concatenate([self._numbers[k] for k in sets])
+        used, gross = np.unique(numbers[kept]), np.unique(numbers[~kept])
+        gross = np.setdiff1d(gross, used)
+        every = np.union1d(used, gross)
+        late = np.count_nonzero(every >= found.stop)
+        after = 2 * late < len(every)
+        return 0 < int(np.count_nonzero((gross >= found.stop) == after)) < LEAST_ASIDE
+
+    def drifts(self, found: _Found) -> bool:
+        """Tell whether a slow drift of the same group explains more than the step."""
+        slow = slow_cosines(self._stops)[1:]
+        if not len(slow):
+            return False
+        columns = [self._names.index(name) for name in found.group.names]
+        matrix = np.zeros((self._fitted + len(columns) * len(slow) + 1,) * 2)
+        for rows, numbers in zip(self._rows, self._numbers, strict=True):
+            moving = rows[columns][:, np.newaxis] * slow[:, np.newaxis, numbers]
+            wide = moving.reshape(-1, *rows.shape[1:])
+            matrix += gram(np.concatenate([rows[: self._fitted], wide, rows[-1:]]))
+        cross = self._root.T @ matrix[: self._fitted, self._fitted : -1]
+        own = matrix[self._fitted : -1, self._fitted : -1]
+        root = inverse_root(own - cross.T @ cross, np.diag(own))
+        gain = root.T @ (matrix[self._fitted : -1, -1] - cross.T @ self._known)
+        _, freedom, left = self._budget(found.group)
+        freedom -= float(root.any(axis=0).sum())
+        return freedom > 0.0 and float(left - gain @ gain) / freedom < found.variance
+
+    def described(self, found: _Found) -> Step:
+        """Return a step with its first sample and its effect on the poses."""
+        group, problem = found.group, self._problem
+        first: list[tuple[int, int, int]] = []
+        moved: list[FloatArray] = []
+        weights: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+        for number in group.sets:
+            each = self._sets[number]
+            after = self._numbers[number] >= found.stop
+            stamps, samples = each.stamps_ns[after].tolist(), self._chosen[number][after].tolist()
+            first += [(stamp, number, k) for stamp, k in zip(stamps, samples, strict=True)]
+            model = ErrorModel(self._chain, group.names, each.base, each.tool)
+            moved.append(model.jacobian(each.joints[after]) @ found.size)
+            for side, which in zip(weights, (~after, after), strict=True):
+                side.append(self._weights[number][which])
+        stamp, of_set, sample = min(first)
+        change = np.sqrt((np.concatenate(moved) ** 2).mean(axis=0))
+        size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+        unit, oriented = 'm', any(kind.oriented for kind in problem.kinds)
+        if group.kind == 'joint':
+            size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
+        elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
+            size, unit = turn, 'rad'
+        sides = zip(('before that', 'from there on'), weights, strict=True)
+        unused = [where for where, side in sides if not np.concatenate(side).any()]
+        seen = problem.sets[of_set]
+        image = None if seen.pixels is None else int(seen.images[sample])
+        where = (of_set, sample, stamp)
+        named = group.what, group.kind, _thing(group.kind, seen)
+        return Step(*named, *where, size, unit, found.share, ''.join(unused), image)
+
+
+def _thing(kind: str, seen: Observations) -> str:
+    if kind == 'joint':
+        return 'the joint'
+    of_images = seen.pixels is not None
+    target = ['the board' if of_images else 'the target']
+    device = ['the camera', 'its lens'] if of_images else ['the measuring device']
+    on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
+    *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
+    return f'{", ".join(first)} or {last}' if first else last
+
+
+def _groups(problem: Problem) -> list[_Group]:
+    found = []
+    for kind in ('base', 'tool'):
+        for frame in dict.fromkeys(getattr(each, kind) for each in problem.sets):
+            sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
+            socket = kind == 'base' and problem.sets[sets[0]].socket  # the ball turns in it
+            names = parameters_of(frame)[: 3 if socket else 6]
+            found.append(_Group(frame, kind, names, tuple(sets)))
+    everywhere = tuple(range(len(problem.sets)))
+    for joint in problem.chain.joints:
+        found.append(_Group(joint.name, 'joint', (joint.driven,), everywhere))
+    return found

@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The usual mistakes in the input: how to undo each, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+from typing import TypeAlias
+
+import numpy as np
+
+from calib_ros.decision.misread import Turn, misread
+from calib_ros.estimation.levels import NEARER, TELLING
+from calib_ros.estimation.observations import Observations
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Convention
+from calib_ros.kinematics.chain_file import shipped_chains
+from calib_ros.kinematics.se3 import FloatArray
+
+Sets: TypeAlias = tuple[Observations, ...]
+Change: TypeAlias = Callable[[Observations], Observations]
+QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
+"""Zeros of joints [rad] that differ between conventions."""
+ANGLES = (
+    ('degrees', 'radians', 'deg', np.radians(1.0)),
+    ('radians', 'degrees', 'rad', np.degrees(1.0)),
+)
+"""Actual unit of angles, assumed unit, option, and size of the actual in the assumed one."""
+SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
+NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
+
+
+@dataclass(frozen=True, eq=False)
+class Suspect:
+    """A possible mistake, in words, and the option to give with a table.
+
+    `changes` in order undo it in the samples, `chain` is the corrected nominal one, joint values
+    are `rows` below their measurement. Of equivalent mistakes, those of lowest `rank` are named.
+    `published` is the remedy for messages, live or from a bag. Mistakes of different parts
+    (`measured` or a joint) may occur together.
+    """
+
+    what: str
+    remedy: str
+    changes: tuple[Change, ...] = ()
+    rank: int = 1
+    chain: Chain | None = None
+    rows: int = 0
+    published: str = 'correct it where it is published'
+    part: str = ''
+
+    def undone(self, sets: Sets) -> Sets:
+        """Return the corrected samples."""
+        for change in self.changes:
+            sets = tuple(map(change, sets))
+        return sets
+
+
+ORIENTATIONS = Suspect(
+    'the positions fit the arm, the orientations do not',
+    'check their convention, their units and their columns, or leave them out',
+    published='check the orientations where they are published',
+)
+"""Named if no other mistake explains the measurements."""
+
+
+def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Suspect]:
+    """Yield possible mistakes, the most usual first.
+
+    Poses `of_images` are those of a board in a camera; joint values come from a table of places.
+    """
+    if of_images:
+        yield from _measured(_of_boards(sets[0].inverse))
+        for each in _of_places(chain):
+            remedy = each.published if 'chain' in each.published else 'correct it in --places'
+            yield replace(each, remedy=remedy)
+        return
+    if not any(each.socket for each in sets):
+        (seen,) = sets
+        yield from _measured(_units(chain))
+        if seen.oriented.any():
+            yield from _measured(_conventions(chain, seen))
+            yield from _misread(chain, seen)
+        remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
+        what = 'the axes of the measuring device are left-handed'
+        yield Suspect(what, remedy, (_mirrored,), 3)
+    yield from _of_places(chain)
+
+
+def _measured(found: Iterator[Suspect]) -> Iterator[Suspect]:
+    for each in found:
+        yield replace(each, part='measured')
+
+
+def _of_places(chain: Chain) -> Iterator[Suspect]:
+    """Yield mistakes of joint values and the arm."""
+    for one, other, unit, size in ANGLES:
+        what = f'the joint values are in {one}, not {other}'
+        change = _of_kind(chain, 'revolute', size)
+        yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
+    yield from _of_joints(chain)
+    yield from _of_one_unit(chain)
+    yield from _of_arms(chain)
+    for rows in (1, -1, 2, -2):
+        where = 'below' if rows > 0 else 'above'
+        count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
+        what = f'the joint values stand {count} {where} their measurement'
+        published = 'check the stamps, and delay'
+        yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
+
+
+def _of_boards(inverse: bool) -> Iterator[Suspect]:
+    """Yield mistakes of a camera and its board."""
+    what, remedy = 'the camera is on the flange', '--eye-in-hand (or eye_in_hand)'
+    if inverse:
+        what, remedy = NOT_ON_FLANGE
+    yield Suspect(what, remedy, (Observations.inverted,), published=_in_sources(not inverse))
+    for unit, size in SCALES.items():
+        remedy = 'give square and marker in metres'
+        what = f'the lengths of the board are in {unit}, not metres'
+        yield Suspect(what, remedy, (_scaled(size),), published=remedy)
+    remedy = 'give images and corners as the camera sees them, u to the right and v down'
+    yield Suspect('the images are mirrored', remedy, (_mirrored,), published=remedy)
+
+
+def _in_sources(on_flange: bool) -> str:
+    return f'set eye_in_hand={str(on_flange).lower()} in sources'
+
+
+def _units(chain: Chain) -> Iterator[Suspect]:
+    """Yield units of lengths, and of angles at the same time."""
+    linear = [f'q{k}' for k, joint in enumerate(chain.joints, 1) if joint.type == 'prismatic']
+    whole = 'positions and linear joints' if linear else 'positions'
+    degrees = _of_kind(chain, 'revolute', np.radians(1.0))
+    for unit, size in SCALES.items():
+        for way, option, factor in (
+            (f'in {unit}, not metres', f'--length {unit}', size),
+            (f'in metres, not {unit}', '--length m', 1.0 / size),
+        ):
+            positions, travels = lengths = _lengths(chain, factor)
+            what = f'the {whole} are {way}'
+            yield Suspect(what, option, lengths)
+            both = f'{what} and the joint values in degrees'
+            yield Suspect(both, f'{option} --joint-angle deg', (*lengths, degrees), 2)
+            if linear:
+                for name, columns, change in (
+                    ('positions', 'xyz', positions),
+                    ('linear joints', linear, travels),
+                ):
+                    option = ','.join(f'{each}={each}*{factor:g}' for each in columns)
+                    yield Suspect(f'the {name} are {way}', f'--columns {option}', (change,), 2)
+
+
+def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
+    """Yield ways to write a pose, also with lengths in mm or joint values in degrees.
+
+    Only if all poses have an orientation, a camera on the flange may have measured them.
+    """
+    back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
+    ways: list[tuple[str, str, tuple[Change, ...], str]] = [
+        (
+            'the quaternions are w x y z, not x y z w',
+            '--quaternion wxyz',
+            (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])), *back),
+            '',
+        ),
+        (
+            'the quaternions are x y z w, not w x y z',
+            '--quaternion xyzw',
+            (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])), *back),
+            '',
+        ),
+        (
+            'the rotations are transposed, those of the device in the target',
+            '--columns qx=-qx,qy=-qy,qz=-qz',
+            (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
+            '',
+        ),
+    ]
+    if seen.inverse:
+        ways.append((*NOT_ON_FLANGE, (), _in_sources(False)))
+    elif seen.oriented.all():
+        what = 'the poses are those of the world in the target, as by a camera on the flange'
+        remedy = '--eye-in-hand (or --inverse, where the device stands)'
+        ways.append((what, remedy, (Observations.inverted,), _in_sources(True)))
+    in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))
+    for what, remedy, changes, published in ways:
+        for more, option, others in (
+            ('', '', ()),
+            (', and the positions in mm', ' --length mm', in_mm),
+            (', and the joint values in degrees', ' --joint-angle deg', (degrees,)),
+            (
+                ', the positions in mm and the joint values in degrees',
+                ' --length mm --joint-angle deg',
+                (*in_mm, degrees),
+            ),
+        ):
+            rank = 2 if more else 1
+            found = Suspect(what + more, remedy + option, (*back, *others, *changes), rank)
+            if published:
+                rest = ', and correct the rest where it is published' if more else ''
+                found = replace(found, published=published + rest)
+            yield found
+
+
+def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
+    """Yield other conventions of the rotations.
+
+    Base and tool preserve the angle between two poses: it must equal that between the flanges.
+    """
+    arm = replace(chain, base=None, tool=None).forward(seen.joints)[seen.oriented, :3, :3]
+    between = se3.angles_between(arm[:-1], arm[1:])
+
+    def away(each: Observations) -> float:
+        some = each.rotations[each.oriented]
+        return float(np.median(np.abs(se3.angles_between(some[:-1], some[1:]) - between)))
+
+    largest = NEARER * max(away(seen), float(np.median(between)))
+    back = (Observations.inverted,) if seen.inverse else ()
+    for what, remedy, turn in misread():
+        found = Suspect(what, remedy, (*back, _with(turn), *back), 2)
+        if away(*found.undone((seen,))) < largest:
+            yield found
+
+
+def _of_joints(chain: Chain) -> Iterator[Suspect]:
+    """Yield signs, zeros, order and couplings of joints."""
+    names = chain.joint_names
+    same = np.eye(len(names))
+    revolute = [joint.type == 'revolute' for joint in chain.joints]
+    for k in range(len(names)):
+        zeros = {'': 0.0, **(QUARTERS if revolute[k] else {})}
+        for sign, (degrees, angle) in product((1.0, -1.0), zeros.items()):
+            if sign < 0.0 or degrees:
+                yield _of_joint(chain, k, sign, degrees, angle)
+    for i, j in combinations(range(len(names)), 2):
+        order = np.arange(len(names))
+        order[[i, j]] = j, i
+        what = f'{names[i]} and {names[j]} are swapped'
+        remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
+        published = 'swap them in joint_names'
+        yield Suspect(what, remedy, (_joints(same[order]),), 2, published=published)
+    for k in range(1, len(names)):
+        for way in '+-' if revolute[k] and revolute[k - 1] else '':
+            coupled = same.copy()
+            coupled[k, k - 1] = float(f'{way}1')
+            what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
+            remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
+            yield Suspect(what, remedy, (_joints(coupled),), 2)
+
+
+def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
+    """Yield that one joint has another angle unit than the others."""
+    turning = [k for k, joint in enumerate(chain.joints) if joint.type == 'revolute']
+    for k in turning if len(turning) > 1 else ():
+        name, column = chain.joint_names[k], f'q{k + 1}'
+        for one, others, _, size in ANGLES:
+            what = f'{name} is in {one}, the other joints in {others}'
+            factor = np.ones(len(chain.joints))
+            factor[k] = size
+            changes = (_joints(np.diag(factor)),)
+            remedy = f'--columns {column}={column}*{size:.9g}'
+            yield Suspect(what, remedy, changes, 2, part=name)
+
+
+def dead(chain: Chain, sets: Sets) -> Suspect | None:
+    """Return position coordinates that are constant although the arm moves.
+
+    A device square to a planar arm measures no more.
+    """
+    for each in sets:
+        if each.socket or len(each) < TELLING:
+            continue
+        seen = (each.inverted() if each.inverse else each).positions
+        held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
+        places = replace(chain, base=None, tool=None).forward(each.joints)[:, :3, 3]
+        spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        if len(held) and spreads[2] > NEARER**2 * spreads[0]:
+            columns = ', '.join('xyz'[k] for k in held)
+            return Suspect(
+                f'all positions have the same {columns}, though the arm moves in all directions',
+                f'was the column {columns} recorded, and read correctly?',
+                published='check the positions where they are published',
+            )
+    return None
+
+
+def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
+    """Return that a joint has the other sign, another zero [rad], or both."""
+    parts, column = [], f'q{k + 1}'
+    if sign < 0.0:
+        parts.append(('counts the other way round', f'sign: {-chain.joints[k].sign}'))
+        column = f'-{column}'
+    if degrees:
+        parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
+        column += f'{degrees[0]}{abs(angle):.16g}'
+    whats, in_file = zip(*parts, strict=True)
+    own = np.eye(len(chain.joints))[k]
+    remedy = f'{" and ".join(in_file)} in the chain file'
+    return Suspect(
+        f'{chain.joint_names[k]} {" and ".join(whats)}',
+        f'{remedy}, or --columns q{k + 1}={column}',
+        (_joints(np.diag(np.where(own, sign, 1.0)), angle * own),),
+        len(whats),
+        published=remedy,
+        part=chain.joint_names[k],
+    )
+
+
+def _of_arms(chain: Chain) -> Iterator[Suspect]:
+    """Yield lengths in mm, the other convention, and other arms with the same kinds of joints."""
+    small = [replace(j, a=SCALES['mm'] * j.a, d=SCALES['mm'] * j.d) for j in chain.joints]
+    what = 'the lengths of the chain file are in mm, not metres'
+    remedy = 'give a and d in metres there'
+    arm = replace(chain, joints=tuple(small))
+    yield Suspect(what, remedy, chain=arm, published=remedy)
+    other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
+    what = f'the DH table is in the {other} convention, not the {chain.convention} one'
+    remedy = f'convention: {other} in the chain file'
+    arm = replace(chain, convention=other, parallel=None)
+    yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
+    types = [joint.type for joint in chain.joints]
+    for ours in shipped_chains():
+        alike = [joint.type for joint in ours.joints] == types
+        if alike and not np.allclose(ours.table, chain.table, atol=1e-6):
+            what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'
+            published = f'set chain (--chain) to {ours.name}'
+            arm = replace(ours, base=chain.base, tool=chain.tool)
+            yield Suspect(what, remedy, rank=2, chain=arm, published=published)
+
+
+def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
+    return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
+
+
+def _of_kind(chain: Chain, kind: str, size: float) -> Change:
+    return _joints(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
+
+
+def _lengths(chain: Chain, size: float) -> tuple[Change, Change]:
+    """Return what `--length` changes: positions and the values of prismatic joints."""
+    return _scaled(size), _of_kind(chain, 'prismatic', size)
+
+
+def _scaled(size: float) -> Change:
+    return lambda each: replace(each, positions=size * each.positions)
+
+
+def _with(turn: Turn) -> Change:
+    return lambda each: replace(each, rotations=turn(each.rotations))
+
+
+def _mirrored(each: Observations) -> Observations:
+    """Return the measurements with the y axis of the device reversed."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    return replace(
+        each, positions=each.positions @ mirror, rotations=mirror @ each.rotations @ mirror
+    )

@@ -1,0 +1,369 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Suspicious results with good figures: one sentence each, and what to do (docs/model.md).
+
+Scale. With L the derivative of the fitted lengths by the scale s of the device (the frames take
+their share), x their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s;
+tau is estimated from the scatter about the line (Paule and Mandel 1982).
+
+Lens. If other intrinsics of a camera explain most of the residuals, the given ones belong to
+another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
+the lens it would be another arm, not just a more accurate one.
+
+Board. Printers stretch one side of a page. The residuals at the board, averaged over the images,
+show the ratio of its sides; the arm absorbs the scale of both together, which is as uncertain.
+
+Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
+leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
+
+Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
+the poses add nothing to the priors.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import special
+
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.region import SHELL
+from calib_ros.decision.result import Identification
+from calib_ros.decision.steps import EXPLAINED
+from calib_ros.errors import InputError
+from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.identifiability import growth
+from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, chance_of
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
+from calib_ros.estimation.samples import seen_residuals
+from calib_ros.estimation.sizes import SPREAD, TYPICAL
+from calib_ros.estimation.start import fit_to_arm
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import shipped_chains
+from calib_ros.kinematics.parameter import IN_A_FRAME, LENS_KINDS, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import EXACT, EXCEPTION
+
+LEAST_SCALE = 0.5 * SCALE
+"""Scale of a device that is remarked: half the scatter of good ones."""
+LARGEST_SCALE = 10.0 * SCALE
+"""More than any arm grows: by 40 degrees, if all aluminium (23 ppm a degree)."""
+HARMFUL = 0.15
+"""Probability of harm by the device's scale at which a result is refused: of 607 good ones 8
+are; of 1,890 arms with such an error 64 are accepted and get worse (benchmarks/scale.py)."""
+LEAST_NOISE = NEARER * EXCEPTION
+"""Residuals in units of the given sigmas below which these are wrong: clearly less than a
+tenth, the ratio of a device's repeatability to its accuracy; mm would be thousandths."""
+SIMULATED = EXACT
+"""Residuals [m or rad] too small for any device."""
+COUPLED = (
+    'couplings of the last joints explain most of the residuals: are the joint values those '
+    'of the motors? If so, add the effects "coupling"'
+)
+SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
+"""Candidate standard deviations [m] of an arm's own length offsets."""
+
+
+def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
+    """Return the result with what is suspicious in it, refused if it cannot be right.
+
+    `another` is false if a mistake is already named, which comes first.
+    """
+    if any(each.socket or each.plane for each in problem.sets):
+        return result  # one place shows none of these
+    sister = _sister(problem, result) if another else ''
+    scale, certain = ('', False) if sister else _scale(problem, result)
+    lens, imitated = _lens(problem, result) if another else ('', False)
+    board = '' if lens else _board(problem, result)
+    gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
+    refusals = list(result.refusals)
+    if certain:
+        refusals.append(Reason(Rule.SCALE, scale))
+    if imitated:
+        refusals.insert(0, Reason(Rule.MISTAKE, lens))
+        lens = ''
+    if refusals and sigmas:
+        first = another and not imitated
+        refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
+        sigmas = ''
+    coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
+    found = (scale, sister, lens, board, gravity, coupled, motion, sigmas)
+    remarks = (*result.remarks, *(each for each in found if each))
+    return replace(result, remarks=remarks, refusals=tuple(refusals))
+
+
+def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:
+    """Return the common scale of all lengths, its standard deviation and degrees of freedom.
+
+    Zero degrees of freedom with fewer than three lengths.
+    """
+    chain, first = result.chain, problem.sets[0]
+    arm = [n for n in chain.parameter_names if n.is_length and not chain.owns_frame(n)]
+    lengths: dict[str, float] = {n: problem.model.value(n) for n in arm if chain.value(n) != 0.0}
+    fitted = [i for i, n in enumerate(result.names) if n in arm]
+    if len(fitted) < 3 or not lengths:
+        return 0.0, np.inf, 0.0
+    ends, joints = (first.base, first.tool), first.spread().joints
+    grown = growth(chain, result.names, lengths, ends, joints, bool(first.oriented.any()))
+    offsets = np.array([chain.offset(result.names[i], problem.model) for i in fitted])
+    return _common(offsets, grown[fitted], result.covariance[np.ix_(fitted, fitted)])
+
+
+def _common(
+    offsets: FloatArray, growth: FloatArray, covariance: FloatArray
+) -> tuple[float, float, float]:
+    """Return s, its standard deviation and freedom, for offsets (P,) = s growth (P,) + noise."""
+    freedom = len(offsets) - 1
+    variances, axes = np.linalg.eigh(covariance)
+    offsets, growth = axes.T @ offsets, axes.T @ growth
+    weights = 1.0 / (np.maximum(variances, 1e-16) + SCATTERS[:, np.newaxis] ** 2)
+    weight = weights @ growth**2
+    scale = (weights @ (growth * offsets)) / np.maximum(weight, 1e-300)
+    left = (weights * (offsets - scale[:, np.newaxis] * growth) ** 2).sum(axis=1)
+    k = int(np.argmax(left <= freedom))  # the smallest tau that explains the scatter
+    return float(scale[k]), float(max(weight[k], 1e-300) ** -0.5), float(freedom)
+
+
+def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
+    """Return the suspicion of a common scale in words, and whether it refuses."""
+    if text := _out_of_scale(result):
+        return text, True
+    scale, std, freedom = scale_of(problem, result)
+    if freedom < 2.0 or abs(scale) < LEAST_SCALE:
+        return '', False
+    limit = special.stdtrit(freedom, 0.5 + 0.5 * SURE) * std
+    if abs(scale) < limit:
+        return '', False
+    certain = abs(scale) - limit > LARGEST_SCALE and not problem.sigma_scale
+    text = f'{_grown(scale)} (sigma {_percent(std)} %): '
+    advice = 'check the scale of the measuring device, and the temperature'
+    return text + ('no arm does' if certain else advice), certain
+
+
+def _out_of_scale(result: Identification) -> str:
+    """Return that the scale of the device may make the calibrated arm worse."""
+    region, rival = result.region, result.posterior.rival
+    if result.refusals or region is None or rival is None or region.by_scale < HARMFUL:
+        return ''
+    return (
+        f'{_grown(rival[1])}, as by a measuring device that is out of scale; '
+        'then the correction would make the arm worse. If a known length shows the right scale, '
+        'set sigma_scale'
+    )
+
+
+def _grown(scale: float) -> str:
+    way = 'grow' if scale > 0.0 else 'shrink'
+    return f'all lengths of the arm {way} alike, by {_percent(abs(scale))} %'
+
+
+def _percent(share: float) -> str:
+    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
+
+
+def _sister(problem: Problem, result: Identification) -> str:
+    far = SPREAD * TYPICAL['length'], SPREAD * TYPICAL['angle']
+    if not any(each.beyond(*far) for each in result.parameters):
+        return ''
+    types = [joint.type for joint in problem.chain.joints]
+    joints = problem.sets[0].spread().joints
+    nominal = _apart(problem.chain, result.chain, joints)
+    alike = [each for each in shipped_chains() if [j.type for j in each.joints] == types]
+    found = [(_apart(each, result.chain, joints), each.name) for each in alike]
+    distance, name = min(found, default=(np.inf, ''))
+    if distance > NEARER * nominal:
+        return ''
+    return (
+        f'the identified arm is closer to the supplied {name} ({1e3 * distance:.2f} mm) than to '
+        f'the nominal {problem.chain.name} ({1e3 * nominal:.2f} mm): is it the right chain file?'
+    )
+
+
+def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
+    """Return the RMS distance [m] of two arms at (N, n), in the best base and tool."""
+    start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
+    return fit_to_arm(start, [*parameters_of('base'), *parameters_of('tool')], found, joints)[1]
+
+
+def _gravity(problem: Problem, result: Identification) -> str:
+    bent = [n for n, _ in result.chain.effects if effects.group_of(n) in ('gravity', 'compliance')]
+    if not bent:
+        return ''
+    rest = [name for name in result.names if name not in bent]
+    straight = result.chain.with_offsets({n: -result.chain.value(n) for n in bent})
+    given = _explained(problem, straight, rest, bent)
+    best, words = 0.0, ''
+    for axis, along in zip('xyz', np.linalg.norm(problem.chain.gravity) * np.eye(3), strict=True):
+        x, y, z = along.tolist()  # coefficients have the sign
+        share = _explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
+        best, words = max((best, words), (share, axis))
+    if not best - given > EXPLAINED * (1.0 - given):
+        return ''
+    return (
+        f'gravity along {words} of the base explains {100.0 * best:.0f} % of the residuals, '
+        f'along the direction given {100.0 * given:.0f} %: is the arm mounted on a wall? Set '
+        'gravity in the chain file'
+    )
+
+
+def _motion(problem: Problem, result: Identification) -> str:
+    """Return in words that what is left is larger where the arm moves faster."""
+    for each, far in zip(problem.sets, result.distances, strict=True):
+        for what, rates in (('speed', each.velocity), ('acceleration', each.acceleration)):
+            if rates is None or result.noise.position <= 1.0:
+                continue
+            size = np.linalg.norm(rates, axis=1)
+            low, high = np.quantile(size, [1.0 / 3.0, 2.0 / 3.0])
+            slow, fast = np.median(far[size <= low]), np.median(far[size >= high])
+            if fast > ALIKE * slow:
+                return (
+                    f'errors grow with the {what} of the arm: stamps jitter, clocks drift, or the '
+                    'device or the joint states are smoothed. Stop at each pose (mode dwell)'
+                )
+    return ''
+
+
+def _sigmas(problem: Problem, result: Identification) -> str:
+    noise, found = result.noise, []
+    if noise.consistent or any(each.pixels is not None for each in problem.sets):
+        return ''
+    sigmas = problem.sigma_position, problem.sigma_orientation
+    variances = [np.einsum('nii->ni', s.spread().covariances(sigmas)) for s in problem.sets]
+    kinds = (
+        ('position', 'm', noise.position, problem.largest_error),
+        ('orientation', 'rad', noise.orientation, problem.largest_angle),
+    )
+    for k, (what, unit, size, most) in enumerate(kinds):
+        if size is None:
+            continue
+        each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
+        given = float(np.sqrt(np.median(each.mean(axis=1))))
+        own = not np.isclose(given, sigmas[k])
+        name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
+        name = f'{name} {given:.2g} {unit}'
+        left = f'{1e3 * size * given:.2g} m{unit} are left'
+        if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
+            found.append(f'{name}, and only {left}: was m{unit} meant?')
+        elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
+            found.append(
+                f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
+                f'{"larger covariances" if own else f"sigma_orientation to {size * given:.2g}"}'
+            )
+    return '; '.join(found)
+
+
+def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
+    """Return that other intrinsics explain the residuals, and whether the arm imitates them.
+
+    They must explain most of the residuals, or more than chance if the arm imitates them: the arm
+    fitted with them then differs by as much as it may be nearer to the nominal. The points of an
+    image share its pose, so each image counts for six freedoms.
+    """
+    if not result.converged or (result.step is not None and result.step.harmful):
+        return '', False
+    images: Counter[str] = Counter()
+    for each in problem.sets:
+        if each.pixels is not None:
+            images[each.camera] += distinct(each.images)
+    for camera, count in images.items():
+        frame, names = problem.chain.frame(camera), parameters_of(camera, LENS_KINDS)
+        freedom = IN_A_FRAME * count - len(result.names)
+        if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
+            continue
+        left = 1.0 - _explained(problem, result.chain, result.names, names)
+        rest = freedom - len(names)
+        if chance_of((1.0 - left) / max(left, EXACT) * rest, len(names), rest) > 1.0 - SURE:
+            continue
+        fitted = replace(frame, lens=replace(frame.lens, fixed=False))
+        imitated = _imitated(problem, result, problem.chain.with_frame(camera, fitted))
+        share = 1.0 - left * freedom / rest
+        if imitated or share > EXPLAINED:
+            lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
+            text = f'other intrinsics of the camera than those given explain {100.0 * share:.0f} %'
+            text += f' of what is left: {lens}, or calibrate the camera as it is used'
+            return text, imitated
+    return '', False
+
+
+def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
+    """Tell whether a fit with a free lens finds another arm, within the region of this one."""
+    try:
+        other = fit(replace(problem, chain=freed))[2].chain
+    except (InputError, np.linalg.LinAlgError):
+        return True
+    joints = [each.spread().joints for each in problem.sets]
+    if result.region is not None:
+        drawn = freed.random_joints(SHELL, np.random.default_rng(0))
+        joints.append(drawn[result.region.covers(drawn)])
+    before, after = (
+        _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
+    )
+    return after > NEARER * before
+
+
+def _board(problem: Problem, result: Identification) -> str:
+    for each, far in zip(problem.sets, result.distances, strict=True):
+        kept = far < OUTLIER
+        if each.points is None or distinct(each.images[kept]) < 2:
+            continue
+        seen, points = each.select(kept), each.points[kept]
+        _, shifts = seen_residuals(result.chain, seen)
+        if each.on_flange:  # the camera moves instead
+            shifts = -shifts
+        else:
+            poses = result.chain.forward(seen.joints, seen.approach, seen.base, seen.tool)
+            shifts = np.einsum('nji,nj->ni', poses[:, :3, :3], shifts)
+        _, image = np.unique(seen.images, return_inverse=True)
+        count = np.bincount(image)
+        stretched = []
+        for side, shift in zip(points.T[:2], shifts.T, strict=False):
+            beside = side - (np.bincount(image, side) / count)[image]
+            size = np.bincount(image, beside**2)
+            stretched.append(np.bincount(image, beside * shift) / np.maximum(size, 1e-300))
+        wider = stretched[0] - stretched[1]
+        mean, error = float(wider.mean()), wider.std(ddof=1) / np.sqrt(len(count))
+        if abs(mean) > LARGEST_SCALE + special.stdtrit(len(count) - 1, SURE) * error:
+            way = 'wider' if mean > 0.0 else 'narrower'
+            return (
+                f'the board is {_percent(abs(mean))} % {way} for its height than stated: print it '
+                'unstretched, else the arm becomes as wrong'
+            )
+    return ''
+
+
+def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:
+    """Return the share of the residuals that couplings of the wrist explain, if most of it.
+
+    `noise` is the size of the residuals [sigma given].
+    """
+    known = [name for name, _ in chain.effects]
+    added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
+    if not added or noise < SUSPICIOUS:  # nothing is left to explain
+        return 0.0
+    share = _explained(problem, chain.with_effects([*known, *added]), names, added)
+    return share if share >= EXPLAINED else 0.0
+
+
+def _explained(
+    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
+) -> float:
+    """Return the share of the residual squares that added parameters explain, linearly."""
+    few = [each.spread() for each in problem.sets]
+    rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
+    count = len(fitted)
+    if len(rows) - count - len(added) < len(rows) // 3:
+        return 0.0
+    scale = np.linalg.norm(rows, axis=0)
+    scale[scale == 0.0] = 1.0
+    factor = np.asarray(np.linalg.qr(rows / scale, mode='r'))
+    rest = factor[count:, count:]  # beyond the fitted parameters
+    left = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
+    total = float(rest[:, -1] @ rest[:, -1])
+    return 1.0 - float(left @ left) / total if total > 0.0 else 0.0

@@ -1,0 +1,369 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Judging a result on held-out poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.identifiability import structurally_independent
+from calib_ros.estimation.leastsquares import System, minimise, without_each
+from calib_ros.estimation.levels import CONFIDENT, TELLING
+from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import OUTLIER, Robust, distances_of
+from calib_ros.estimation.samples import residual_arrays, seen_residuals
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.se3 import FloatArray, Index, norms
+from calib_ros.shown import Shown, as_frame, of_them
+
+COUNTS = 0.005
+"""Relative change of an RMS error that counts; less is chance (benchmarks/real_robots.py)."""
+
+
+@dataclass(frozen=True)
+class ErrorFigures:
+    """Figures of position errors over a set of poses, as in ISO 9283."""
+
+    count: int
+    rms_mm: float
+    mean_mm: float
+    max_mm: float
+    mean_plus_3_sigma_mm: float
+    rms_mrad: float | None
+    rms_px: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
+
+    Both in the world; the rotation is NaN where not measured. `configurations` (N,) are the
+    configuration numbers. For board points the position is the shortest shift that explains the
+    residual in `pixels` (N, 2), which are NaN otherwise.
+    """
+
+    position: FloatArray
+    orientation: FloatArray
+    configurations: NDArray[np.intp]
+    pixels: FloatArray
+
+    def figures(self, which: NDArray[np.bool_]) -> ErrorFigures:
+        """Return RMS, mean and maximum over the pairs of a mask (N,)."""
+        parts = self.position, self.orientation, self.pixels
+        distance, angle, away = (norms(part[which]) for part in parts)
+        distance, angle = 1e3 * distance, 1e3 * angle[~np.isnan(angle)]
+        away = away[~np.isnan(away)]
+        return ErrorFigures(
+            len(distance),
+            float(np.sqrt(np.mean(distance**2))),
+            float(distance.mean()),
+            float(distance.max()),
+            float(distance.mean() + 3.0 * distance.std(ddof=int(len(distance) > 1))),
+            float(np.sqrt(np.mean(angle**2))) if angle.size else None,
+            float(np.sqrt(np.mean(away**2))) if away.size else None,
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Shown):
+    """Residuals of the same poses before and after.
+
+    Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
+    `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
+    configurations, which count in the figures but not for acceptance.
+    """
+
+    before: Residuals
+    after: Residuals
+    judged: NDArray[np.bool_]
+    repeated: NDArray[np.bool_] | None = None
+
+    @property
+    def deciding(self) -> NDArray[np.bool_]:
+        """Return which pairs (N,) count for acceptance."""
+        return self.judged if self.repeated is None else self.judged & ~self.repeated
+
+    @property
+    def outliers(self) -> int:
+        """Return the number of outliers, which are left out of the figures."""
+        return int((~self.judged).sum())
+
+    @cached_property
+    def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
+        """Return the figures before and after, without outliers."""
+        return self.before.figures(self.judged), self.after.figures(self.judged)
+
+    def to_frame(self) -> Any:
+        """Return the position residuals [m] before and after as a pandas.DataFrame."""
+        columns = {
+            f'{when}_{axis}': residuals.position[:, k]
+            for when, residuals in (('before', self.before), ('after', self.after))
+            for k, axis in enumerate('xyz')
+        }
+        groups = {'configuration': self.after.configurations, 'judged': self.judged}
+        return as_frame(columns | groups)
+
+    @cached_property
+    def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
+        """Return the figures before and after with outliers."""
+        if not self.outliers:
+            return self.figures
+        everything = np.ones_like(self.judged)
+        return self.before.figures(everything), self.after.figures(everything)
+
+
+def residuals(chain: Chain, observations: Observations) -> Residuals:
+    """Return measured minus predicted for every pair."""
+    pixels = np.full((len(observations), 2), np.nan)
+    if observations.pixels is not None:
+        pixels, position = seen_residuals(chain, observations)
+        orientation = np.full((len(observations), 3), np.nan)
+    else:
+        position, orientation = residual_arrays(chain, observations)
+    if position.shape[1] == 1:  # a distance
+        position = np.pad(position, ((0, 0), (0, 2)))
+    return Residuals(position, orientation, observations.configurations, pixels)
+
+
+def compare(
+    before: Chain,
+    after: Chain,
+    sets: Sequence[Observations],
+    judged: NDArray[np.bool_] | None = None,
+) -> Comparison:
+    """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
+    numbers = np.concatenate(numbered(sets))
+    last, first = (  # `after` first: cached after a fit
+        _joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)
+    )
+    every = np.ones(len(numbers), dtype=bool)
+    return Comparison(first, last, every if judged is None else judged)
+
+
+def validate(
+    problem: Problem,
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+    explained: NDArray[np.bool_] | None = None,
+) -> tuple[Comparison | None, str]:
+    """Judge both chains on pairs that were not fitted.
+
+    Held-out pairs are outliers if they are far from the prediction and not `explained` (N,) by a
+    simpler model. In cross-validation, configurations are dealt to the folds one by one, so that
+    none is on both sides. Outliers keep their weight of the whole fit in the folds; they are
+    judged too.
+    """
+    repeated = _repeated(problem)
+    if problem.judging and not repeated.all():
+        comparison = replace(compare(before, after, problem.judging), repeated=repeated)
+        if problem.loss != 'none':
+            distances = distances_of(after, names, problem.system(problem.judging))
+            judged = np.concatenate(distances) <= OUTLIER
+            judged |= np.False_ if explained is None else explained
+            comparison = replace(comparison, judged=judged)
+        text = f'{len(comparison.judged)} held-out poses'
+        if comparison.outliers:
+            text += f', {of_them(comparison.outliers, "outlier")} not in the figures'
+        if count := repeated.sum():
+            text += f'; those that repeat fitted poses ({count}) do not count for acceptance'
+        return comparison, text
+    places = _places(problem)
+    if len(places) > 1 and all(each.socket for each in problem.sets):
+        return _leave_one_place_out(problem, places, before, after, names, robust)
+    note = ', because all held-out poses were fitted too' if len(repeated) else ''
+    return _cross_validate(problem, before, after, names, robust, note)
+
+
+def _cross_validate(
+    problem: Problem,
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+    said: str,
+) -> tuple[Comparison | None, str]:
+    groups = problem.configurations
+    count = distinct(np.concatenate(groups))
+    rows = sum(
+        distinct(group) * kind.rows for group, kind in zip(groups, problem.kinds, strict=True)
+    )
+    folds = _folds(problem, names, count, rows)
+    if folds < 2:
+        return None, 'nothing: too few poses to hold any out'
+    frames = [name for name in names if before.owns_frame(name)]
+    numbers = [group % folds for group in groups]
+    chains = zip(
+        without_each(before, frames, robust.system, numbers),
+        without_each(after, names, robust.system, numbers),
+        strict=True,
+    )
+    first, second = left_out(chains, problem.sets, groups, numbers)
+    return (
+        Comparison(first, second, ~robust.outliers),
+        f'{folds}-fold cross-validation over {count} different poses{said}',
+    )
+
+
+def left_out(
+    chains: Iterable[tuple[Chain, Chain]],
+    sets: Sequence[Observations],
+    groups: Sequence[NDArray[np.intp]],
+    folds: Sequence[NDArray[np.intp]],
+) -> tuple[Residuals, Residuals]:
+    """Return the residuals of every fold by its own two chains, before and after.
+
+    `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
+    """
+    ordered = [
+        each.select(np.argsort(numbers, kind='stable'))
+        for each, numbers in zip(sets, folds, strict=True)
+    ]
+    pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
+    for k, pair in enumerate(chains):
+        for each, numbers in zip(ordered, folds, strict=True):
+            first = np.count_nonzero(numbers < k)
+            out = each.select(slice(first, first + np.count_nonzero(numbers == k)))
+            for side, chain in zip(pieces, pair, strict=True):
+                side.append(residuals(chain, out))
+    index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
+    before, after = (_joined(side, np.concatenate(groups), index) for side in pieces)
+    return before, after
+
+
+def _repeated(problem: Problem) -> NDArray[np.bool_]:  # held-out pairs (N,)
+    if not problem.judging:
+        return np.zeros(0, dtype=bool)
+    numbers = numbered(problem.all_sets)
+    count = len(problem.sets)
+    return np.isin(np.concatenate(numbers[count:]), np.concatenate(numbers[:count]))
+
+
+def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int:
+    """Return the number of folds; 0 if all configurations are needed for the fit.
+
+    The other folds must determine the fit, with some equations to spare. If they do so only with
+    priors, one configuration is left out at a time.
+    """
+    known = dict(problem.model.effects)
+    names = [name for name in names if name not in known]  # effects have priors
+    folds = min(problem.folds, count)
+    if folds > 1 and rows * (folds - 1) // folds >= len(names) + TELLING:
+        return folds
+    folds = count
+    unknown = set(names) - problem.informed
+    if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + TELLING:
+        return 0
+    return folds
+
+
+def _joined(
+    pieces: Sequence[Residuals],
+    configurations: NDArray[np.intp],
+    index: NDArray[np.intp] | slice = slice(None),
+) -> Residuals:
+    return Residuals(
+        np.concatenate([piece.position for piece in pieces])[index],
+        np.concatenate([piece.orientation for piece in pieces])[index],
+        configurations,
+        np.concatenate([piece.pixels for piece in pieces])[index],
+    )
+
+
+def _places(problem: Problem) -> list[set[str]]:
+    places = [{base} for base in dict.fromkeys(each.base for each in problem.sets)]
+    for first, second, _ in problem.separations:
+        one, other = (next(p for p in places if base in p) for base in (first, second))
+        if one is not other:
+            one |= other
+            places.remove(other)
+    return places
+
+
+def _leave_one_place_out(
+    problem: Problem,
+    places: Sequence[set[str]],
+    before: Chain,
+    after: Chain,
+    names: Sequence[str],
+    robust: Robust,
+) -> tuple[Comparison, str]:
+    """Judge both chains on places of sockets that were not fitted.
+
+    The unknown positions of a place's sockets are fitted to its own pairs, with arm and tool of
+    the others. Outliers keep their weight of the whole fit.
+    """
+    pairs = list(zip(problem.sets, robust.system.sets, strict=True))
+
+    def part(place: set[str], inside: bool) -> System:
+        chosen = [samples for each, samples in pairs if (each.base in place) == inside]
+        known = {samples.observations.base for samples in chosen}
+        apart = tuple(pair for pair in robust.system.separations if {*pair[:2]} <= known)
+        return replace(robust.system, sets=tuple(chosen), separations=apart)
+
+    frames = [name for name in names if before.owns_frame(name)]
+    chains: list[list[Chain]] = [[], []]
+    for place in places:
+        own = [n for base in sorted(place) for n in parameters_of(base)[:3] if n in problem.free]
+        others, left = part(place, inside=False), part(place, inside=True)
+        kinds = [kind for kind in problem.kinds if kind.base not in place]
+        for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
+            rest = [name for name in fitted if name not in own]
+            # without this place a gauge may be free
+            determined = structurally_independent(
+                problem.model, rest, kinds, others.separation_rows
+            )
+            rest = [name for name in rest if name in determined or name in problem.prior_sigmas]
+            found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)
+    number = {base: k for k, place in enumerate(places) for base in place}
+    parts = [
+        compare(chains[0][number[each.base]], chains[1][number[each.base]], [each])
+        for each in problem.sets
+    ]
+    groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
+    first = _joined([part.before for part in parts], groups)
+    second = _joined([part.after for part in parts], groups)
+    return (
+        Comparison(first, second, ~robust.outliers),
+        f'leaving out one of {len(places)} places at a time',
+    )
+
+
+def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:
+    """Return the mean squared errors (2, K) of K configurations, for errors (N, 3) of pairs."""
+    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
+    known = ~np.isnan(squares).any(axis=0)
+    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+
+
+def log_gain(
+    before: FloatArray,
+    after: FloatArray,
+    configurations: NDArray[np.intp],
+    confidence: float = CONFIDENT,
+) -> tuple[float, float]:
+    """Return the log of RMS before / RMS after, and its size that chance could cause.
+
+    Errors are (N, 3). The standard error is that of the difference of the two logarithms by the
+    delta method, from the spread over configurations, because pairs of one are not independent.
+    """
+    means = mean_squares(before, after, configurations)
+    count = means.shape[1]
+    if count < 2:
+        return 0.0, np.inf
+    totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
+    deviation = np.diff(means / totals, axis=0).std(ddof=1)
+    limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
+    return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)

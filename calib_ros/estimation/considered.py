@@ -1,0 +1,179 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors that are considered, not fitted: unmodelled effects and device errors.
+
+Possible effects of an arm and the scale of the device are columns of the posterior with their own
+sizes (`evidence.py`). Smooth device errors and rounded joint values have known sizes s. Their
+columns N are eliminated from the products of the other columns A: A^T A becomes
+A^T A - A^T N (N^T N + s^-2)^-1 N^T A, as if V = 1 + s^2 N N^T were the covariance of the
+measurements (Schmidt 1966). docs/model.md (Sizes of errors) gives the reasons.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from calib_ros.estimation.identifiability import DEGENERATE
+from calib_ros.estimation.leastsquares import Normal, System, gram, normal_equations
+from calib_ros.estimation.levels import PRINTED, SCALE
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.samples import Samples
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+
+CONSIDERED = ('eccentricity', 'gravity')
+"""Effects that any arm may have, fitted or not; moves of one joint hardly excite couplings."""
+
+
+def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the effects that an arm may have besides the named ones.
+
+    DH parameters held at nominal by a `fixed` pattern may be off as well.
+    """
+    every = [name for group in CONSIDERED for name in effects.members(chain, group)]
+    every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
+    held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
+    every += [name for name in chain.parameter_names if name in held and name.of_dh]
+    return tuple(name for name in every if name not in names)
+
+
+def products_with_doubts(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    noise: float,
+    doubts: Mapping[str, float],
+    lengths: Mapping[str, float],
+    by_device: bool,
+    known: Normal | None,
+    most: int = 10 * SOME_POSES,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return products of columns and residual, and their products with doubtful columns.
+
+    The first (P + 1, P + 1) are those of the names, of the device's scale if there are `lengths`,
+    and of the residual. A^T N (P + 1, K) and N^T N + 1 (K, K) follow, with N scaled by its
+    standard deviations. All are in units of `noise` [sigma given], without priors. `doubts` are
+    standard deviations of parameters that something else moves too; `by_device` includes smooth
+    device errors. Larger systems are thinned to `most` samples; `known` holds the products of all
+    samples for the names alone.
+    """
+    columns = list(dict.fromkeys([*names, *lengths]))
+    share = -(-system.count // most)
+    if known is not None and share == 1 and not lengths and not by_device:
+        products = known.products.sum(axis=0)
+    else:
+        few = replace(system.spread(most), prior=None)
+        products = share * _products(chain, columns, few, by_device)
+    extra = np.column_stack(system.separation_rows(chain, columns))
+    own = [*range(len(columns)), -1]
+    products[np.ix_(own, own)] += share * (extra.T @ extra)
+    every = np.eye(len(products))
+    row = {str(name): k for k, name in enumerate(columns)}
+    grown = every[:, [row[str(name)] for name in lengths]] * [*lengths.values()]
+    grown = grown.sum(axis=1)[:, np.newaxis][:, : len(lengths)]  # none without lengths
+    doubted = every[:, [row[str(name)] for name in doubts]] * [*doubts.values()]
+    fields = every[:, len(columns) : -1]
+    kept = np.column_stack([every[:, : len(names)], grown, every[:, -1]])
+    mixing = np.column_stack([kept, doubted, fields])
+    mixed = mixing.T @ (products / noise**2) @ mixing
+    first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
+    plain, cross, doubtful = mixed[first, first], mixed[first, rest], mixed[rest, rest]
+    return plain, cross, doubtful + np.eye(len(doubtful))
+
+
+def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
+    """Return all lengths [m] that positions depend on, and the standard deviation of their scale.
+
+    There are none for sockets and planes, whose places are fixed. The travel of a prismatic joint
+    is scaled by its ratio, which is added to the returned chain.
+    """
+    sets = [samples.observations for samples in system.sets]
+    if any(each.socket or each.plane for each in sets):
+        return chain, {}, SCALE
+    travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
+    chain = chain.with_effects(travels)
+    names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
+    names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
+    scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
+    return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
+
+
+def _products(chain: Chain, columns: Sequence[str], system: System, by_device: bool) -> FloatArray:
+    fields = bends(system.sets) if by_device else []
+    if not any(map(len, fields)):
+        return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
+    size = len(columns)
+    found = np.zeros((size + len(fields[0]) + 1,) * 2)
+    own = [*range(size), -1]
+    for samples, field in zip(system.sets, fields, strict=True):
+        first = 0
+        for placed, *turned in samples.parts(chain, columns):
+            last = first + placed.shape[2]
+            wide = np.concatenate([placed[:-1], field[:, :, first:last], placed[-1:]])
+            found += gram(wide)
+            for rows in turned:  # distortion does not turn
+                found[np.ix_(own, own)] += gram(rows)
+            first = last
+    return found
+
+
+def bends(sets: Sequence[Samples]) -> list[FloatArray]:
+    """Return the possible device distortions of each set (K, c, N), weighted as position rows.
+
+    Each of the K coefficients has standard deviation 1; together they have the device's sigma in
+    each coordinate (RMS over samples). Each device has its own; sockets, planes, distances and
+    pixels have none.
+    """
+    by_device: dict[str, list[int]] = {}
+    for number, samples in enumerate(sets):
+        seen = samples.observations
+        if seen.distances is None and seen.pixels is None and not seen.socket:
+            by_device.setdefault(seen.tool if seen.inverse else seen.base, []).append(number)
+    found = [np.zeros((0, samples.width, samples.count)) for samples in sets]
+    for own in by_device.values():
+        device = [sets[number] for number in own]
+        weights = [np.ones(s.count) if s.weights is None else s.weights for s in device]
+        shown = [samples.observations for samples in device]
+        places = [(each.inverted() if each.inverse else each).positions for each in shown]
+        waves = _polynomials(np.concatenate(places), np.concatenate(weights))
+        ends = np.cumsum([samples.count for samples in device])[:-1]
+        parts = dict(zip(own, np.split(waves, ends, axis=1), strict=True))
+        for k, samples in enumerate(sets):
+            none = np.zeros((3 * len(waves), samples.width, samples.count))
+            bent = _rows(samples, parts[k]) if k in parts else none
+            found[k] = np.concatenate([found[k], bent])
+    return found
+
+
+def _polynomials(places: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return weighted polynomials (M, N), orthogonal, without mean, of total mean square 1."""
+    total = max(float(weights @ weights), 1.0)
+    centred = places - (weights**2 @ places) / total
+    centred /= max(float(np.sqrt((weights**2 @ centred**2).sum() / total)), DEGENERATE)
+    pairs = combinations_with_replacement(centred.T, 2)
+    terms = [np.ones(len(places)), *centred.T, *(one * other for one, other in pairs)]
+    columns = weights * np.array(terms)
+    basis, factor = np.linalg.qr(columns.T)
+    used = np.abs(np.diag(factor)) > DEGENERATE * np.linalg.norm(columns, axis=1)[: len(factor)]
+    used[0] = False
+    return np.asarray(basis.T[used] * np.sqrt(total / max(used.sum(), 1)))
+
+
+def _rows(samples: Samples, waves: FloatArray) -> FloatArray:
+    """Return rows (3 M, c, N) of weighted polynomials (M, N) along each axis of the device."""
+    seen = samples.observations
+    axes = seen.rotations if seen.inverse else np.eye(3)[np.newaxis]
+    bent = np.einsum('mn,nia->main', waves, np.broadcast_to(axes, (samples.count, 3, 3)))
+    bent = bent.reshape(-1, 3, samples.count)
+    if samples.whitening is None:
+        return np.asarray(bent)
+    covariance = seen.covariances(samples.sigmas)[:, :3, :3]
+    sigma = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3.0))
+    return np.asarray(np.einsum('rsn,psn->prn', samples.whitening[:, :3], sigma * bent))

@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The typical size of this arm's errors, estimated from its own data (empirical Bayes).
+
+Offsets from the nominal arm have normal priors about zero, with one size s for each group of
+parameters. The sizes maximise the probability of the data with the parameters integrated out
+(evidence; MacKay 1992):
+
+    s^2 = |x|^2 / gamma        gamma = sum over the group of (1 - V_ii / s^2)
+
+with x the posterior mean and V its covariance, (L / t^2 + S^-1)^-1; docs/model.md (Sizes of
+errors) explains them, the hyperprior and the considered effects (Schmidt 1966).
+
+The tails of Student's t with TAILS degrees of freedom are a normal prior with the variance s^2 /
+w, w = (TAILS + 1) / (TAILS + (x^2 + V_ii) / s^2). To judge an arm, variances are averaged over w,
+whose inverse has the mean (TAILS + (x^2 + V_ii) / s^2) / (TAILS - 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import TypeAlias
+
+import numpy as np
+from scipy import linalg
+
+from calib_ros.estimation.considered import lengths_of, products_with_doubts
+from calib_ros.estimation.leastsquares import Normal, System
+from calib_ros.estimation.levels import OUT_OF_SCALE, SCALE
+from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
+"""A weight, with mean (P,) and covariance (P, P) of the offsets."""
+
+
+def group_of(chain: Chain, name: str) -> str | None:
+    """Return the group of parameters with errors of one size; None for frames."""
+    return None if chain.owns_frame(name) else _group(name)
+
+
+@lru_cache(maxsize=1024)
+def _group(name: str) -> str:
+    if Parameter(name).of_dh:
+        return 'length' if Parameter(name).is_length else 'angle'
+    group = effects.group_of(name)
+    return group if group in TYPICAL else 'drive'
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Shown):
+    """Posterior of a fitted arm, given the data and the sizes of its errors.
+
+    Attributes
+    ----------
+    chain : Chain
+        The fitted arm, with considered effects of size zero.
+    names : tuple of str
+        Fitted parameters and considered effects, (P,) in all.
+    offsets : (P,)
+        Fitted minus nominal values; zero for frames.
+    shift : (P,)
+        Posterior mean minus fitted values.
+    covariance : (P, P)
+        For the measuring device; averaged over plausible sizes if used to judge.
+    device : (P, K)
+        Square root of the covariance that smooth errors of that device add.
+    priors : mapping of str to float
+        Standard deviation [m or rad] of parameters with a prior.
+    sizes : mapping of str to float
+        Size of the errors by group.
+    doubted : tuple of Mixed
+        The posterior of the offsets for each plausible set of sizes, if the device may have a
+        scale error and rounded joint values may be off.
+    rival : (float, float, (P,), (P, P)), optional
+        The same for a device out of scale: log odds, scale minus one, mean and covariance.
+    """
+
+    chain: Chain
+    names: tuple[str, ...]
+    offsets: FloatArray
+    shift: FloatArray
+    covariance: FloatArray
+    device: FloatArray
+    priors: Mapping[str, float]
+    sizes: Mapping[str, float]
+    doubted: tuple[Mixed, ...]
+    rival: tuple[float, float, FloatArray, FloatArray] | None = None
+
+    @cached_property
+    def square(self) -> FloatArray:
+        """Return the expected squares (P, P) of the parameter errors."""
+        return np.asarray(self.covariance + np.outer(self.shift, self.shift))
+
+    def expected(self, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> FloatArray:
+        """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
+
+        In world axes, unmodelled effects included.
+        """
+        rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
+        return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
+
+    def stds_of(self, names: Sequence[str]) -> FloatArray:
+        """Return the standard deviations (K,) of undetermined parameters of the arm."""
+        groups = [_group(name) for name in names]
+        return np.array([self.sizes.get(group, TYPICAL[group]) for group in groups])
+
+    def held_at(self, names: Sequence[str], slopes: FloatArray) -> Posterior:
+        """Return the posterior with K parameters held at nominal, as uncertain as others.
+
+        The first F fitted parameters follow them by `slopes` (F, K).
+        """
+        count, between = len(names), len(self.names) - len(slopes)
+        along = np.concatenate([slopes, np.zeros((between, count)), np.eye(count)])
+        more = (along * self.stds_of(names) ** 2) @ along.T
+
+        def padded(matrix: FloatArray) -> FloatArray:
+            return np.asarray(np.pad(matrix, (0, count)) + more)
+
+        none = np.zeros(count)
+        return replace(
+            self,
+            names=(*self.names, *names),
+            offsets=np.append(self.offsets, none),
+            shift=np.append(self.shift, none),
+            covariance=padded(self.covariance),
+            device=np.pad(self.device, ((0, count), (0, 0))),
+            rival=None,  # nothing measures the scale
+            doubted=tuple((w, np.append(m, none), padded(c)) for w, m, c in self.doubted),
+        )
+
+    def held(self, name: str) -> float:
+        """Return the share of a parameter's variance due to its prior, 1 if undetermined."""
+        variance = float(self.covariance[self.names.index(name), self.names.index(name)])
+        return variance / self.priors[name] ** 2 if name in self.priors else 0.0
+
+
+def posterior_of(
+    chain: Chain,
+    nominal: Chain,
+    names: Sequence[str],
+    system: System,
+    noise: float,
+    known: Mapping[str, float],
+    more: Sequence[str] = (),
+    doubts: Mapping[str, float] | None = None,
+    at_the_fit: Normal | None = None,
+    judging: bool = True,
+    sigma_scale: float = 0.0,
+) -> Posterior:
+    """Return the posterior of fitted parameters and considered effects, linearised at the fit.
+
+    Offsets of the fitted `chain` from the `nominal` one are normal about zero. `names` were fitted
+    to the `system` with its weights and noise of size `noise` [sigma given]; `more` effects are
+    considered. `known` are given priors [m or rad], `doubts` standard deviations of parameters
+    that something else moves too, `at_the_fit` the last normal equations if known, `sigma_scale`
+    the standard deviation of the device's scale, 0 if unknown. Doubts are only evaluated if
+    `judging`.
+    """
+    chain = chain.with_effects([name for name in more if not Parameter(name).of_dh])
+    every = (*names, *more)
+    beside = {name: std for name, std in (doubts or {}).items() if name in names}
+    whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
+    unsure = bool(lengths) and scale == SCALE and not sigma_scale
+    what = beside, lengths, bool(more), at_the_fit
+    plain, cross, doubtful = products_with_doubts(whole, every, system, noise, *what)
+    offsets = np.zeros(len(plain) - 1)
+    arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
+    offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
+    reduced = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
+    alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
+    vector = matrix @ offsets + reduced[:-1, -1]
+    also = ['scale'] if lengths else []
+    groups = [*(None if n in known else group_of(chain, n) for n in every), *also]
+    given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2
+    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': sigma_scale or scale})
+    beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
+    size, slope = evidence.most_probable(beside_it)
+    sought = evidence, matrix, vector, len(every), size, beside_it
+    rival = _rival(*sought) if judging and unsure else None
+    near = evidence.near(size, slope) if judging else ()
+    known_by = zip(every, evidence.precision(size).tolist(), strict=False)
+    priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
+    if judging:
+        evidence.widen(size)
+    weights = [weight for weight, _ in near] or [1.0]
+    precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
+    arm = np.s_[: len(every)]
+    along = (alone @ offsets + plain[:-1, -1])[arm]
+    each_alone = [solved(alone[arm, arm], along, each[arm]) for each in precisions]
+    mean, covariance = mixed(each_alone, weights)
+    device = _device(alone, cross[:-1], doubtful, evidence.precision(size), len(every))
+    wider = [solved(matrix, vector, each) for each in precisions if near]
+    parts = zip(weights, wider, strict=False)
+    doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
+    found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
+    return Posterior(chain, every, *found, doubted, rival)
+
+
+def _rival(
+    evidence: Evidence,
+    matrix: FloatArray,
+    vector: FloatArray,
+    count: int,
+    size: FloatArray,
+    considered: set[str | None],
+) -> tuple[float, float, FloatArray, FloatArray]:
+    """Return log odds, scale, mean and covariance of `count` columns for a device out of scale."""
+    odds, precision = evidence.rival('scale', OUT_OF_SCALE, size, considered)
+    mean, root = solved(matrix, vector, precision)
+    arm = np.s_[:count]
+    return odds, float(mean[-1]), mean[arm], (root @ root.T)[arm, arm]
+
+
+def _device(
+    matrix: FloatArray, cross: FloatArray, doubtful: FloatArray, precision: FloatArray, count: int
+) -> FloatArray:
+    """Return (P, K), the root of what another device adds to the covariance of `count` columns.
+
+    From the products of columns, the scale last, with those of device errors (Woodbury).
+    """
+    arm, scale = np.s_[:count], np.s_[count:]
+    std = precision[scale, np.newaxis] ** -0.5
+    beside = np.column_stack([matrix[arm, scale] * std.T, cross[arm]])
+    own = np.block(
+        [
+            [std * matrix[scale, scale] * std.T + np.eye(len(std)), std * cross[scale]],
+            [(std * cross[scale]).T, doubtful],
+        ]
+    )
+    root = solved(matrix[arm, arm], np.zeros(count), precision[arm])[1]
+    along = root @ (root.T @ beside)
+    left, axes = np.linalg.eigh(own - beside.T @ along)
+    return np.asarray(along @ axes / np.sqrt(np.maximum(left, 1.0)))  # >= 1 but for rounding

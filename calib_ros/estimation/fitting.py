@@ -1,0 +1,347 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The fit itself: its parameters, start, priors and noise.
+
+A first fit to some samples, guarded by common-sense priors, comes close. The robust fit to all
+samples follows. If its data yield priors that would change it (`evidence.py`), it is repeated with
+them; with effects, until the noise no longer falls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import special
+from scipy.linalg import solve_triangular
+
+from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.evidence import Posterior, posterior_of
+from calib_ros.estimation.leastsquares import (
+    System,
+    factor_of,
+    factor_of_some,
+    minimise,
+    triangular_factor,
+)
+from calib_ros.estimation.levels import CONFIDENT, KNOWN
+from calib_ros.estimation.noise import Noise, noise_of
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.robust import SUSPICIOUS, Robust, reweighted, thorough_fit
+from calib_ros.estimation.start import start_frames
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray, left_jacobian_inverse
+
+SOME = 2 * SOME_POSES
+"""Samples for a first fit or a linear model."""
+FOLLOWED = 2.0
+"""Inverse share of the unmodelled error that the geometric model does not follow
+(benchmarks/real_robots.py)."""
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter of the model: m for lengths, rad for angles.
+
+    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses do
+    not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
+    degrees of freedom of `std`; infinite if the noise is known.
+    """
+
+    name: Parameter
+    value: float
+    offset: float
+    std: float | None
+    status: str
+    freedom: float = np.inf
+
+    def half_width(self, level: float = CONFIDENT) -> float | None:
+        """Return the half width of the confidence interval, by Student's t."""
+        if self.std is None:
+            return None
+        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
+
+    def beyond(self, length: float, angle: float) -> bool:
+        """Tell whether a DH parameter is certainly further from nominal than a limit."""
+        limit = length if self.name.is_length else angle
+        return self.std is not None and self.name.of_dh and abs(self.offset) - 3 * self.std > limit
+
+
+@dataclass(frozen=True, eq=False)
+class Simpler:
+    """Results of the fit of a simpler model, without effects."""
+
+    chain: Chain
+    distances: tuple[FloatArray, ...]
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A robust fit with what follows from its residuals.
+
+    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors.
+    `held` are K parameters held at nominal that only other kinds of measurement determine, and how
+    the fitted ones follow them (P, K).
+    """
+
+    problem: Problem
+    names: tuple[str, ...]
+    robust: Robust
+    factor: FloatArray
+    noise: Noise
+    uncertainty: identifiability.Uncertainty
+    size: float
+    held: tuple[tuple[str, ...], FloatArray] | None = None
+
+    @property
+    def chain(self) -> Chain:
+        """Return the fitted chain."""
+        return self.robust.fit.chain
+
+    @property
+    def system(self) -> System:
+        """Return the samples with their weights in the fit."""
+        return self.robust.system
+
+    def posterior(
+        self,
+        noise: float,
+        more: Sequence[str] = (),
+        doubts: Mapping[str, float] | None = None,
+        judging: bool = True,
+    ) -> Posterior:
+        """Return the posterior of the fit with `more` effects considered."""
+        model, given, names = self.problem.model, self.problem.given, self.names
+        known = None if more else self.robust.fit.normal
+        how = doubts, known, judging, self.problem.sigma_scale
+        found = posterior_of(self.chain, model, names, self.system, noise, given, more, *how)
+        return found if self.held is None else found.held_at(*self.held)
+
+
+def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
+    """Return the structurally identifiable names, the chain with start frames, and the fit."""
+    model, separations = problem.model, problem.system(problem.sets).separation_rows
+    structural, held = identifiability.identifiable_and_held(
+        model, problem.free, problem.kinds, separations
+    )
+    _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
+    sigmas = (problem.sigma_position, problem.sigma_orientation)
+    start = start_frames(model, problem.sets, *sigmas, problem.loss)
+    names, factor = _excited_names(problem, structural, start)
+    fitted = _fit_all(problem, names, start, factor, simpler)
+    held = tuple(name for name in held if name not in names)  # unless a prior tells them
+    return structural, start, _widened(fitted, held) if held else fitted
+
+
+def _widened(fitted: Fitted, held: tuple[str, ...]) -> Fitted:
+    """Return a fit with K parameters held at nominal, as uncertain as others of the arm."""
+    count = len(fitted.names)
+    factor = factor_of(fitted.chain, (*fitted.names, *held), fitted.system)
+    slopes = -solve_triangular(factor[:count, :count], factor[:count, count:])
+    stds = fitted.posterior(fitted.size, judging=False).stds_of(held)
+    shared = (slopes * stds**2) @ slopes.T
+    uncertainty = identifiability.Uncertainty(
+        np.concatenate([fitted.uncertainty.parts, shared[np.newaxis]]),
+        np.append(fitted.uncertainty.freedom, np.inf),
+    )
+    return replace(fitted, uncertainty=uncertainty, held=(held, slopes))
+
+
+def _excited_names(
+    problem: Problem, structural: Sequence[str], start: Chain
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the parameters that the poses determine, and their factor by some samples."""
+    priors = problem.prior_sigmas
+    wanted = [n for n in problem.free if n in structural or n in priors]
+    few, every = problem.system([each.spread(SOME) for each in problem.sets]), problem.sets
+    factor = factor_of(start, wanted, few)
+    names = identifiability.excited(factor, wanted)
+    if len(names) < len(wanted) and few.count < sum(map(len, every)):  # more may determine more
+        names = identifiability.excited(
+            triangular_factor(start, wanted, problem.system(every)), wanted
+        )
+    return names, factor_of_some(factor, [k for k, n in enumerate(wanted) if n in names])
+
+
+def _fit_all(
+    problem: Problem,
+    names: tuple[str, ...],
+    start: Chain,
+    factor: FloatArray,
+    simpler: Simpler | None,
+) -> Fitted:
+    """Fit the named parameters from start frames, with priors where needed.
+
+    `factor` (P, P) is that of some samples at the start.
+    """
+    problem = _guarded(problem, names, factor, simpler)
+    rough = start
+    if simpler is not None:
+        rough = simpler.chain.with_effects([name for name, _ in problem.model.effects])
+    few = problem.system([each.spread(SOME) for each in problem.sets])
+    if few.count < sum(map(len, problem.sets)) // 2:
+        rough = minimise(rough, names, few, tolerance=1e-2).chain
+    fitted = _fit(*_some(problem, simpler), rough, names)
+    guarded = _guarded(problem, names, fitted.factor, simpler)
+    if guarded is not problem:  # outliers carried the information
+        problem = guarded
+        fitted = _fit(*_some(problem, simpler), rough, names)
+    size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
+    posterior = fitted.posterior(size, judging=False)
+    if not _priors_matter(problem, names, posterior):
+        return fitted
+    for _ in range(ROUNDS):
+        priors = {
+            name: min(posterior.priors[name], problem.common_sense(name))
+            for name in names
+            if not problem.model.owns_frame(name)
+        }
+        problem = replace(problem, learned=Learned(priors, size))
+        fitted = _fit(problem, simpler, fitted.chain, names, again=True)
+        less = _noise_for_priors(fitted.noise, simpler)
+        if simpler is None or SUSPICIOUS * less > size:
+            break
+        size = less  # too narrow priors had made it larger
+        posterior = fitted.posterior(size, judging=False)
+    return replace(fitted, size=first)
+
+
+def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
+    """Thin a problem to the samples that determine the priors of a richer model."""
+    share = -(-sum(map(len, problem.sets)) // (2 * SOME))
+    if simpler is None or share < 2:
+        return problem, simpler
+    first, *more = (each.select(np.arange(0, len(each), share)) for each in problem.sets)
+    few = replace(problem, observations=first, more=more)
+    return few, replace(simpler, distances=tuple(each[::share] for each in simpler.distances))
+
+
+def _fit(
+    problem: Problem,
+    simpler: Simpler | None,
+    chain: Chain,
+    names: tuple[str, ...],
+    again: bool = False,
+) -> Fitted:
+    """Fit the named parameters from a near chain, or `again` from a fitted one."""
+    system = problem.system(problem.sets)
+    if simpler is None and not again:
+        robust = thorough_fit(chain, names, system, problem.loss)
+    else:
+        distances = None if simpler is None else simpler.distances
+        robust = reweighted(chain, names, system, problem.loss, distances)
+    fit = robust.fit
+    factor = factor_of(fit.chain, names, robust.system, fit.normal)
+    noise, uncertainty = noise_of(fit, names, robust.system, factor)
+    noise = replace(noise, given=problem.sigmas)
+    return Fitted(problem, names, robust, factor, noise, uncertainty, noise.size)
+
+
+def _noise_for_priors(noise: Noise, simpler: Simpler | None) -> float:
+    """Return the size of the noise [sigma given] that priors are weighed against.
+
+    What the geometric model lacks is no noise to it: it can follow a part of it. On measured
+    robots errors in held-out regions were least with more weight on the prior, those on held-out
+    rows of the same session with less. With the noise that neighbours do not share, over FOLLOWED,
+    they are those of least squares (`benchmarks/real_robots.py`).
+    """
+    if simpler is not None or noise.consistent:
+        return noise.size
+    return max(noise.size / (FOLLOWED * noise.widened), min(noise.size, 1.0))
+
+
+def _guarded(
+    problem: Problem, names: Sequence[str], factor: FloatArray, simpler: Simpler | None
+) -> Problem:
+    """Return the problem with priors that keep a first fit from diverging.
+
+    `factor` (P, P) is that of some samples at the start, or of a robust fit. DH parameters that it
+    determines no better than common sense get a third of the largest error of a faulty robot as a
+    prior.
+    """
+    known = problem.prior_sigmas
+    stds = np.sqrt(np.diag(identifiability.covariance(factor))).tolist()
+    guards = {
+        name: problem.common_sense(name)
+        for name, std in zip(names, stds, strict=True)
+        if name not in known
+        and not problem.model.owns_frame(name)
+        and std > problem.common_sense(name)
+    }
+    if problem.learned is not None:
+        more = replace(problem.learned, priors={**problem.learned.priors, **guards})
+        return replace(problem, learned=more) if guards else problem
+    noise = 1.0 if simpler is None else _noise_for_priors(simpler.noise, None)
+    return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
+
+
+def _priors_matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
+    """Tell whether the priors found in the data would change a fit without them."""
+    if problem.learned is not None or problem.model.effects:
+        return True
+    return any(
+        posterior.held(name) > 1.0 - CONFIDENT for name in names if name not in problem.given
+    )
+
+
+def _require_enough(problem: Problem, names: Sequence[str]) -> None:
+    rows = configurations = 0
+    for each, kind in zip(problem.sets, problem.kinds, strict=True):
+        if not len(each):
+            raise InputError(f'no pairs to fit between {each.base} and {each.tool}')
+        count = int(each.configurations.max()) + 1
+        rows += count * kind.rows
+        configurations += count
+    if rows < len(names):
+        width = problem.kinds[0].rows
+        raise TooFewObservationsError(
+            configurations,
+            -(-len(names) // width),
+            f'{width} equations each for {len(names)} parameters',
+        )
+
+
+def parameter_rows(
+    problem: Problem,
+    chain: Chain,
+    structural: Sequence[str],
+    names: Sequence[str],
+    uncertainty: identifiability.Uncertainty,
+) -> tuple[ParameterRow, ...]:
+    """Return every parameter of a fitted chain, with its standard deviation if fitted."""
+    change = _to_values(chain, names)
+    variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
+    std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
+    freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
+    free = set(problem.free)
+    rows = []
+    for name in chain.parameter_names:
+        if name in std:
+            status = 'fitted'
+        elif name in structural:
+            status = 'not excited'
+        else:
+            status = 'gauge' if name in free else 'fixed'
+        offset = chain.offset(name, problem.model)
+        value, spread = chain.value(name), std.get(name)
+        rows.append(ParameterRow(name, value, offset, spread, status, freedom.get(name, np.inf)))
+    return tuple(rows)
+
+
+def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
+    """Return the derivative (P, P) of the values, which differ for rotation vectors of frames.
+
+    A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
+    """
+    change = np.eye(len(names))
+    for frame in chain.frame_names:
+        index = [names.index(name) for name in parameters_of(frame)[3:] if name in names]
+        if len(index) == 3:
+            vector = chain.frame(frame).offsets()[3:]
+            change[np.ix_(index, index)] = left_jacobian_inverse(vector)
+    return change

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The size of the noise, pairs that share it, and the uncertainty of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import special
+
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.identifiability import Uncertainty
+from calib_ros.estimation.leastsquares import Fit, System
+from calib_ros.estimation.levels import SURE
+from calib_ros.estimation.robust import SUSPICIOUS
+from calib_ros.estimation.shared_errors import shared_errors
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import FloatArray
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Size of the residuals in units of the given sigma, for position and orientation.
+
+    `consistent` tells whether a chi-squared test accepts the sigmas. Then standard deviations
+    follow the larger of given and found sigmas, because a test of few residuals would accept
+    sigmas that are too small; otherwise the found ones.
+
+    `successive` and `near` are the correlations of residuals of configurations that follow each
+    other, and that are near each other in joint space; `shared` names those with shared errors by
+    a test (`shared_errors.py`), which widens the standard deviations by the factor `widened`
+    (median). `size` is their total ratio to those by the given sigmas. `given` are these [m, rad,
+    px] by their names in `Problem`, where known.
+    """
+
+    position: float
+    orientation: float | None
+    consistent: bool
+    successive: float
+    near: float
+    shared: tuple[str, ...]
+    widened: float = 1.0
+    size: float = 1.0
+    given: Mapping[str, float] = field(default_factory=dict)
+
+
+def noise_of(
+    fit: Fit, names: Sequence[str], system: System, factor: FloatArray
+) -> tuple[Noise, Uncertainty]:
+    """Return the noise and the resulting uncertainty of the parameters.
+
+    `factor` R (P, P) is that of the weighted Jacobian, R^T R = H. Each part (position,
+    orientation) has as many degrees of freedom as equations, minus its share of the parameters,
+    trace(H^-1 H_part). Pairs of one configuration share the model error, and count for fewer.
+    """
+    plain = identifiability.covariance(factor)
+    taken = np.array([float(np.sum(plain * part)) for part in fit.normal.parts])
+    squares = _squares(fit.chain, system)
+    if not fit.normal.parts[1].any():  # whitened as a whole, or no orientation
+        squares = np.column_stack([squares.sum(axis=1), np.zeros(4)])
+    sums, counts, joint_sums, joint_counts = squares
+    freedom = counts - taken
+    known = freedom > 1e-9
+    variances = np.where(known, sums / np.where(known, freedom, 1.0), 1.0)
+    beyond = 0.5 * (1.0 - SURE)
+    low, high = (special.chdtri(np.where(known, freedom, 1.0), p) for p in (1.0 - beyond, beyond))
+    consistent = bool(np.all(~known | ((low <= sums) & (sums <= high))))
+    position, orientation = np.sqrt(variances).tolist()
+    orientation = orientation if known[1] else None
+    neighbours = shared_errors(fit, names, system)
+    noise = Noise(
+        position, orientation, consistent, neighbours.successive, neighbours.near, neighbours.found
+    )
+    together = joint_sums / np.maximum(sums, 1e-300)
+    alone = np.maximum(variances, 1.0) if consistent else variances
+    sizes = np.where(together > SUSPICIOUS, together, 1.0) * alone
+    middles = [size * part for size, part in zip(sizes, fit.normal.parts, strict=True)]
+    extra, _ = system.extra_rows(fit.chain, names)
+    if system.prior is not None:
+        extra[: len(names)] *= system.prior.noise
+    estimated = np.array(
+        [not consistent or sizes[k] != 1.0 or k in neighbours.middles for k in (0, 1)]
+    )
+    seen = np.where(together > SUSPICIOUS, joint_counts, counts)
+    freedom = np.maximum(seen - taken, 1.0)
+    freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
+    if not estimated.any():
+        return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))
+
+    def covariances(by_part: Sequence[FloatArray]) -> FloatArray:
+        sources = (*by_part, extra.T @ extra)
+        return np.array([identifiability.covariance(factor, middle) for middle in sources])
+
+    covariance = covariances(
+        [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
+    )
+    if neighbours.middles:
+        alone = np.diag(covariances(middles).sum(axis=0))
+        widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
+        noise = replace(noise, widened=widened)
+    size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))
+    return replace(noise, size=size), Uncertainty(covariance, freedom)
+
+
+def _squares(chain: Chain, system: System) -> FloatArray:
+    """Return by part (4, 2) sums and counts of squared residuals, alone and over configurations.
+
+    If pairs of a configuration share no error, squares of their sums add up to the same.
+    """
+    found = np.zeros((4, 2))
+    sums, counts, joint_sums, joint_counts = found  # views
+    for samples in system.sets:
+        for k, part in enumerate(samples.whitened_residuals(chain)):
+            weights = np.ones(len(part)) if samples.weights is None else samples.weights**2
+            known = ~np.isnan(part[:, 0])
+            sums[k] += weights[known] @ (part[known] ** 2).sum(axis=1)
+            counts[k] += part.shape[1] * weights[known].sum()
+            groups = samples.observations.configurations[known]
+            weighted = np.sqrt(weights[known]) * part[known].T
+            joint_sums[k] += sum((np.bincount(groups, row) ** 2).sum() for row in weighted)
+            joint_counts[k] += part.shape[1] * np.count_nonzero(np.bincount(groups))
+    return found

@@ -1,0 +1,324 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Observations: matched pairs of joint values and measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import InputError
+from calib_ros.estimation.configurations import configurations, stops
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import Shown
+
+_SHAPES: dict[str, tuple[int | None, ...]] = {
+    **dict.fromkeys(('stamps_ns', 'oriented', 'distances', 'delay'), ()),
+    **dict.fromkeys(('joints', 'approach', 'velocity', 'acceleration'), (None,)),
+    **dict.fromkeys(('positions', 'points'), (3,)),
+    'rotations': (3, 3),
+    'covariance': (6, 6),
+    'pixels': (2,),
+}
+"""Shapes per pair; None for the number of joints."""
+NO_ROTATION = 0.05
+"""Largest deviation of R^T R from the identity for a rotation: two digits leave 0.02."""
+SOME_POSES = 200
+"""Sample size by convention: random poses for the joint range, even ones for the measured poses.
+Other counts are multiples."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Observations(Shown):
+    """N matched pairs of joint values and measured poses, in stamp order.
+
+    Parameters
+    ----------
+    stamps_ns : (N,) int64
+    joints : (N, n) [rad or m]
+    positions, rotations : (N, 3) [m], (N, 3, 3)
+        Of the target in the measuring device's frame, the world.
+    oriented : (N,) bool
+        True where the orientation was measured; elsewhere the rotation is the identity.
+    covariance : (N, 6, 6), optional
+        Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
+        PoseWithCovariance; NaN rows where unknown.
+    approach : (N, n), optional
+        Signs of the velocities with which the joints reached their values, for backlash.
+    distances : (N,), optional
+        Distances [m] from the origin of the world to the target, for draw-wires and ball-bars.
+        Positions and rotations are then ignored.
+    plane : bool
+        The distances are heights over the plane z = 0 of the world, zero where touched.
+    velocity, acceleration : (N, n), optional
+        Of the joints, if the arm was moving when measured.
+    delay : (N,), optional
+        Time [s] before the stamps at which the joints had these values.
+    base, tool : str
+        Frames of the chain for these pairs.
+    socket : bool
+        The target is a ball in a socket at an unknown place: the origin of the world, whose axes
+        are parallel to the arm's base.
+    inverse : bool
+        The poses are inverted: a fixed target was measured by a camera on the flange.
+    pixels, points : (N, 2), (N, 3), optional
+        Points of a board in images: one row per point, with its place in the image and in the
+        board frame [m]. Rows of one image are consecutive and share stamp and joint values.
+        Positions and rotations are then ignored.
+    on_flange : bool
+        The camera is on the flange, at `tool`, and the board is the world. Otherwise the camera is
+        the world and the board is at `tool`.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    joints: FloatArray
+    positions: FloatArray
+    rotations: FloatArray
+    oriented: NDArray[np.bool_]
+    covariance: FloatArray | None = None
+    approach: FloatArray | None = None
+    distances: FloatArray | None = None
+    velocity: FloatArray | None = None
+    acceleration: FloatArray | None = None
+    delay: FloatArray | None = None
+    base: str = 'base'
+    tool: str = 'tool'
+    socket: bool = False
+    inverse: bool = False
+    pixels: FloatArray | None = None
+    points: FloatArray | None = None
+    on_flange: bool = False
+    plane: bool = False
+
+    def __post_init__(self) -> None:
+        """Check that the arrays match and are finite."""
+        if self.plane and self.distances is None:
+            raise InputError('a plane needs the heights over it as distances, zero where touched')
+        if (self.pixels is None) != (self.points is None):
+            raise InputError('pixels and the board points they show must be given together')
+        count, joints = len(self.stamps_ns), self.joints.shape[-1]
+        for name, array in self._arrays().items():
+            shape = (count, *(joints if size is None else size for size in _SHAPES[name]))
+            if array.shape != shape:
+                raise InputError(
+                    f'{name} of {count} observations must have the shape {shape}, not '
+                    f'{array.shape}'
+                )
+            if name != 'covariance' and not np.isfinite(array).all():
+                raise InputError(f'{name} of the observations hold NaN or infinite values')
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        arrays = {name: getattr(self, name) for name in _SHAPES}
+        return {name: array for name, array in arrays.items() if array is not None}
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @classmethod
+    def from_arrays(
+        cls, joints: FloatArray, positions: FloatArray, rotations: FloatArray | None = None
+    ) -> Observations:
+        """Make observations of joint values (N, n) [rad or m] and positions (N, 3) [m].
+
+        With `rotations` (N, 3, 3) they are poses. Masked values count as missing.
+
+        Raises
+        ------
+        InputError
+            For arrays that are not numeric, have another shape, or are not rotations.
+        """
+        joints, positions = _numbers('joints', joints), _numbers('positions', positions)
+        if joints.ndim != 2:
+            raise InputError(f'joints must have the shape (N, n), not {joints.shape}')
+        count, oriented = len(joints), rotations is not None
+        if oriented:
+            turns = _numbers('rotations', rotations)
+        else:
+            turns = np.broadcast_to(np.eye(3), (count, 3, 3))
+        stamps = np.arange(1, count + 1, dtype=np.int64) * 1_000_000_000
+        found = cls(stamps, joints, positions, turns, np.full(count, oriented))
+        if oriented:
+            _refuse_other_than_rotations(turns)
+        return found
+
+    @classmethod
+    def from_pixels(
+        cls,
+        joints: FloatArray,
+        pixels: FloatArray,
+        points: FloatArray,
+        images: NDArray[np.intp],
+        on_flange: bool = False,
+    ) -> Observations:
+        """Make observations of board `points` (N, 3) [m] at `pixels` (N, 2).
+
+        `images` (N,) numbers the image of each row, `joints` (N, n) are the joint values at that
+        image.
+        """
+        plain = cls.from_arrays(joints, np.broadcast_to(np.zeros(3), (len(joints), 3)))
+        stamps = (np.asarray(images, dtype=np.int64) + 1) * 1_000_000_000
+        return replace(
+            plain,
+            stamps_ns=stamps,
+            pixels=np.asarray(pixels, dtype=np.float64),
+            points=np.asarray(points, dtype=np.float64),
+            on_flange=on_flange,
+        )
+
+    @classmethod
+    def touching(cls, joints: FloatArray, base: str = 'base', tool: str = 'tool') -> Observations:
+        """Make observations of a point touching one plane, at joint values (N, n)."""
+        heights = np.zeros(len(joints))
+        plain = cls.from_arrays(joints, np.zeros((len(joints), 3)))
+        return replace(plain, distances=heights, plane=True, base=base, tool=tool)
+
+    def select(self, mask: NDArray[np.generic] | slice) -> Observations:
+        """Return the pairs of a mask (N,), indices (K,) or a slice, unchecked."""
+        chosen = object.__new__(Observations)
+        vars(chosen).update({name: vars(self)[name] for name in self.__dataclass_fields__})
+        count = len(self.stamps_ns[mask])
+        for name, array in self._arrays().items():
+            alike = array.strides[0] == 0  # keep broadcast arrays so
+            few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
+            vars(chosen)[name] = few
+        if 'configurations' in vars(self):  # slow to compute
+            numbers = self.configurations[mask]
+            vars(chosen)['configurations'] = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
+        return chosen
+
+    def spread(self, most: int = SOME_POSES) -> Observations:
+        """Return evenly spread pairs, at most `most`."""
+        step = -(-len(self) // most)
+        return self if step <= 1 else self.select(np.arange(0, len(self), step))
+
+    def inverted(self, sigmas: tuple[float, float] | None = None) -> Observations:
+        """Return the inverted poses, for a camera on the flange that sees a fixed target.
+
+        The pose of the target in the camera becomes the pose of the camera in the target frame,
+        the new world. Covariances are transformed too. `sigmas` (position [m], orientation [rad])
+        replace missing ones, because the uncertainty of the inverse includes the orientation's
+        sigma times the distance.
+        """
+        if not self.oriented.all():
+            raise InputError(
+                'poses of a camera on the flange need an orientation (qx qy qz qw): without it '
+                'they cannot be inverted'
+            )
+        turned = np.swapaxes(self.rotations, 1, 2)
+        positions = -np.einsum('nij,nj->ni', turned, self.positions)
+        covariance = self.covariance if sigmas is None else self.covariances(sigmas)
+        if covariance is not None:
+            lever, none = turned @ se3.skew(self.positions), np.zeros_like(turned)
+            jacobian = -np.block([[turned, lever], [none, turned]])
+            covariance = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+        return replace(
+            self,
+            positions=positions,
+            rotations=turned,
+            covariance=covariance,
+            inverse=not self.inverse,
+        )
+
+    def covariances(self, sigmas: tuple[float, float]) -> FloatArray:
+        """Return the covariances (N, 6, 6), from `sigmas` [m, rad] where missing.
+
+        A covariance with zeros for the rotation is that of the position alone.
+        """
+        given = np.diag(np.repeat(np.square(sigmas), 3))
+        found = np.tile(given, (len(self), 1, 1))
+        if self.covariance is not None:
+            own = ~np.isnan(self.covariance[:, 0, 0])
+            found[own] = self.covariance[own]
+            position_only = ~found[:, 3:].any(axis=(1, 2))
+            found[position_only, 3:, 3:] = given[3:, 3:]
+        return found
+
+    def at(self, stamps_ns: NDArray[np.int64]) -> Observations:
+        """Return the pairs with other stamps (N,)."""
+        return replace(self, stamps_ns=stamps_ns)
+
+    def earlier(self, delay: float | None) -> Observations:
+        """Return the measurements with the joint values a delay [s] before the stamps.
+
+        By velocity and acceleration; without them the arm was at rest and nothing changes.
+        """
+        if self.velocity is None or delay is None:
+            return self
+        delays = np.full(len(self), float(delay))
+        more = (delays if self.delay is None else delays - self.delay)[:, np.newaxis]
+        if not more.any():
+            return self
+        velocity, joints = self.velocity, self.joints - more * self.velocity
+        if self.acceleration is not None:
+            joints = joints + 0.5 * more**2 * self.acceleration
+            velocity = velocity - more * self.acceleration
+        return replace(self, joints=joints, velocity=velocity, delay=delays)
+
+    @property
+    def moving(self) -> bool:
+        """Tell whether the arm moved while it was measured, so that a delay matters."""
+        return self.velocity is not None and bool(self.velocity.any())
+
+    def between(self, names: Mapping[str, str]) -> Observations:
+        """Return them between the frames that have these names now."""
+        base, tool = (names.get(name, name) for name in (self.base, self.tool))
+        return replace(self, base=base, tool=tool)
+
+    @property
+    def camera(self) -> str:
+        """Return the frame of the camera."""
+        return self.tool if self.on_flange else self.base
+
+    @cached_property
+    def images(self) -> NDArray[np.intp]:
+        """Return the image number (N,) of each row of pixels."""
+        other = np.zeros(len(self), dtype=np.intp)
+        other[1:] = np.diff(self.stamps_ns) != 0
+        other[1:] |= (np.diff(self.joints, axis=0) != 0.0).any(axis=1)
+        return np.cumsum(other)
+
+    @cached_property
+    def configurations(self) -> NDArray[np.intp]:
+        """Return the configuration number (N,) of each pair."""
+        return configurations(self.joints)
+
+    @cached_property
+    def stops(self) -> NDArray[np.intp]:
+        """Return the stop number (N,) of each pair, in sequence."""
+        return stops(self.joints)
+
+
+def _numbers(name: str, values: object) -> FloatArray:
+    """Return values as an array, masked ones as NaN."""
+    try:
+        array = np.ma.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as err:
+        raise InputError(f'{name} must be numbers in an array: {err}') from err
+    return np.asarray(array.filled(np.nan)) if np.ma.is_masked(array) else np.asarray(array.data)
+
+
+def _refuse_other_than_rotations(turns: FloatArray) -> None:
+    square = np.einsum('nij,nik->njk', turns, turns)
+    wrong = np.abs(square - np.eye(3)).max(axis=(1, 2), initial=0.0) > NO_ROTATION
+    wrong |= np.linalg.det(turns) < 0.0
+    if wrong.any():
+        k = int(wrong.argmax())
+        what = 'left-handed' if np.linalg.det(turns[k]) < 0.0 else 'not orthogonal'
+        raise InputError(
+            f'the rotation of pair {k} (counted from 0) is {what}: {np.count_nonzero(wrong)} of '
+            f'{len(turns)} are not rotation matrices'
+        )
+
+
+def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
+    """Return the configuration numbers (N,) of each set, counted over all sets."""
+    if len(sets) == 1:
+        return (sets[0].configurations,)
+    numbers = configurations(np.concatenate([each.joints for each in sets]))
+    return tuple(np.split(numbers, np.cumsum([len(each) for each in sets])[:-1]))

@@ -1,0 +1,336 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The input of an identification."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from numbers import Integral, Real
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.leastsquares import Prior, System
+from calib_ros.estimation.observations import Observations, numbered
+from calib_ros.estimation.pixels import samples_of
+from calib_ros.estimation.robust import LOSSES
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Settings
+from calib_ros.shown import Shown
+
+SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
+TOOL = 1.0
+"""Largest length [m] of a target on a flange, assumed."""
+
+
+@dataclass(frozen=True)
+class Learned:
+    """Sizes of errors [m, rad] by parameter, and of the noise [sigma given], from a first fit."""
+
+    priors: Mapping[str, float]
+    noise: float = 1.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
+    """The input of an identification.
+
+    Parameters
+    ----------
+    chain : Chain
+        The nominal chain. Frames that it does not fix are fitted.
+    observations, more : Observations, sequence of Observations
+        Pairs to fit; further sets in the same fit: other sessions or targets with their own
+        frames, other kinds of measurement.
+    separations : sequence of (str, str, float)
+        Pairs of base frames whose origins are a known distance [m] apart: sockets of a ball on the
+        flange. Their worlds are parallel to the arm's base.
+    world_frame : str
+        Frame of the measured poses, for the record.
+    held_out : Observations or several, optional
+        Pairs that judge the result and are never fitted. Without them it is judged by
+        cross-validation over whole configurations.
+    sigma_position, sigma_orientation : float
+        Standard deviations [m, rad] of measurements without a covariance. Their ratio weights
+        position against orientation; the size of the noise is estimated.
+    sigma_pixel, sigma_touch : float
+        Standard deviations [px] of image coordinates of a board point, and [m] of heights over a
+        plane.
+    sigma_scale : float
+        Standard deviation of the scale of the measuring device [1], if checked with a known
+        length; otherwise 0.
+    loss : 'redescending', 'huber' or 'none'
+        Treatment of gross errors (`robust.py`).
+    priors : mapping of str to float
+        Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
+        such as `*.a`; the first match applies.
+    effects : sequence of str
+        Non-geometric effects to fit, by name or by group (`effects.py`).
+    fixed : sequence of str
+        Parameters to hold at their nominal values; `*` and `?` match as in file names.
+    folds : int
+        Number of cross-validation folds.
+    largest_length, largest_angle : float
+        Largest accepted offsets [m, rad], beyond any fault of the right robot.
+    largest_error : float
+        Largest accepted RMS position error [m] on held-out poses.
+    learned : Learned, optional
+        Priors estimated from the data, for parameters without one (`evidence.py`).
+    of_messages : bool
+        True if the samples were messages, to which table options do not apply.
+    """
+
+    chain: Chain
+    observations: Observations
+    held_out: Observations | Sequence[Observations] | None = None
+    sigma_position: float = Settings.sigma_position
+    sigma_orientation: float = Settings.sigma_orientation
+    fixed: Sequence[str] = ()
+    folds: int = Settings.folds
+    largest_length: float = Settings.largest_length
+    largest_angle: float = Settings.largest_angle
+    largest_error: float = Settings.largest_error
+    loss: str = Settings.loss
+    priors: Mapping[str, float] = field(default_factory=dict)
+    effects: Sequence[str] = ()
+    more: Sequence[Observations] = ()
+    world_frame: str = ''
+    separations: Sequence[tuple[str, str, float]] = ()
+    learned: Learned | None = None
+    sigma_pixel: float = Settings.sigma_pixel
+    sigma_touch: float = Settings.sigma_position
+    sigma_scale: float = 0.0
+    of_messages: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the arguments."""
+        priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
+        for name, sigma in (self.sigmas | priors).items():
+            if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:
+                raise ConfigError(f'{name} must be a positive number, not {sigma}')
+        if not isinstance(self.sigma_scale, Real) or not 0.0 <= float(self.sigma_scale) < 1.0:
+            raise ConfigError(f'sigma_scale must be from 0 to 1, not {self.sigma_scale}')
+        if not isinstance(self.folds, Integral) or self.folds < 2:
+            raise ConfigError(f'folds must be an integer of at least 2, not {self.folds}')
+        for name in ('fixed', 'effects'):
+            if isinstance(getattr(self, name), str):
+                raise ConfigError(f'{name} must be a list of names, not "{getattr(self, name)}"')
+        if isinstance(self.more, Observations):
+            raise ConfigError('more must be a list of observations, not one of them')
+        if self.loss not in LOSSES:
+            raise UnknownNameError('loss', self.loss, LOSSES)
+        self._check_sets()
+        self._check_patterns()
+        self._check_effects()
+        if not self.free:
+            raise ConfigError('every parameter is fixed: nothing is left to identify')
+
+    def _check_sets(self) -> None:
+        joints = len(self.chain.joints)
+        for observations in self.all_sets:
+            if observations.joints.shape[1:] != (joints,):
+                raise InputError(
+                    f'observations have {observations.joints.shape[1:]} joint values, chain '
+                    f'"{self.chain.name}" has {joints} joints'
+                )
+            if observations.distances is not None:
+                self._check_distances(observations.distances)
+            if observations.pixels is not None:
+                require_lens(self.model.frame(observations.camera).lens, observations.camera)
+        sockets = {each.base for each in self.sets if each.socket}
+        for *pair, distance in self.separations:
+            for base in pair:
+                if base not in sockets:
+                    raise UnknownNameError('socket that is a known distance away', base, sockets)
+            if not distance > 0.0:
+                raise ConfigError(f'the distance of sockets must be positive, not {distance}')
+
+    def _check_distances(self, distances: FloatArray) -> None:
+        """Refuse distances that vary by more than the flange can move.
+
+        By their quartiles: some may be gross errors.
+        """
+        reach = TOOL
+        for joint in self.chain.joints:
+            reach += abs(joint.a) + abs(joint.d)
+            if joint.type == 'prismatic':
+                ends = joint.lower, joint.upper
+                reach += max(np.inf if end is None else abs(end) for end in ends)
+        spread = float(np.ptp(np.percentile(distances, (25.0, 75.0)))) if len(distances) else 0.0
+        if spread > 2.0 * reach:
+            raise InputError(
+                f'the distances vary by {spread:.3g} m, more than an arm of {reach - TOOL:.3g} m '
+                'can cause: are they in metres (--length)?'
+            )
+
+    def _check_patterns(self) -> None:
+        names = self.model.parameter_names
+        for pattern in (*self.fixed, *self.priors):
+            if not fnmatch.filter(names, pattern):
+                raise UnknownNameError('parameter', pattern, names)
+        for pattern in self.priors:
+            if self._places(pattern):
+                raise ConfigError(
+                    f'a frame is either known or unknown, and takes no prior: "{pattern}"'
+                )
+        for pattern in self.fixed:
+            if self._places(pattern):
+                raise ConfigError(
+                    'a frame is fixed as a whole: give it in the chain file with "fixed: true" '
+                    f'instead of fixing "{pattern}"'
+                )
+
+    def _check_effects(self) -> None:
+        for name in self.effects:
+            if not effects.resolve(self.chain, name):
+                raise ConfigError(
+                    f'this chain has nothing to fit in "{name}" (gear needs the gear_ratio of '
+                    'joints in the chain file)'
+                )
+            group = effects.group_of(f'.{name}')
+            if group == 'compliance' and not any(joint.mass for joint in self.chain.joints):
+                raise ConfigError('compliance needs the masses of the links in the chain file')
+            if group == 'backlash' and all(each.approach is None for each in self.sets):
+                raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
+
+    def _places(self, pattern: str) -> bool:
+        """Tell whether a pattern matches the place of a frame, not a lens there."""
+        place = self.model.owns_frame(pattern)
+        return place and not fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
+
+    @cached_property
+    def sets(self) -> tuple[Observations, ...]:
+        """Return all sets to fit."""
+        return (self.observations, *self.more)
+
+    @cached_property
+    def judging(self) -> tuple[Observations, ...]:
+        """Return the held-out sets that are not empty."""
+        held_out = self.held_out or ()
+        sets = (held_out,) if isinstance(held_out, Observations) else held_out
+        return tuple(each for each in sets if len(each))
+
+    @property
+    def all_sets(self) -> tuple[Observations, ...]:
+        """Return the sets to fit, then the held-out ones."""
+        return (*self.sets, *self.judging)
+
+    @cached_property
+    def configurations(self) -> tuple[NDArray[np.intp], ...]:
+        """Return the configuration numbers (N,) of each set to fit, counted over all sets."""
+        return numbered(self.sets)
+
+    @cached_property
+    def kinds(self) -> tuple[identifiability.Kind, ...]:
+        """Return what each set measures."""
+        return tuple(
+            identifiability.Kind(
+                bool(each.oriented.any()) or each.pixels is not None,
+                each.distances is not None,
+                each.moving,
+                each.base,
+                each.tool,
+                each.socket,
+                each.plane,
+            )
+            for each in self.sets
+        )
+
+    @cached_property
+    def model(self) -> Chain:
+        """Return the nominal chain with all frames and effects to fit."""
+        chain = self.chain
+        known = dict(chain.frames)
+        added = {n for each in self.sets for n in (each.base, each.tool)} - set(chain.frame_names)
+        chain = replace(chain, frames=tuple((known | dict.fromkeys(sorted(added))).items()))
+        for each in self.sets:
+            device = chain.frame(each.base)
+            if each.moving and device.delay is None:
+                start = 0.0 if each.delay is None else float(np.median(each.delay))
+                chain = chain.with_frame(each.base, replace(device, delay=start))
+        wanted = [each for name in self.effects for each in effects.resolve(chain, name)]
+        return chain.with_effects(wanted)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Return the sigmas of the measurements [m, rad, px, m] by name."""
+        return {name: getattr(self, name) for name in SIGMAS}
+
+    @cached_property
+    def prior_sigmas(self) -> Mapping[str, float]:
+        """Return the standard deviations [m, rad] of all priors.
+
+        Frames have none; effects always have one.
+        """
+        sigmas = {**(self.learned.priors if self.learned else {}), **self.given}
+        for name, _ in self.model.effects:
+            sigmas.setdefault(name, effects.expected(name))
+        return sigmas
+
+    @cached_property
+    def given(self) -> Mapping[str, float]:
+        """Return the standard deviations [m, rad] of the given priors by name."""
+        sigmas: dict[str, float] = {}
+        for name in self.free:
+            fits = [x for pattern, x in self.priors.items() if fnmatch.fnmatchcase(name, pattern)]
+            if fits and (name.of_lens or not self.model.owns_frame(name)):
+                sigmas[name] = fits[0]
+        return sigmas
+
+    @cached_property
+    def informed(self) -> frozenset[str]:
+        """Return the DH parameters whose prior is tighter than common sense."""
+        known = {n for n, sigma in self.given.items() if sigma < self.common_sense(n)}
+        return frozenset(known - dict(self.model.effects).keys())
+
+    def common_sense(self, name: str) -> float:
+        """Return a third of the largest offset [m, rad] of a faulty robot."""
+        return (self.largest_length if Parameter(name).is_length else self.largest_angle) / 3.0
+
+    def system(self, sets: Sequence[Observations], learned: bool = True) -> System:
+        """Return sets and priors for the solver, without `learned` priors if asked."""
+        if not learned and self.learned is not None:
+            return replace(self, learned=None).system(sets)
+        sigmas = self.prior_sigmas
+        noise = 1.0 if self.learned is None else self.learned.noise
+        prior = Prior(self.model, sigmas, noise) if sigmas else None
+        samples = []
+        for each in sets:
+            position = self.sigma_touch if each.plane else self.sigma_position
+            samples.append(samples_of(each, (position, self.sigma_orientation), self.sigma_pixel))
+        present = {each.base for each in sets}
+        apart = tuple(s for s in self.separations if {s[0], s[1]} <= present)
+        return System(tuple(samples), prior, apart)
+
+    @cached_property
+    def free(self) -> tuple[Parameter, ...]:
+        """Return the parameters to fit, by priority.
+
+        Of parameters that trade against each other the last are kept nominal: effects, and before
+        them lengths d, which become absurd between nearly parallel axes.
+        """
+        model = self.model
+        used = {name for each in self.sets for name in (each.base, each.tool)}
+        held: set[str] = set()
+        for key in model.frame_names:
+            frame = model.frame(key)
+            if frame.fixed or key not in used:
+                held.update(parameters_of(key, (*FRAME_KINDS, DELAY)))
+            if frame.lens is None or frame.lens.fixed or key not in used:
+                held.update(parameters_of(key, LENS_KINDS))
+        for each in self.sets:
+            held.update(parameters_of(each.base)[3:] if each.socket else ())
+        for pattern in self.fixed:
+            held.update(fnmatch.filter(model.parameter_names, pattern))
+        known = dict(model.effects)
+        names = [name for name in model.parameter_names if name not in held]
+        return tuple(sorted(names, key=lambda name: 2 * (name in known) + (name.kind == 'd')))

@@ -1,0 +1,225 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Robust least squares, and the names of gross errors (docs/model.md, Fit).
+
+A sample's distance is the length of its residual in units of the median length of all, the larger
+one of position and orientation, or of a corner and the sum over its image. Fits are repeated with
+weights by distance until they converge (Holland and Welsch 1977):
+
+    first        w = min(1, 1 / distance)                  least absolute lengths
+    redescending w = 1 below INNER, 0 beyond OUTER, falling in between (Hampel 1974)
+    huber        w = min(1, INNER / distance)              (Huber 1964)
+
+If that finds outliers, or larger residuals than the given sigmas explain, the fit is repeated from
+the best half of the samples (`trimmed.py`): gross errors may agree with each other, and are then a
+second model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE, Fit, System, minimise
+from calib_ros.estimation.levels import ALIKE, SURE
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.trimmed import trimmed_start, trimmed_sum, unknown
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
+
+Loss: TypeAlias = Literal['redescending', 'huber', 'none']
+LOSSES: tuple[str, ...] = get_args(Loss)
+OUTLIER = 6.0
+"""Distance [scale] beyond which a sample is named as an outlier, at half its weight; a convention
+(Hampel 1974)."""
+INNER, OUTER = OUTLIER - 1.0, OUTLIER + 1.0
+"""Distances [scale] at which a sample begins to lose weight, and has none left. Of Gaussian
+errors in three directions 2 of 100,000 lie beyond the first."""
+MANY = 100 * SOME_POSES
+"""Samples that suffice to detect gross errors (benchmarks/end_to_end.py)."""
+SUSPICIOUS = 1.2
+"""Ratio of actual to expected residuals at which gross errors, or errors shared by a
+configuration, may hide in them; a convention, which benchmarks/outliers.py does not tell from
+1.5."""
+
+
+@dataclass(frozen=True, eq=False)
+class Robust:
+    """A robust fit, the weighted system, and the distances (N,) of the samples of each set."""
+
+    fit: Fit
+    system: System
+    distances: tuple[FloatArray, ...]
+    settled: bool
+    iterations: int
+    loss: str
+
+    @property
+    def good(self) -> tuple[NDArray[np.bool_], ...]:
+        """Return which samples (N,) of each set are no gross errors."""
+        return tuple(each <= OUTLIER for each in self.distances)
+
+    @property
+    def outliers(self) -> NDArray[np.bool_]:
+        """Return which samples (N,) of all sets are gross errors."""
+        return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')
+
+
+def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+    """Fit as `robust_fit`, then from the best half of the samples if that looks suspicious.
+
+    More than MANY samples are thinned to choose between the two; all are fitted from there.
+    """
+    if system.count > MANY:
+        few = thorough_fit(chain, names, system.spread(MANY), loss)
+        found = reweighted(few.fit.chain, names, system, loss, tolerance=0.1)
+        return replace(found, iterations=few.iterations + found.iterations)
+    first = robust_fit(chain, names, system, loss)
+    suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
+    if loss != 'redescending' or not suspicious:
+        return first
+    second = reweighted(trimmed_start(chain, names, system), names, system, loss)
+    sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
+    another = sums[0] > ALIKE**2 * sums[1]
+    if another and _chance(names, system, first, second) < 1.0 - SURE:
+        return replace(second, iterations=first.iterations + second.iterations)
+    return first
+
+
+def _chance(names: Sequence[str], system: System, first: Robust, second: Robust) -> float:
+    """Return the probability that a fit leaves so many samples out by chance, at most.
+
+    The F test of a shift of each of them (Cook and Weisberg 1982), times the number of ways to
+    choose them, with a tail bound (Chernoff 1952), because it may underflow.
+    """
+    out = int(second.outliers.sum())
+    if not out:
+        return 0.0
+    least = minimise(first.fit.chain, names, system, tolerance=1e-3).normal.cost
+    share = second.fit.normal.cost / max(least, 1e-300)
+    shifts = 0.5 * system.rows * out / system.count
+    spare = 0.5 * (system.rows - unknown(names, system)) - shifts
+    if spare <= 0.0 or share >= spare / (spare + shifts):
+        return 1.0
+    mean = spare / (spare + shifts)
+    ways = -special.betaln(out + 1.0, system.count - out + 1.0) - np.log(system.count + 1.0)
+    tail = spare * np.log(max(share, 1e-300) / mean)
+    tail += shifts * np.log((1.0 - share) / (1.0 - mean))
+    return float(np.exp(min(tail + ways, 0.0)))
+
+
+def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
+    """Fit the named parameters without gross errors."""
+    fit = minimise(chain, names, system)
+    iterations = fit.iterations
+    distances = distances_of(fit.chain, names, system)
+    if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
+        return Robust(fit, system, distances, True, iterations, loss)
+    if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # misled from a good start
+        fit = replace(fit, chain=chain)
+        distances = distances_of(chain, names, system)
+    for _ in range(ROUNDS):
+        before = distances
+        bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
+        fit = minimise(fit.chain, names, bounded, iterations=2)
+        iterations += fit.iterations
+        distances = distances_of(fit.chain, names, system)
+        if all(
+            np.allclose(d, b, rtol=0.1, atol=0.1) for d, b in zip(distances, before, strict=True)
+        ):
+            break
+    robust = reweighted(fit.chain, names, system, loss)
+    return replace(robust, iterations=iterations + robust.iterations)
+
+
+def reweighted(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    loss: str,
+    simpler: Sequence[FloatArray] | None = None,
+    tolerance: float = 1e-3,
+) -> Robust:
+    """Fit with the weights of a loss, from a start that is good enough to detect gross errors.
+
+    Fits are repeated to a `tolerance` until the weights converge. With the distances (N,) of all
+    samples by a `simpler` model, samples that it explains are no gross errors: a richer model has
+    to explain them too.
+    """
+
+    def judged(chain: Chain) -> tuple[FloatArray, ...]:
+        found = distances_of(chain, names, system)
+        if simpler is None:
+            return found
+        return tuple(np.minimum(d, s) for d, s in zip(found, simpler, strict=True))
+
+    distances = judged(chain)
+    iterations = 0
+    settled = False
+    last: list[FloatArray] = []
+    weights: list[FloatArray] = []
+    for _ in range(ROUNDS):
+        found = [weights_of(d, loss) for d in distances]
+        settled = bool(weights) and all(
+            np.allclose(f, w, rtol=0, atol=1e-4) for f, w in zip(found, weights, strict=True)
+        )
+        if settled:
+            break
+        last, weights = weights, _damp_oscillation(found, weights, last)
+        system = system.weighted(weights)
+        fit = minimise(chain, names, system, tolerance)
+        chain, iterations = fit.chain, iterations + fit.iterations
+        distances = judged(chain)
+        if not fit.converged:
+            break
+    if not (settled and fit.left < STEP_TOLERANCE):
+        fit = minimise(chain, names, system)
+        iterations += fit.iterations
+    return Robust(fit, system, distances, settled, iterations, loss)
+
+
+def _damp_oscillation(
+    found: list[FloatArray], last: list[FloatArray], before: list[FloatArray]
+) -> list[FloatArray]:
+    """Return the weights found (N,), set by set, averaged with the last ones if they oscillate.
+
+    A sample at the edge may lose weight, come nearer, regain it, and so on for ever. Empty lists
+    are weights not found yet.
+    """
+    steps = zip(found, last, before, strict=True) if before else ()
+    swings = sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0
+    return [0.5 * (f + b) for f, b in zip(found, last, strict=True)] if swings else found
+
+
+def weights_of(distance: FloatArray, loss: str) -> FloatArray:
+    """Return the weights (N,) of samples at distances (N,)."""
+    if loss == 'none':
+        return np.ones(len(distance))
+    if loss == 'huber':
+        return np.minimum(1.0, INNER / np.maximum(distance, 1e-12))
+    return np.clip((OUTER - distance) / (OUTER - INNER), 0.0, 1.0)
+
+
+def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[FloatArray, ...]:
+    """Return the distance (N,) of every sample, set by set."""
+    share = max(1.0 - len(names) / system.rows, 0.1)  # residuals are shorter than errors
+    found = []
+    for samples in system.sets:
+        largest = np.zeros(samples.count)
+        for part, row in samples.misfits(chain):
+            length = norms(part) / np.sqrt(share)
+            known = ~np.isnan(length)
+            if known.any():
+                usual = np.sqrt(
+                    special.chdtri(part.shape[1], 0.5)
+                )  # median length of standard normals
+                scale = np.median(length[known]) / usual
+                size = np.where(known, length, 0.0) / max(scale, STEP_TOLERANCE)  # else rounding
+                largest = np.maximum(largest, size[row])
+        found.append(largest)
+    return tuple(found)

@@ -1,0 +1,330 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Samples of one set of observations for the solver: weighted rows, block by block.
+
+Residual of a sample: p_measured - p and the rotation vector from the model's orientation to the
+measured one, both in world axes, weighted by the inverse covariance of the measurement. Its
+derivative by the parameters is minus that of the error model. The orientation part omits the
+Jacobian of the logarithm, which leaves the residual itself unchanged: with equal weights on the
+three axes the gradient is the same. A measured distance has the residual L - |p|, and its
+derivative is the position's along p. Pixels of a board are in `pixels.py`.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from functools import wraps
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.estimation.observations import Observations
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.lens import require_lens, view
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.walk import BLOCK as BLOCK
+from calib_ros.values import LARGEST
+
+Block: TypeAlias = tuple[slice, FloatArray, FloatArray, ErrorModel]
+Both: TypeAlias = tuple[FloatArray, FloatArray]
+"""Residuals by position and orientation, or in the image and at the board."""
+
+
+class Samples:
+    """One set of observations laid out for the solver: component first, sample last.
+
+    The sigmas [m, rad] are those of measurements without a covariance. `moments` has one row per
+    linearised joint values: the observations, or one of each image.
+    """
+
+    def __init__(
+        self, observations: Observations, sigma_position: float, sigma_orientation: float
+    ) -> None:
+        self.observations = self.moments = observations
+        self.count = len(observations)
+        self.joints = np.ascontiguousarray(observations.joints.T)
+        self.positions = np.ascontiguousarray(observations.positions.T)
+        self.rotations = np.ascontiguousarray(observations.rotations.transpose(2, 1, 0))
+        approach = observations.approach
+        self.approach = None if approach is None else np.ascontiguousarray(approach.T)
+        self.distances = observations.distances
+        self.oriented = bool(observations.oriented.any()) and self.distances is None
+        width = 3 if self.distances is None else 1
+        self.rows = width * self.count + 3 * int(observations.oriented.sum()) * self.oriented
+        self.sigmas = (sigma_position, sigma_orientation)
+        self.whitening: FloatArray | None = None
+        mixed = self.oriented and not observations.oriented.all()
+        if mixed or (observations.covariance is not None and self.distances is None):
+            self.whitening = _whitening(observations, sigma_position, sigma_orientation)
+        self.weights: FloatArray | None = None
+        """Square roots of the robust weights (N,); None for ones."""
+
+    def select(self, index: NDArray[np.generic]) -> Samples:
+        """Return the samples chosen by a mask (N,) or indices (K,), with their weights."""
+        few = type(self)(self.observations.select(index), *self.sigmas)
+        few.weights = None if self.weights is None else self.weights[index]
+        return few
+
+    def weighted(self, weights: FloatArray | None) -> Samples:
+        """Return the samples with robust weights (N,); None for ones."""
+        found = copy.copy(self)
+        found.weights = None if weights is None else np.sqrt(weights)
+        return found
+
+    def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
+        """Yield weighted rows of Jacobian and residual in blocks.
+
+        Each is a slice of samples; `shift` (P + 1, c, B), the derivative of the residual, which is
+        the last row; `turn` (P_rotational + 1, 3, B) of a separate orientation, else empty; and
+        the error model with the order of the parameters in the rows.
+        """
+        model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
+        empty = np.zeros((0, 0, 0))
+        joints, velocity = self.moving(chain)
+        out = None
+        for start in range(0, self.count, BLOCK):
+            part = slice(start, start + BLOCK)
+            if start + BLOCK > self.count:
+                out = None  # the last is shorter
+            approach = None if self.approach is None else self.approach[:, part]
+            moving = None if velocity is None else velocity[:, part]
+            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving, out)
+            out = shift, turn
+            if self.distances is not None:
+                shift = _along(origin, shift, self.distances[part], self.observations.plane)
+            else:
+                np.subtract(self.positions[:, part], origin, out=shift[-1])
+            if self.oriented:
+                turn[-1] = orientation_error(self.rotations[:, :, part], axes)
+            weights = 1.0 if self.weights is None else self.weights[part]
+            sigmas = self.sigmas if self.whitening is None else (1.0, 1.0)
+            shift *= weights / sigmas[0]
+            if self.oriented:
+                turn *= weights / sigmas[1]
+            if self.whitening is not None:
+                shift, turn = self._whitened(shift, turn, part), empty
+            yield part, shift, turn if self.oriented else empty, model
+
+    def products(
+        self,
+        chain: Chain,
+        names: Sequence[str],
+        count: int = 1,
+        folds: NDArray[np.intp] | None = None,
+    ) -> FloatArray:
+        """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
+        size = len(names) + 1
+        found = np.zeros((count, 2, size, size))
+        order, samples, ends = np.arange(size), self, np.array([0, self.count])
+        if folds is not None:
+            samples = self.select(np.argsort(folds, kind='stable'))
+            ends = np.append(0, np.cumsum(np.bincount(folds, minlength=count)))
+        for which, shift, turn, model in samples.blocks(chain, names):
+            last = len(turn) - 1
+            cuts = np.clip(ends - which.start, 0, shift.shape[2]).tolist()
+            for (by_position, by_orientation), *cut in zip(found, cuts, cuts[1:], strict=False):
+                part = slice(*cut)
+                rows = shift[..., part].reshape(size, -1)
+                by_position += rows @ rows.T
+                if last >= 0:
+                    rows = turn[..., part].reshape(last + 1, -1)
+                    products = rows @ rows.T
+                    by_orientation[:last, :last] += products[:-1, :-1]
+                    by_orientation[:last, -1] += products[:-1, -1]
+                    by_orientation[-1, -1] += products[-1, -1]
+            order[:-1] = model.order
+        found[:, 1, -1, :-1] = found[:, 1, :-1, -1]
+        return np.asarray(found[:, :, order[:, np.newaxis], order])
+
+    def sums(
+        self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
+    ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
+        """Yield numbers (n,) of successive groups, and summed rows (P + 1, c, n) by part."""
+        first = 0
+        for block in self.parts(chain, names):
+            index = groups[first : first + block[0].shape[2]]
+            first += len(index)
+            begins = np.flatnonzero(np.diff(index, prepend=-1))
+            if len(begins) < len(index):
+                block = tuple(np.add.reduceat(part, begins, axis=2) for part in block)
+            yield index[begins], block
+
+    def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
+        """Return joint values (n, N) at the device's delay, and velocities if it has one."""
+        delay = chain.frame(self.observations.base).delay
+        if self.moments.velocity is None or delay is None:
+            return self.joints, None
+        then = self.moments.earlier(delay)
+        velocity = np.ascontiguousarray(np.asarray(then.velocity).T)
+        return np.ascontiguousarray(then.joints.T), velocity
+
+    def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
+        """Yield the rows by position and orientation, (P + 1, c, B) each, in blocks.
+
+        Parameters are in the order of their names, the residual last. Without a separate
+        orientation there is one part.
+        """
+        for _, shift, turn, model in self.blocks(chain, names):
+            order = [*model.order, len(names)]
+            if not len(turn):
+                yield (shift[order],)
+                continue
+            full = np.zeros((len(names) + 1, *turn.shape[1:]))
+            rotational = np.flatnonzero(model.order < model.rotations)
+            full[rotational], full[-1] = turn[model.order[rotational]], turn[-1]
+            yield shift[order], full
+
+    @property
+    def width(self) -> int:
+        """Return the number of rows of a sample: of its position, or of all if whitened."""
+        return 1 if self.distances is not None else 6 if self.whitening is not None else 3
+
+    def rows_of(self, chain: Chain, names: Sequence[str]) -> FloatArray:
+        """Return the weighted rows (P + 1, c, N) sample by sample, the residual last."""
+        found = [np.concatenate(parts, axis=1) for parts in self.parts(chain, names)]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=2)
+
+    def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
+        """Return (P + 1, 6, B): position and orientation rows mixed by each sample's whitening."""
+        assert self.whitening is not None
+        full = np.zeros((len(shift), 6, shift.shape[2]))
+        full[:, :3] = shift
+        full[: len(turn) - 1, 3:] = turn[:-1]
+        full[-1, 3:] = turn[-1] if self.oriented else 0.0
+        mixed = np.einsum('rsb,psb->prb', self.whitening[:, :, part], full, optimize=True)
+        return np.ascontiguousarray(mixed)
+
+    def position_errors(self, residuals: FloatArray) -> FloatArray:
+        """Return position errors (N, 3) [m] of weighted residuals (rows,).
+
+        Residuals are ordered component by component, as rows; of distances the error is the first.
+        """
+        rows = residuals.reshape(-1, self.count).T
+        if self.whitening is not None:  # lower triangular: no orientation in it
+            mixing = self.whitening[:3, :3].transpose(2, 0, 1)
+            return np.asarray(np.linalg.solve(mixing, rows[:, :3, np.newaxis])[..., 0])
+        errors = np.zeros((self.count, 3))
+        width = 1 if self.distances is not None else 3
+        errors[:, :width] = self.sigmas[0] * rows[:, :width]
+        return errors
+
+    def whitened_residuals(self, chain: Chain) -> Both:
+        """Return the residuals by a chain `in_sigma`."""
+        return self.in_sigma(*residual_arrays(chain, self.observations))
+
+    def in_sigma(self, position: FloatArray, orientation: FloatArray) -> Both:
+        """Return residuals in sigma: position (N, 3 or 1), orientation (N, 3).
+
+        NaN where not measured. With covariances, samples are whitened as a whole, so the two parts
+        are only approximate.
+        """
+        if self.whitening is not None:
+            both = np.concatenate([position, np.nan_to_num(orientation)], axis=1)
+            both = np.einsum('rsn,ns->nr', self.whitening, both)
+            position, turned = both[:, :3], both[:, 3:]
+            return position, np.where(self.observations.oriented[:, None], turned, np.nan)
+        return position / self.sigmas[0], orientation / self.sigmas[1]
+
+    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
+        """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
+        for part in self.whitened_residuals(chain):
+            yield part, slice(None)
+
+
+def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:
+    """Cache the residuals of the last chain in the observations."""
+
+    @wraps(find)
+    def found(chain: Chain, observations: Observations) -> Both:
+        known = vars(observations).get('_residuals')
+        if known is None or known[0] is not chain:
+            known = vars(observations)['_residuals'] = (chain, find(chain, observations))
+            for each in known[1]:
+                each.setflags(write=False)
+        arrays: Both = known[1]
+        return arrays
+
+    return found
+
+
+@_cached
+def residual_arrays(chain: Chain, observations: Observations) -> Both:
+    """Return measured minus predicted: position (N, 3) [m], rotation vector (N, 3) [rad].
+
+    Distances give (N, 1). Rotation vectors are NaN where not measured.
+    """
+    then = observations.earlier(chain.frame(observations.base).delay)
+    distances = observations.distances
+    position = np.empty((len(then), 3 if distances is None else 1))
+    orientation = np.full((len(then), 3), np.nan)
+    oriented = observations.oriented & (distances is None)
+    for start in range(0, len(then), BLOCK):
+        part = slice(start, start + BLOCK)
+        q = np.ascontiguousarray(then.joints[part].T)
+        signs = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
+        axes, origin = chain.trace(
+            chain.effective(q, signs), base=observations.base, tool=observations.tool
+        )
+        if distances is not None:
+            length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
+            position[part, 0] = distances[part] - length
+            continue
+        position[part] = observations.positions[part] - origin.T
+        if oriented[part].any():
+            measured = np.ascontiguousarray(observations.rotations[part].transpose(2, 1, 0))
+            orientation[part] = orientation_error(measured, axes).T
+    orientation[~oriented] = np.nan
+    return position, orientation
+
+
+@_cached
+def seen_residuals(chain: Chain, observations: Observations) -> Both:
+    """Return measured minus predicted pixels (N, 2), and as shifts at the board (N, 3) [m].
+
+    Clipped to LARGEST: points behind the camera or far away give meaningless values.
+    """
+    camera = observations.camera
+    lens = require_lens(chain.frame(camera).lens, camera)
+    then = observations.earlier(chain.frame(observations.base).delay)
+    first = np.flatnonzero(np.diff(then.images, prepend=-1))
+    assert then.pixels is not None
+    assert then.points is not None
+    q = np.ascontiguousarray(then.joints[first].T)
+    signs = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
+    axes, origin = chain.trace(chain.effective(q, signs), base=then.base, tool=then.tool)
+    pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
+    for start in range(0, len(then), 4 * BLOCK):
+        part = slice(start, start + 4 * BLOCK)
+        seen = view(lens, axes, origin, then.images[part], then.points[part].T, then.on_flange)
+        residual = np.clip(then.pixels[part].T - seen.pixels, -LARGEST, LARGEST)
+        pixels[part], shifts[part] = residual.T, seen.at_the_board(residual)
+    return pixels, np.clip(shifts, -LARGEST, LARGEST)
+
+
+def _along(
+    origin: FloatArray, shift: FloatArray, distances: FloatArray, plane: bool
+) -> FloatArray:
+    """Return rows (P + 1, 1, B) along the line of sight or a plane's normal z, and L - |p|."""
+    if plane:
+        along = np.ascontiguousarray(shift[:, 2:])
+        along[-1, 0] = distances - origin[2]
+        return along
+    length = np.maximum(np.linalg.norm(origin, axis=0), 1e-12)
+    along = np.einsum('pcb,cb->pb', shift, origin / length)[:, np.newaxis]
+    along[-1, 0] = distances - length
+    return np.ascontiguousarray(along)
+
+
+def _whitening(
+    observations: Observations, sigma_position: float, sigma_orientation: float
+) -> FloatArray:
+    """Return W (6, 6, N) with W^T W the inverse covariance; zero rows if not measured."""
+    covariance = observations.covariances((sigma_position, sigma_orientation))
+    covariance[~observations.oriented, 3:, :] = 0.0
+    covariance[~observations.oriented, 3:, 3:] = np.eye(3)
+    whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+    whitening[~observations.oriented, 3:, :] = 0.0
+    return np.ascontiguousarray(whitening.transpose(1, 2, 0))

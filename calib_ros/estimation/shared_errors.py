@@ -1,0 +1,346 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors shared by neighbouring poses.
+
+A tracker drifts, and model errors change slowly over the joint space, so neighbours have similar
+errors and carry less information than their number. Configurations are neighbours in succession or
+in joint space. Residuals r of white noise of unit variance have the covariance B = I - Q Q^T (Q:
+orthonormal columns of the Jacobian), so a quadratic form r^T A r has
+
+    mean tr(A B)        covariance with r^T C r: 2 tr(A B C B)
+
+With A the links of neighbours, r^T A r / r^T r is tested against its mean (Moran's I of residuals,
+Cliff and Ord 1972; for successive ones that of Durbin and Watson 1950). If the test finds similar
+neighbours, the noise is modelled as a sum of independent and fading parts,
+
+    V = v_0 I + sum_k v_k K_k        K_k = exp(-distance / length_k)
+
+where the sizes v_k >= 0 equate the forms r^T K_k r with their expected values (MINQUE, Rao 1971),
+which allows for errors absorbed by the fit. The covariance of the parameters is then
+H^-1 (J^T V J) H^-1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, special
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from calib_ros.estimation.leastsquares import Fit, System, gram
+from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
+from calib_ros.values import LARGEST
+
+LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
+"""Decay lengths of shared errors: stops, and rad (m) of all joints together."""
+NEARBY = SEVERAL
+"""Neighbours in joint space tested per configuration; benchmarks/drift.py --quick does not tell
+them from 1."""
+MOST_STOPS = 2 * SOME_POSES
+"""Stops used to estimate sizes; of more, every k-th run of a twentieth."""
+ELSEWHERE = 4.0 * LARGEST
+"""Distance between stops of different sets, which are no neighbours."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shared:
+    """Correlation of neighbours, and the noise by parts if they share errors.
+
+    `successive` and `near` are the larger correlation of residuals of both parts, `found` the
+    kinds of neighbours with shared errors by the test, `middles` J^T V J (P, P) of each part (0
+    position, 1 orientation) with shared errors.
+    """
+
+    successive: float
+    near: float
+    found: tuple[str, ...]
+    middles: dict[int, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class _Stops:
+    """Rows of stops, summed over the samples of each.
+
+    `parts` are (P + 1, c, n), by position and orientation, zero if not measured; `count` (n,)
+    samples per stop; `place` (n, D) in joint space, angles on the unit circle, and `time` (n,) the
+    stop number; both far apart between sets.
+    """
+
+    parts: list[FloatArray]
+    count: FloatArray
+    place: FloatArray
+    time: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.count)
+
+    def distances(self, kind: str) -> FloatArray:
+        if kind == 'near':
+            return np.asarray(cdist(self.place, self.place))
+        return np.asarray(np.abs(self.time[:, np.newaxis] - self.time))
+
+    def links(self, kind: str) -> csr_array:
+        """Return (n, n): 1 for neighbours."""
+        count = len(self)
+        if kind == 'successive':
+            first = np.flatnonzero(np.diff(self.time) == 1.0)
+            second = first + 1
+        else:
+            far, nearest = cKDTree(self.place).query(self.place, k=NEARBY + 1)
+            first, second = np.repeat(np.arange(count), NEARBY + 1), nearest.ravel()
+            good = (first != second) & (far.ravel() < ELSEWHERE / 2)
+            first, second = first[good], second[good]
+        ends = (np.append(first, second), np.append(second, first))
+        links = csr_array((np.ones(2 * len(first)), ends), shape=(count, count))
+        links.data[:] = 1.0
+        return links
+
+    def kernel(self, kind: str, length: float) -> FloatArray:
+        """Return (n, n): covariance of the sums over each stop, per root of count."""
+        root = np.sqrt(self.count)
+        return np.asarray(np.outer(root, root) * np.exp(-self.distances(kind) / length))
+
+
+def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
+    """Return which neighbours share errors, and the resulting noise."""
+    kinds = tuple(LENGTHS)
+    total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
+    share = max(1, -(-total // MOST_STOPS))
+    few = _gather(fit.chain, names, system, share, MOST_STOPS // 20)
+    correlations = dict.fromkeys(kinds, 0.0)
+    if len(few) < TELLING:
+        return Shared(**correlations, found=(), middles={})
+    extra, _ = system.extra_rows(fit.chain, names)
+    forms = _Forms(few, extra)
+    limit = special.ndtri(1.0 - (1.0 - CERTAIN) / (len(kinds) * len(forms.parts)))
+    alike: dict[int, list[str]] = {}
+    for kind in kinds:
+        links = few.links(kind)
+        for part in forms.parts:
+            correlation, score = forms.test(part, links)
+            correlations[kind] = max(correlations[kind], correlation)
+            if score > limit:
+                alike.setdefault(part, []).append(kind)
+    if not alike:
+        return Shared(**correlations, found=(), middles={})
+    kernels = {
+        part: [(kind, length) for kind in kinds if kind in found for length in LENGTHS[kind]]
+        for part, found in alike.items()
+    }
+    sizes = forms.sizes(kernels)
+    alike = {part: found for part, found in alike.items() if sizes[part].any()}
+    even = few if share == 1 else _gather(fit.chain, names, system, share, 1)
+    middles: dict[int, FloatArray] = {}
+    by_time: dict[int, list[tuple[float, float]]] = {}
+    for part in alike:
+        white, *rest = sizes[part]
+        middles[part] = white * fit.normal.parts[part]
+        for (kind, length), size in zip(kernels[part], rest, strict=True):
+            if size and kind == 'near':
+                middles[part] += size * _near(even, part, length, share)
+            elif size:
+                by_time.setdefault(part, []).append((length, size))
+    for part, middle in _successive(fit.chain, names, system, by_time).items():
+        middles[part] += middle
+    found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
+    return Shared(**correlations, found=found, middles=middles)
+
+
+class _Forms:
+    """Quadratic forms of residuals, and their moments."""
+
+    def __init__(self, units: _Stops, extra: FloatArray) -> None:
+        self._units = units
+        width = extra.shape[1]
+        rows = [part.reshape(width + 1, -1).T for part in units.parts]
+        stacked = np.concatenate([*rows, np.pad(extra, ((0, 0), (0, 1)))])
+        basis = linalg.qr(stacked[:, :-1], mode='economic', check_finite=False)[0]
+        left = stacked[:, -1] - basis @ (basis.T @ stacked[:, -1])
+        self._basis: dict[int, FloatArray] = {}
+        self._residual: dict[int, FloatArray] = {}
+        self._known: dict[int, FloatArray] = {}
+        self.parts: list[int] = []
+        first = 0
+        for part, each in enumerate(units.parts):
+            shape = each.shape[1:]
+            block = slice(first, first + shape[0] * shape[1])
+            first = block.stop
+            if not each.any():
+                continue
+            turned = basis[block].reshape(*shape, -1).transpose(1, 0, 2)
+            self._basis[part] = np.ascontiguousarray(turned)
+            self._residual[part] = left[block].reshape(shape).T
+            self._known[part] = each.any(axis=0).T.astype(float)
+            self.parts.append(part)
+
+    def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
+        """Return the traces (F, F) tr(A B C B) of forms with matrices (K, n, n) by part."""
+        inner, alone = list[FloatArray](), list[FloatArray]()
+        for part, own in matrices.items():
+            basis, known, count = self._basis[part], self._known[part], len(own)
+            products = np.matmul(own, basis.reshape(len(basis), -1))
+            products = products.reshape(count, *basis.shape) * known[:, :, np.newaxis]
+            columns = basis.reshape(-1, basis.shape[2])
+            crossed = np.matmul(columns.T, products.reshape(count, *columns.shape))
+            inner.append(crossed.reshape(count, -1))
+            flat = own.reshape(count, -1)
+            both = (flat * (known @ known.T).ravel()) @ flat.T
+            alone.append(both - 2.0 * gram(products))
+        return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
+
+    def _values(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
+        """Return the forms (F,) r^T A r."""
+        pairs = [(self._residual[part], own) for part, own in matrices.items()]
+        return np.concatenate([(r * (own @ r)).sum(axis=(1, 2)) for r, own in pairs])
+
+    def test(self, part: int, links: csr_array) -> tuple[float, float]:
+        """Return the excess correlation of linked residuals and its score, N(0, 1) for none."""
+        basis, residual, known = self._basis[part], self._residual[part], self._known[part]
+        product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
+        product *= known[:, :, np.newaxis]
+        white, linked = _inner(basis, basis), _inner(basis, product)
+        pairs = float((known * (links @ known)).sum())
+        size = float((residual**2).sum())
+        freedom = float(known.sum() - np.trace(white))
+        if not (size > 0.0 and pairs > 0.0 and freedom > 1.5):  # one alone has a constant ratio
+            return 0.0, 0.0
+        ratio = -float(np.trace(linked)) / freedom
+        both = float((linked**2).sum() + pairs - 2.0 * (product**2).sum())
+        mixed = float((linked * white).sum() - 2.0 * (product * basis).sum())
+        alone = float((white**2).sum() + known.sum() - 2.0 * (basis**2).sum())
+        variance = 2.0 * max(both - 2.0 * ratio * mixed + ratio**2 * alone, 1e-300)
+        excess = float((residual * (links @ residual)).sum()) * freedom / size - ratio * freedom
+        return excess / pairs, excess / float(np.sqrt(variance))
+
+    def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
+        """Return, by part, the sizes (1 + K,) of the independent part and each kernel."""
+        from scipy import optimize  # slow to import, rarely needed
+
+        white = np.eye(len(self._units))
+        every = dict.fromkeys(kernel for own in kernels.values() for kernel in own)
+        known = {kernel: self._units.kernel(*kernel) for kernel in every}
+        matrices = {
+            part: np.array([white, *(known[kernel] for kernel in kernels.get(part, ()))])
+            for part in self.parts
+        }
+        moments = self._moments(matrices)
+        scale = np.sqrt(np.maximum(np.diag(moments), HALF_THE_DIGITS))
+        scaled = moments / np.outer(scale, scale)
+        # weighted by the covariance of the forms under white noise; those without spread, if
+        # hardly more was measured than fitted, carry no information
+        squares, directions = linalg.eigh(scaled)
+        informative = squares > HALF_THE_DIGITS * squares[-1]
+        roots, directions = np.sqrt(squares[informative]), directions[:, informative]
+        values = self._values(matrices) / scale
+        sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, values @ directions / roots)[0]
+        ends = np.cumsum([len(own) for own in matrices.values()])[:-1]
+        return dict(zip(self.parts, np.split(sizes / scale, ends), strict=True))
+
+
+def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return products (P, P) of columns (n, c, P)."""
+    size = first.shape[2]
+    return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
+
+
+def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:
+    """Return the stops of all sets; of many, every `share`-th run of `run` stops."""
+    widths = (max(samples.width for samples in system.sets), 3)
+    parts: list[list[FloatArray]] = [[], []]
+    counts, places, times = [], [], []
+    circular = np.array([joint.type == 'revolute' for joint in chain.joints])
+    for number, samples in enumerate(system.sets):
+        all_numbers = samples.observations.stops
+        chosen = all_numbers // run % share == 0
+        if samples.weights is not None:
+            chosen &= samples.weights > 0.0
+        if not chosen.any():
+            continue
+        few = samples.select(chosen)
+        numbers = all_numbers[chosen]
+        pieces = list(few.sums(chain, names, numbers))
+        index = np.concatenate([piece[0] for piece in pieces])
+        again = np.flatnonzero(np.diff(index, prepend=-1))  # stops across the end of a block
+        begins = np.flatnonzero(np.diff(numbers, prepend=-1))
+        count = np.diff([*begins, len(numbers)]).astype(float)
+        for part, width in enumerate(widths):
+            rows = np.zeros((len(names) + 1, width, len(begins)))
+            if part < len(pieces[0][1]):
+                whole = np.concatenate([piece[1][part] for piece in pieces], axis=2)
+                added = np.add.reduceat(whole, again, axis=2)
+                rows[:, : added.shape[1]] = added / np.sqrt(count)
+            parts[part].append(rows)
+        q = few.observations.joints[begins]
+        turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
+        places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
+        times.append(numbers[begins] + ELSEWHERE * number)
+        counts.append(count)
+    if not counts:
+        return _Stops([], np.zeros(0), np.zeros((0, 0)), np.zeros(0))
+    return _Stops(
+        [np.concatenate(part, axis=2) for part in parts],
+        *(np.concatenate(each) for each in (counts, places, times)),
+    )
+
+
+def _near(units: _Stops, part: int, length: float, share: int) -> FloatArray:
+    """Return J^T K J of errors fading in joint space, by every `share`-th stop: pairs are many."""
+    kernel = units.kernel('near', length)
+    own = np.diag(kernel) * (share - share**2)
+    kernel = share**2 * kernel + np.diag(own)
+    rows = units.parts[part][:-1]
+    return np.asarray(np.einsum('pcn,rcn->pr', rows @ kernel, rows, optimize=True))
+
+
+def _successive(
+    chain: Chain,
+    names: Sequence[str],
+    system: System,
+    kernels: Mapping[int, Sequence[tuple[float, float]]],
+) -> dict[int, FloatArray]:
+    """Return by part J^T K J of errors fading in succession, for (length, size) each."""
+    found = {part: np.zeros((len(names), len(names))) for part in kernels}
+    for samples in system.sets if kernels else ():
+        states: dict[int, FloatArray] = {}
+        for _, sums in samples.sums(chain, names, samples.observations.stops):
+            for part, own_kernels in kernels.items():
+                if part >= len(sums):
+                    continue
+                rows = sums[part][:-1]
+                own = rows.reshape(len(rows), -1)
+                earlier, states[part] = _faded_sums(
+                    rows.reshape(-1, rows.shape[2]), states.get(part), own_kernels
+                )
+                found[part] += own @ earlier.reshape(own.shape).T
+    return {part: cross + cross.T for part, cross in found.items()}
+
+
+def _faded_sums(
+    rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the faded sum (R, n) of the columns before each of (R, n), and half of itself.
+
+    With it, for each kernel (length, size), the sum (R, K) so far, which continues `state`. Runs
+    of about the root of n columns make both a product with a small matrix.
+    """
+    lengths, sizes = np.array(kernels).T
+    run = int(np.sqrt(rows.shape[1]))
+    ahead = np.subtract.outer(np.arange(run), np.arange(run))[..., np.newaxis]
+    inside = (np.exp(-np.abs(ahead) / lengths) @ sizes) * np.heaviside(-ahead[..., 0], 0.5)
+    after = np.exp(-np.arange(run)[::-1, np.newaxis] / lengths)
+    found = np.empty_like(rows)
+    state = np.zeros((len(rows), len(lengths))) if state is None else state
+    for first in range(0, rows.shape[1], run):
+        part = np.ascontiguousarray(rows[:, first : first + run])
+        width = part.shape[1]
+        fading = np.exp(-np.arange(1, width + 1) / lengths[:, np.newaxis])
+        found[:, first : first + width] = part @ inside[:width, :width] + (state * sizes) @ fading
+        state = state * fading[:, -1] + part @ after[run - width :]
+    return found, state

@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Sizes of the errors of each kind: the most probable given the data (`evidence.py`)."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from scipy import special
+from scipy.linalg import lapack
+
+from calib_ros.estimation.levels import CONFIDENT
+from calib_ros.kinematics.effects import EXPECTED
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+
+TYPICAL = {'length': 5e-4, 'angle': 1e-3, 'drive': EXPECTED['gear'], 'coupling': 1e-3}
+TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backlash')}
+"""Size [m, rad] of the errors that arms have, by group."""
+SPREAD = 10.0
+"""Factor between the error sizes of one arm and TYPICAL (one standard deviation;
+benchmarks/harm.py)."""
+TAILS = 3.0
+"""Degrees of freedom of the prior (benchmarks/harm.py)."""
+SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
+"""Logarithms of the ratio of probabilities beyond which effects show, and from which those of
+usual size are refuted."""
+SETTLED = 0.02
+"""Change of the log of a size at convergence; a convention."""
+LEAST_SIZE = SPREAD**-3
+"""Smallest size searched, relative to TYPICAL; its inverse is the largest."""
+
+
+def solved(
+    matrix: FloatArray, vector: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (P,) and a root (P, P) of the covariance."""
+    scaled, scale = _scaled(matrix, precision)
+    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError('singular posterior')
+    inverse = lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
+    inverse *= scale
+    return inverse.T @ (inverse @ vector), inverse.T
+
+
+def mixed(
+    solutions: Sequence[tuple[FloatArray, FloatArray]], weights: Sequence[float]
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean (P,) and covariance (P, P) of a weighted mixture of means and roots."""
+    means = np.array([mean for mean, _ in solutions])
+    mean = np.average(means, axis=0, weights=weights)
+    away = [np.outer(each - mean, each - mean) for each in means]
+    squares = [root @ root.T + more for (_, root), more in zip(solutions, away, strict=True)]
+    return mean, np.average(squares, axis=0, weights=weights)
+
+
+def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return matrices (..., P, P) + precisions (..., P), scaled to unit diagonal, and scales."""
+    size = np.arange(len(matrix))
+    diagonal = matrix[size, size] + precision
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
+    scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
+    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # never singular
+    return scaled, scale
+
+
+class Evidence:
+    """Evidence of the data for sizes of the errors."""
+
+    def __init__(
+        self,
+        matrix: FloatArray,
+        vector: FloatArray,
+        given: FloatArray,
+        groups: Sequence[str | None],
+        typical: Mapping[str, float],
+    ) -> None:
+        self._matrix, self._vector, self._given = matrix, vector, given
+        self._names = [*dict.fromkeys(group for group in groups if group is not None)]
+        rows = [[group == name for group in groups] for name in self._names]
+        self._member = np.array(rows, dtype=float).reshape(len(rows), len(groups))
+        self._typical = np.log([typical[name] for name in self._names])
+        self._own = np.array([group in ('length', 'angle') for group in groups])
+        self._tails = np.ones(len(groups))
+
+    def most_probable(self, considered: set[str | None]) -> tuple[FloatArray, FloatArray]:
+        """Return the log size of each group (G,), and the curvature (G,) there.
+
+        Considered effects have size zero if the data rule out the usual size and show no effect.
+        """
+        size, width = self._typical.copy(), np.log(SPREAD) ** -2
+        if self._own.sum() == self._member.sum():
+            mean, variance = self._means(size - np.log(LEAST_SIZE))
+            surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt(variance), 0.0)
+            self._lengthen(surely**2, 1.0, size)
+        for _ in range(ROUNDS):
+            weight = self._weight(size)
+            mean, variance = self._means(size)
+            gamma = (self._member - weight * variance).sum(axis=1)
+            slope = weight @ mean**2 - gamma - width * (size - self._typical)
+            step = np.clip(slope / (2.0 * np.maximum(gamma, 0.0) + width), -1.0, 1.0)
+            size = self._within(size + step)
+            self._lengthen(mean**2 + variance, 0.0, size)
+            if np.abs(step).max(initial=0.0) < SETTLED:
+                break
+        for k, name in enumerate(self._names):
+            if name in considered:
+                tried = np.tile(size, (3, 1))
+                tried[1:, k] = self._typical[k] + np.log(LEAST_SIZE), self._typical[k]
+                here, without, usual = self._of(tried).tolist()
+                if not here - without > SHOWN and without - usual > REFUTED:
+                    size = tried[1]
+        return size, 2.0 * np.maximum(gamma, 0.0) + width
+
+    def rival(
+        self, group: str, std: float, size: FloatArray, considered: set[str | None]
+    ) -> tuple[float, FloatArray]:
+        """Return the log odds of a group having size `std`, and the precision (P,) then.
+
+        Against the most probable log sizes (G,); the other groups are searched again.
+        """
+        own = self._names.index(group)
+        rest = [k for k in range(len(self._names)) if k != own]
+        other = copy.copy(self)
+        other._given = np.where(self._member[own] > 0.0, std**-2, self._given)
+        other._names = [self._names[k] for k in rest]
+        other._member, other._typical = self._member[rest], self._typical[rest]
+        found, _ = other.most_probable(considered - {group})
+        more = other._probable(found) - self._probable(size)
+        other.widen(found)
+        return more, other.precision(found)
+
+    def _probable(self, size: FloatArray) -> float:
+        """Return the log probability of data and log sizes (G,), but for a constant (Laplace)."""
+        mean, root = solved(self._matrix, self._vector, self.precision(size))
+        fit = mean @ self._vector - 0.5 * mean @ self._matrix @ mean
+        known = self._member.any(axis=0)
+        sizes = self._member.T @ size
+        squares = np.where(known, mean * np.exp(-sizes), 0.0) ** 2
+        tails = 0.5 * (TAILS + 1.0) * np.log1p(squares / TAILS)
+        usual = np.where(self._own, tails, 0.5 * squares).sum() + sizes[known].sum()
+        given = self._given > 0.0
+        usual += (
+            0.5 * (self._given * mean**2)[given].sum() - 0.5 * np.log(self._given[given]).sum()
+        )
+        usual += 0.5 * (((size - self._typical) / np.log(SPREAD)) ** 2).sum()
+        return float(fit - usual + np.log(np.abs(np.diag(root))).sum())
+
+    def near(self, size: FloatArray, slope: FloatArray) -> list[tuple[float, FloatArray]]:
+        """Return plausible log sizes with their weights, from the curvature (G,).
+
+        One group differs at a time, up and down, by as much as makes means right to second order
+        (unscented transform, Julier and Uhlmann 1997), weighted by their evidence. Groups of size
+        zero stay so, and so does the scale of the device.
+        """
+        arms = np.array([name in TYPICAL for name in self._names])
+        some = np.flatnonzero(arms & (size > self._typical + np.log(LEAST_SIZE)))
+        if not len(some):
+            return [(1.0, size)]
+        steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
+        tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
+        unusual = (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(axis=1)
+        likely = self._of(tried) - 0.5 * unusual
+        upper = special.expit(likely[::2] - likely[1::2])
+        weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
+        return list(zip(weights.tolist(), tried, strict=True))
+
+    def _within(self, size: FloatArray) -> FloatArray:
+        """Return log sizes (G,) clipped to the searched range."""
+        most = -np.log(LEAST_SIZE)
+        return self._typical + np.clip(size - self._typical, -most, most)
+
+    def widen(self, size: FloatArray) -> None:
+        """Set the variances to the mean over the tails of the prior, for log sizes (G,)."""
+        for _ in range(ROUNDS):
+            mean, variance = self._means(size)
+            last = self._tails
+            self._lengthen(mean**2 + variance, 0.0, size, TAILS - 1.0)
+            if np.abs(np.log(self._tails / last)).max(initial=0.0) < SETTLED:
+                break
+
+    def _means(self, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return means and variances (P,) for log sizes (G,)."""
+        mean, root = solved(self._matrix, self._vector, self.precision(size))
+        return mean, (root**2).sum(axis=1)
+
+    def precision(self, size: FloatArray) -> FloatArray:
+        """Return the prior precision (P,) of the parameters for log sizes (G,)."""
+        return np.asarray(self._given + self._weight(size).sum(axis=0))
+
+    def named(self, size: FloatArray) -> dict[str, float]:
+        """Return the size [m, rad] of each group from log sizes (G,)."""
+        return dict(zip(self._names, np.exp(size).tolist(), strict=True))
+
+    def _lengthen(
+        self, squares: FloatArray, more: float, size: FloatArray, freedom: float = TAILS + 1.0
+    ) -> None:
+        """Set the tails of the prior for offsets of expected squares (P,), plus `more` sizes.
+
+        Effects have none: drives of one make are alike.
+        """
+        far = self._member.T @ np.exp(-2.0 * size) * squares + more
+        self._tails = np.where(self._own, freedom / (TAILS + far), 1.0)
+
+    def _weight(self, size: FloatArray) -> FloatArray:
+        """Return the inverse variances (G, P) of the parameters of each group."""
+        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
+
+    def _of(self, sizes: FloatArray) -> FloatArray:
+        """Return the log evidence of log sizes (S, G)."""
+        weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
+        scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
+        seen = (scale * self._vector)[:, :, np.newaxis]
+        fit = (seen * np.linalg.solve(scaled, seen)).sum(axis=(1, 2))
+        volume = 2.0 * np.log(scale).sum(axis=1) - np.linalg.slogdet(scaled)[1]
+        return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))

@@ -1,0 +1,265 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Starting values for unknown base and tool frames, in closed form (docs/model.md).
+
+With the nominal arm K_i = A_1 ... A_n, a measured pose is M_i = T_world_base K_i T_flange_target.
+If orientations hardly vary, the tool's translation is the shortest one, the base takes the rest,
+and rotations come from a registration. A touched plane: n p_K + n R_K t = d is linear in n, n t^T
+and d, or with a given tool it is the plane through the points. Pixels: the pose of the board in
+each image (`resection.py`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib_ros.estimation.identifiability import DEGENERATE, excited, structurally_independent
+from calib_ros.estimation.leastsquares import System, factor_of, minimise, normal_equations
+from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.resection import board_poses
+from calib_ros.estimation.robust import robust_fit, thorough_fit
+from calib_ros.estimation.samples import Samples, residual_arrays
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.lens import require_lens
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray, norms
+from calib_ros.settings import EXCEPTION, Settings
+
+
+def start_frames(
+    chain: Chain,
+    sets: Sequence[Observations],
+    sigma_position: float,
+    sigma_orientation: float,
+    loss: str,
+) -> Chain:
+    """Return the chain with base and tool frames that bring it close to the measurements.
+
+    Sets are processed in order; frames found by earlier sets are kept.
+    """
+    found: set[str] = set()
+    for observations in sets:
+        placed = {name: replace(chain.frame(name), fixed=True) for name in found}
+        known = {**chain.all_frames, **placed}
+        base, tool = observations.base, observations.tool
+        view = replace(chain, base=known[base], tool=known[tool])
+        alone = replace(observations, base='base', tool='tool')
+        if alone.pixels is not None:
+            lens = require_lens(view.frame(alone.camera).lens, alone.camera)
+            share = -(-(int(alone.images[-1]) + 1) // SOME_POSES)
+            alone = board_poses(alone.select(alone.images % share == 0), lens)
+        view = _start_one(view, alone, (sigma_position, sigma_orientation), loss)
+        for key, name in (('base', base), ('tool', tool)):
+            frame = replace(view.frame(key), fixed=chain.frame(name).fixed)
+            chain = chain.with_frame(name, frame)
+        found |= {base, tool}
+    return chain
+
+
+def _start_one(
+    chain: Chain, observations: Observations, sigmas: tuple[float, float], loss: str
+) -> Chain:
+    oriented = bool(observations.oriented.any()) and observations.distances is None
+    every = movable(chain, ('base', 'tool'))
+    names = [name for name in every if oriented or name.owner == 'base' or name.is_length]
+    if not names:
+        return chain
+    if observations.socket:
+        return next(closed_forms(chain, observations))
+    subset = observations.spread()
+    system = System((Samples(subset, *sigmas),))
+    if subset.distances is not None and not subset.plane:
+        start = _trilaterated(chain, flange(chain, subset), subset)
+        lengths = [name for name in names if name.is_length]
+        return thorough_fit(start, lengths, system, loss).fit.chain
+    spread = float(np.sqrt(subset.positions.var(axis=0).sum()))
+    determined: tuple[str, ...] = ()
+    best, least, left = chain, np.inf, np.full_like(subset.positions, np.inf)
+    for starts in _starts(chain, subset):
+        for start in starts:
+            away = norms(residual_arrays(start, subset)[0] - left)
+            if np.median(away) <= EXCEPTION * spread:  # the same valley
+                continue
+            normal = normal_equations(start, names, system)
+            chosen = excited(factor_of(start, names, system, normal), names)
+            known = normal if len(chosen) == len(names) else None
+            fitted = minimise(start, chosen, system, tolerance=1e-3, normal=known).chain
+            residual = residual_arrays(fitted, subset)[0]
+            error = np.median(norms(residual))  # robust
+            if error < least:
+                best, least, determined, left = fitted, error, chosen, residual
+        if least <= EXCEPTION * spread:  # no other valley is as low
+            break
+    return robust_fit(best, determined, system, loss).fit.chain
+
+
+def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain]]:
+    """Yield starts to polish, then further ones if none of those is good."""
+    arm = flange(chain, observations)
+    if observations.plane:
+        yield _on_plane(chain, arm, observations)
+        return
+    yield closed_forms(chain, observations)
+    cube = Rotation.create_group('O').as_matrix()
+    yield (_complete(chain, arm, observations, rotation) for rotation in cube)
+
+
+def flange(chain: Chain, observations: Observations) -> FloatArray:
+    """Return the poses (N, 4, 4) of the bare arm."""
+    arm = replace(chain, base=Frame(), tool=Frame())
+    return arm.forward(observations.joints, observations.approach)
+
+
+def movable(chain: Chain, frames: Iterable[str]) -> list[Parameter]:
+    """Return the parameters of the frames that are not fixed."""
+    return [n for each in frames if not chain.frame(each).fixed for n in parameters_of(each)]
+
+
+def fit_to_arm(
+    chain: Chain,
+    names: Sequence[str],
+    arm: Chain,
+    joints: FloatArray,
+    sigma_orientation: float = Settings.sigma_orientation,
+) -> tuple[Chain, float]:
+    """Return a chain fitted to an arm at joint values (N, n), and the RMS distance [m].
+
+    Of redundant parameters the first are fitted, to exact poses; a turn by `sigma_orientation`
+    [rad] counts as much as a shift by the default sigma.
+    """
+    poses = arm.forward(joints)
+    seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
+    system = System((Samples(seen, Settings.sigma_position, sigma_orientation),))
+    fitted = minimise(chain, structurally_independent(chain, names), system).chain
+    left = fitted.forward(joints)[:, :3, 3] - seen.positions
+    return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def closed_forms(
+    chain: Chain, observations: Observations, arm: FloatArray | None = None
+) -> Iterator[Chain]:
+    """Yield the chain with base and tool for poses, positions or a socket, in closed form.
+
+    `arm` (N, 4, 4) are the poses of the bare arm, if known.
+    """
+    arm = flange(chain, observations) if arm is None else arm
+    for rotation in _closed_form(chain, arm, observations):
+        yield _complete(chain, arm, observations, rotation)
+
+
+def _on_plane(chain: Chain, arm: FloatArray, observations: Observations) -> Iterator[Chain]:
+    """Yield the chain on the plane z = 0 through poses (N, 4, 4), with given and found tool."""
+    assert observations.distances is not None
+    tool = chain.frame('tool')
+    tips = [tool.matrix[:3, 3]]
+    columns = np.column_stack([arm[:, :3, 3], arm[:, :3, :3].reshape(-1, 9), np.ones(len(arm))])
+    if not tool.fixed and len(columns) > columns.shape[1]:  # one touch more than unknowns
+        least = np.linalg.svd(columns, full_matrices=False)[2][-1]
+        normal = least[:3]
+        tips.append(normal @ least[3:12].reshape(3, 3) / max(float(normal @ normal), 1e-12))
+    for tip in tips:
+        points = arm[:, :3, 3] + arm[:, :3, :3] @ tip
+        axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+        axes[2] = np.cross(axes[0], axes[1])
+        place = se3.transform(axes, -axes @ points.mean(axis=0))
+        place[2, 3] += observations.distances.mean()
+        yield _placed(chain, place, se3.transform(tool.matrix[:3, :3], tip))
+
+
+def _placed(chain: Chain, base: FloatArray, tool: FloatArray) -> Chain:
+    """Return the chain with other matrices (4, 4) for frames that are not fixed."""
+    for key, matrix in (('base', base), ('tool', tool)):
+        if not chain.frame(key).fixed:
+            chain = chain.with_frame(key, replace(chain.frame(key), matrix=matrix))
+    return chain
+
+
+def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
+    """Return the chain placed by distances from the world's origin.
+
+    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; distances do not determine the
+    orientation of the base, which stays parallel to the world.
+    """
+    assert observations.distances is not None
+    tool = chain.frame('tool').matrix
+    points = (arm @ tool)[:, :3, 3]
+    columns = np.column_stack([2.0 * points, np.ones(len(points))])
+    wanted = observations.distances**2 - (points**2).sum(axis=1)
+    place = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
+    return _placed(chain, se3.transform(np.eye(3), place), tool)
+
+
+def _closed_form(
+    chain: Chain, arm: FloatArray, observations: Observations
+) -> Iterator[FloatArray]:
+    """Yield rotations of the base (3, 3) from the given frames and closed forms."""
+    if observations.socket:
+        yield np.eye(3)  # the world's axes are the base's
+        return
+    if chain.base is not None:
+        yield chain.base.matrix[:3, :3]
+        if chain.base.fixed:
+            return
+    oriented = observations.oriented
+    if oriented.any():
+        rotations, measured = arm[oriented, :3, :3], observations.rotations[oriented]
+        if chain.tool is not None:
+            tool = chain.tool.matrix[:3, :3]
+            yield se3.nearest_rotation(
+                np.einsum('nij,nkj->ik', measured, rotations @ tool) / len(measured)
+            )
+        system = np.einsum('nji,nlk->ikjl', rotations, measured).reshape(9, 9)
+        matrix = np.linalg.svd(system)[2][0].reshape(3, 3, order='F')
+        sign = np.sign(np.linalg.det(matrix))  # arbitrary in a singular vector
+        yield se3.nearest_rotation(sign * matrix)
+    positions = observations.positions - observations.positions.mean(axis=0)
+    reached = (arm @ chain.frame('tool').matrix)[:, :3, 3]
+    yield se3.nearest_rotation(positions.T @ (reached - reached.mean(axis=0)))
+    if len(arm) >= 16 and chain.tool is None:
+        columns = np.concatenate([arm[:, :3, :3].reshape(-1, 9), arm[:, :3, 3]], axis=1)
+        solution = np.linalg.lstsq(columns - columns.mean(axis=0), positions, rcond=1e-9)[0]
+        yield se3.nearest_rotation(solution[9:].T)
+
+
+def _complete(
+    chain: Chain, arm: FloatArray, observations: Observations, rotation: FloatArray
+) -> Chain:
+    """Return the chain with the rest of its frames in closed form, for a base rotation."""
+    base, tool = chain.frame('base'), chain.frame('tool')
+    base_matrix, tool_matrix = base.matrix.copy(), tool.matrix.copy()
+    oriented = observations.oriented
+    if not base.fixed:
+        base_matrix[:3, :3] = rotation
+    if not tool.fixed and oriented.any():
+        turned = rotation @ arm[oriented, :3, :3]
+        tool_matrix[:3, :3] = se3.nearest_rotation(
+            np.einsum('nji,njk->ik', turned, observations.rotations[oriented])
+        )
+    # p = R_B p_K + R_B R_K t + b, with b and t unknown unless their frame is fixed
+    turned = rotation @ arm[:, :3, :3]
+    wanted = observations.positions - arm[:, :3, 3] @ rotation.T - turned @ tool_matrix[:3, 3]
+    if not tool.fixed:
+        left = wanted - base_matrix[:3, 3] if base.fixed else wanted
+        shift = _shortest(turned, left, not base.fixed)
+        tool_matrix[:3, 3] += shift
+        wanted -= turned @ shift
+    base_matrix[:3, 3] = wanted.mean(axis=0)
+    return _placed(chain, base_matrix, tool_matrix)
+
+
+def _shortest(turned: FloatArray, wanted: FloatArray, free: bool) -> FloatArray:
+    """Return the shortest t (3,) [m] that brings R_i t + b close to wanted (N, 3) [m].
+
+    Zero in directions in which rotations (N, 3, 3) hardly vary. b is arbitrary if `free`, else
+    zero.
+    """
+    if free:
+        turned, wanted = turned - turned.mean(axis=0), wanted - wanted.mean(axis=0)
+    left, sizes, right = np.linalg.svd(turned.reshape(-1, 3), full_matrices=False)
+    known = sizes > DEGENERATE * np.sqrt(len(turned))
+    return np.asarray(right[known].T @ ((wanted.ravel() @ left)[known] / sizes[known]))

@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Nothing is accepted that does not make the arm better."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import SIGMAS, UR10E, measured_arm
+
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics.chain_file import load_chain
+
+pytestmark = pytest.mark.usefixtures('unsearched')
+
+
+def test_held_out_pairs_never_influence_the_fit():
+    rng, true, seen = measured_arm(8, 50, (1e-4, 1e-4))
+    other = measure(true, UR10E.random_joints(50, rng), rng, 1.0, 1.0)
+    first, second = (identify(Problem(UR10E, seen, held_out=each)) for each in (seen, other))
+    np.testing.assert_array_equal(first.chain.table, second.chain.table)
+    assert not second.accepted
+
+
+def test_no_gain_is_claimed_where_there_is_none():
+    by_chance = 0
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        arm = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
+        seen = measure(arm, UR10E.random_joints(40, rng), rng, 1e-4, 3e-4)
+        result = identify(Problem(UR10E, seen))
+        assert not result.accepted
+        (text,) = [str(each) for each in result.refusals if each.rule is Rule.GAIN]
+        before, after = result.validation.figures
+        assert text.startswith('no gain on held-out poses beyond chance')
+        assert ('; with 40 poses chance' in text) == (after.rms_mm < before.rms_mm)
+        by_chance += after.rms_mm < before.rms_mm
+    assert by_chance
+
+
+def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():
+    rng = np.random.default_rng(17)
+    true = faulty(UR10E, Cell(), rng)
+    few = UR10E.random_joints(7, rng)
+    laps = measure(true, np.tile(few, (10, 1)), rng, 2e-4, 2e-3)
+    assert len(np.unique(laps.configurations)) == 7
+    result = identify(Problem(UR10E, laps))
+    assert not result.accepted
+    assert any('too few poses' in text for text in result.refusals)
+
+
+def test_what_another_robot_leaves_is_never_accepted():
+    """Seeded arms of another kind with the same number of joints, some of which fit by chance."""
+    other, nominal = load_chain('franka_panda'), load_chain('kuka_iiwa14')
+    for seed in (3, 16):
+        rng = np.random.default_rng(seed)
+        true = faulty(other, Cell(), rng)
+        seen = measure(true, other.random_joints(60, rng), rng, 5e-5, 2e-4)
+        assert not identify(Problem(nominal, seen)).accepted
+
+
+TOLERANCES = {'*.a': 5e-4, '*.d': 5e-4, '*.alpha': 1e-3, '*.theta': 1e-3, '*.beta': 1e-3}
+
+
+@pytest.mark.parametrize(
+    ('oriented', 'count', 'share'), [(True, 6, 0.4), (False, 8, 0.5), (False, 10, 0.2)]
+)
+def test_few_poses_and_manufacturing_tolerances_are_judged_by_leaving_out_one(
+    oriented, count, share
+):
+    """Six poses hold as many equations as needed without priors and none to judge by.
+
+    One arm's lengths err alike by chance, as a device that is out of scale makes them.
+    """
+    accepted, nominal_errors, errors, estimates, sigmas = [], [], [], [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        q, unseen = UR10E.random_joints(count, rng), UR10E.random_joints(300, rng)
+        seen = measure(true, q, rng, 5e-5, 2e-4, oriented)
+        sigmas_given = {'sigma_position': 5e-5, 'sigma_orientation': 2e-4}
+        result = identify(Problem(UR10E, seen, priors=TOLERANCES, **sigmas_given))
+        accepted.append(result.accepted)
+        assert not result.outliers
+        assert result.validated_by.startswith(f'{count}-fold')
+        wanted = true.forward(unseen)[:, :3, 3]
+        for chain, found in ((result.before, nominal_errors), (result.chain, errors)):
+            error = chain.forward(unseen)[:, :3, 3] - wanted
+            found.append(1e3 * np.sqrt((error**2).sum(axis=1).mean()))
+        estimates.append(result.validation.figures[1].rms_mm)
+        sigmas.append(1e3 * np.sqrt((result.predicted_sigma() ** 2).mean()))
+    assert sum(accepted) >= 5
+    assert np.max(np.divide(errors, nominal_errors)) < share
+    # the estimate by fits to one pose less is cautious, the predicted sigma is right
+    assert 1.0 < np.median(np.divide(estimates, errors)) < 2.5
+    # of effects that so few poses cannot refute it takes account
+    assert 0.4 < np.median(np.divide(errors, sigmas)) < 1.35
+
+
+@pytest.mark.parametrize('priors', [{}, {'*.a': 0.05, '*.alpha': 0.1}])
+def test_few_poses_without_priors_that_say_anything_stay_refused(priors):
+    rng = np.random.default_rng(0)
+    true = faulty(UR10E, Cell(), rng)
+    for seen in (
+        measure(true, UR10E.random_joints(6, rng), rng, 5e-5, 2e-4),
+        measure(true, UR10E.random_joints(10, rng), rng, 5e-5, oriented=False),
+    ):
+        result = identify(Problem(UR10E, seen, priors=priors))
+        assert not result.accepted
+        assert result.validation is None
+
+
+def test_few_poses_and_priors_of_an_arm_without_errors_gain_nothing():
+    accepted = 0
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        true = replace(UR10E, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
+        seen = measure(true, UR10E.random_joints(8, rng), rng, 5e-5, 2e-4)
+        accepted += identify(Problem(UR10E, seen, priors=TOLERANCES)).accepted
+    assert accepted <= 2  # of 10 by a one-sided test of 95 %
+
+
+def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing():
+    """Of half a metre, it grows by the millimetres that the arm is corrected by, or shrinks."""
+    _, _, seen = measured_arm(5, 40, oriented=False)
+    clean = identify(Problem(UR10E, seen, **SIGMAS)).fitted
+    correction = (clean.before.position - clean.after.position)[20]
+    positions = seen.positions.copy()
+    positions[20] -= 0.4 * correction / np.linalg.norm(correction)
+    result = identify(Problem(UR10E, replace(seen, positions=positions), **SIGMAS))
+    before, after = result.validation.figures_of_all
+    assert after.rms_mm > 1.005 * before.rms_mm
+    assert after.mean_mm < before.mean_mm
+    assert result.accepted

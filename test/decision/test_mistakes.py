@@ -1,0 +1,357 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Mistakes that are named. `benchmarks/mistakes.py` tries all of them on measured robots."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.mistakes import explained
+from calib_ros.decision.suspects import QUARTERS, dead
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain_file import load_chain
+
+UR = load_chain('ur10e')
+
+
+def seen_of(chain=UR, seed=1, count=40, oriented=True):
+    rng = np.random.default_rng(seed)
+    true = faulty(chain, Cell(), rng)
+    return measure(true, chain.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+
+
+def joints(change):
+    return lambda each: replace(each, joints=change(each.joints))
+
+
+def turned(order):
+    return lambda each: replace(
+        each, rotations=se3.from_quat(se3.to_quat(each.rotations)[:, order])
+    )
+
+
+def later(each):
+    short = each.select(np.arange(len(each) - 1))
+    return replace(short, joints=each.joints[1:])
+
+
+def rewritten(read, written, size=1.0):
+    """Angles about x, y and z, or a rotation vector (''), are written and read otherwise."""
+
+    def change(each):
+        turns = Rotation.from_matrix(each.rotations)
+        angles = turns.as_rotvec()
+        if written:
+            angles = turns.as_euler(written)[:, [written.index(axis) for axis in 'XYZ']]
+        made = Rotation.from_rotvec(size * angles)
+        if read:
+            in_turn = size * angles[:, ['XYZ'.index(axis) for axis in read]]
+            made = Rotation.from_euler(read, in_turn)
+        return replace(each, rotations=made.as_matrix())
+
+    return change
+
+
+def _in_turn(rotations):
+    angles = Rotation.from_matrix(rotations).as_euler('ZYX')
+    return Rotation.from_euler('XYZ', angles).as_matrix()
+
+
+COUPLED = np.eye(6)
+COUPLED[2, 1] = 1.0
+SIGNS = np.array([1.0, 1.0, -1.0, 1.0, 1.0, 1.0])
+QUARTER = np.array([0.0, 0.0, 0.0, 0.5 * np.pi, 0.0, 0.0])
+SPOILT = {
+    'mm': (lambda e: replace(e, positions=1e3 * e.positions), '--length mm'),
+    'degrees': (joints(np.degrees), '--joint-angle deg'),
+    'both': (
+        lambda e: replace(e, positions=1e3 * e.positions, joints=np.degrees(e.joints)),
+        '--length mm --joint-angle deg',
+    ),
+    'wxyz': (turned([3, 0, 1, 2]), '--quaternion wxyz'),
+    'transposed': (
+        lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)),
+        '--columns qx=-qx,qy=-qy,qz=-qz',
+    ),
+    'Euler order': (rewritten('XYZ', 'ZYX'), '--euler ZYX, '),
+    'Euler columns': (
+        lambda e: replace(e, rotations=_in_turn(e.rotations)),
+        '--euler ZYX with r1, r2, r3 (now rx, ry, rz)',
+    ),
+    'vectors': (rewritten('XYZ', ''), '--rotation-vector'),
+    'no vectors': (rewritten('', 'XYZ'), '--euler XYZ'),
+    'Euler radians': (rewritten('ZXY', 'ZXY', np.radians(1.0)), '--angle rad'),
+    'vectors in radians': (rewritten('', '', np.radians(1.0)), '--angle rad'),
+    'orientations': (rewritten('', '', np.degrees(1.0)), 'the orientations do not: check'),
+    'Euler order and mm': (
+        lambda e: replace(rewritten('XYZ', 'ZYX')(e), positions=1e3 * e.positions),
+        'in mm, not metres, and the orientations do not fit either: --length mm',
+    ),
+    'inverse': (lambda e: replace(e.inverted(), inverse=False), '--eye-in-hand (or --inverse'),
+    'eye in hand': (lambda e: e.inverted(), 'leave out --eye-in-hand'),
+    'left-handed': (
+        lambda e: replace(
+            e,
+            positions=e.positions * [1, -1, 1],
+            rotations=np.diag([1.0, -1, 1]) @ e.rotations @ np.diag([1.0, -1, 1]),
+        ),
+        'y=-y',
+    ),
+    'sign': (joints(lambda q: SIGNS * q), 'q3=-q3'),
+    'zero': (joints(lambda q: q + QUARTER), 'q4=q4-1.57079632679489'),
+    'swapped': (joints(lambda q: q[:, [0, 1, 2, 4, 3, 5]]), 'q4=q5,q5=q4'),
+    'coupled': (joints(lambda q: q @ COUPLED.T), 'q3=q3-q2'),
+    'shift': (later, '--shift -1'),
+}
+
+
+TWO = ('shoulder_lift_joint', 'wrist_2_joint')
+TWO_SIGNS, TWO_UNITS = (np.array([1.0, each, 1.0, 1.0, each, 1.0]) for each in (-1, 180.0 / np.pi))
+PUBLISHED = {
+    'orientations': 'check the orientations where they are published',
+    'both': 'correct it where it is published',
+    'inverse': 'set eye_in_hand=true in sources',
+    'sign': 'sign: -1 in the chain file',
+    'zero': 'theta -90 degrees in the chain file',
+    'swapped': 'swap them in joint_names',
+    'shift': 'check the stamps',
+}
+POSITIONS_TELL = ('mm', 'left-handed', 'sign', 'coupled')
+
+
+@pytest.mark.parametrize(
+    ('mistake', 'oriented'),
+    [*((name, True) for name in SPOILT), *((name, False) for name in POSITIONS_TELL)],
+)
+def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
+    change, remedy = SPOILT[mistake]
+    found = explained(Problem(UR, change(seen_of(oriented=oriented))))
+    assert remedy in str(found)
+    assert len(found.suspects) <= 2
+    assert 5.0 * found.corrected < found.given
+    published = ' -- '.join(each.published for each in found.suspects)
+    assert PUBLISHED.get(mistake, '') in published  # what is said of messages
+    assert '--' not in published.replace(' -- ', '')
+
+
+def test_a_wrong_order_of_angles_is_named_where_the_tool_hardly_turns():
+    rng = np.random.default_rng(1)
+    q = np.array([0.3, -1.4, 1.6, 0.0, -1.5, 0.2]) + 0.1 * rng.uniform(-1.0, 1.0, (40, 6))
+    q[:, :3] += rng.uniform(-0.5, 0.5, (40, 3))
+    q[:, 3] -= np.pi / 2 + q[:, 1] + q[:, 2]
+    q[:, 5] += q[:, 0]
+    seen = measure(faulty(UR, Cell(), rng), q, rng, 5e-5, 2e-4)
+    turn = seen.rotations[0].T
+    near_none = replace(seen, rotations=turn @ seen.rotations, positions=seen.positions @ turn.T)
+    found = explained(Problem(UR, rewritten('ZYX', 'XYZ')(near_none)))
+    assert '--euler XYZ, ' in str(found)
+
+
+SEVERAL = {
+    'two signs': (
+        joints(lambda q: TWO_SIGNS * q),
+        [f'{name} counts the other way round (sign: -1 in the chain file)' for name in TWO],
+    ),
+    'two units': (
+        joints(lambda q: TWO_UNITS * q),
+        [f'{name} is in degrees, the other joints in radians' for name in TWO],
+    ),
+    'sign and zero, in mm': (
+        lambda e: replace(e, joints=SIGNS * e.joints + QUARTER, positions=1e3 * e.positions),
+        (
+            'the positions are in mm, not metres (--length mm)',
+            'elbow_joint counts the other way round (sign: -1 in the chain file)',
+            'wrist_1_joint has its zero 90 degrees away (theta -90 degrees in the chain file)',
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ('mistakes', 'oriented'),
+    [
+        ('two signs', True),
+        ('two units', True),
+        ('two units', False),
+        ('sign and zero, in mm', False),
+    ],
+)
+def test_mistakes_made_at_once_are_named(mistakes, oriented):
+    change, said = SEVERAL[mistakes]
+    found = str(explained(Problem(UR, change(seen_of(oriented=oriented)))))
+    assert found.startswith('several mistakes at once: ')
+    for each in said:
+        assert each in found
+
+
+def test_a_joint_with_another_sign_and_zero_is_named():
+    seen = seen_of(oriented=False)
+    turned = replace(seen, joints=SIGNS * seen.joints + np.eye(6)[2] * np.pi / 2)
+    found = str(explained(Problem(UR, turned)))
+    assert 'elbow_joint counts the other way round and has its zero 90 degrees away' in found
+    assert 'sign: -1 and theta +90 degrees in the chain file, or --columns q3=-q3+1.5' in found
+
+
+@pytest.mark.parametrize(
+    ('travel', 'positions', 'remedy'),
+    [
+        (1e3, 1e3, '--length mm'),
+        (1e3, 1.0, '--columns q1=q1*0.001'),
+        (1.0, 1e3, '--columns x=x*0.001,y=y*0.001,z=z*0.001'),
+    ],
+)
+def test_linear_joints_in_millimetres_are_named(travel, positions, remedy):
+    rail = load_chain('ur10e_on_linear_axis')
+    seen = seen_of(rail)
+    sizes = [travel if joint.type == 'prismatic' else 1.0 for joint in rail.joints]
+    spoilt = replace(seen, joints=seen.joints * sizes, positions=positions * seen.positions)
+    assert remedy in str(explained(Problem(rail, spoilt)))
+
+
+def test_another_robot_and_the_other_convention_are_named():
+    seen = seen_of()
+    assert '--chain ur10e' in str(explained(Problem(load_chain('ur5e'), seen)))
+    other = replace(UR, convention='modified', parallel=None)
+    assert 'convention: standard' in str(explained(Problem(other, seen)))
+
+
+def test_a_chain_file_in_millimetres_is_named():
+    rows = tuple(replace(joint, a=1e3 * joint.a, d=1e3 * joint.d) for joint in UR.joints)
+    named = identify(Problem(replace(UR, joints=rows), seen_of())).refusals[0]
+    assert 'the lengths of the chain file are in mm, not metres' in named
+
+
+@pytest.mark.parametrize(('stated', 'remarks'), [(0.1, 0), (0.01, 1)])
+def test_orientations_that_do_not_fit_are_a_remark_where_the_rest_is_accepted(stated, remarks):
+    """Of a small target, say: 0.1 rad; nothing is said if that is what was stated."""
+    rng = np.random.default_rng(1)
+    true = faulty(UR, Cell(), rng)
+    seen = measure(true, UR.random_joints(40, rng), rng, 5e-5, 0.1)
+    found = identify(Problem(UR, seen, sigma_position=5e-5, sigma_orientation=stated))
+    assert found.accepted
+    assert len([each for each in found.remarks if 'orientations do not' in each]) == remarks
+
+
+def test_another_robot_in_messages_is_named_as_the_chain_to_set():
+    problem = Problem(load_chain('ur5e'), seen_of(), of_messages=True)
+    assert 'set chain (--chain) to ur10e (' in str(explained(problem))
+
+
+def test_large_errors_of_an_arm_are_no_mistake():
+    rng = np.random.default_rng(0)
+    true = faulty(UR, Cell(5e-3, 1e-2), rng)
+    seen = measure(true, UR.random_joints(60, rng), rng, 5e-5, oriented=False)
+    assert identify(Problem(UR, seen)).accepted
+
+
+def test_where_nothing_is_wrong_nothing_is_said(rng):
+    poses, places = (seen_of(oriented=oriented) for oriented in (True, False))
+    mixed = replace(poses, joints=rng.permutation(poses.joints))
+    noisy = replace(places, positions=places.positions + rng.normal(scale=0.2, size=(40, 3)))
+    for seen in (poses, places, mixed, noisy):
+        assert explained(Problem(UR, seen)) is None
+
+
+def test_motor_angles_of_a_small_arm_are_refused_whatever_its_error():
+    """Around one posture the fit halves the errors of a few millimetres, on poses left out too."""
+    rows = (
+        {'a': 0.045, 'alpha': 0.5 * np.pi, 'd': 0.12},
+        {'a': 0.165, 'theta': 1.2},
+        {'a': 0.18, 'alpha': 0.5 * np.pi, 'theta': -1.2},
+        {'d': 0.045},
+    )
+    small = Chain('small', 'standard', tuple(Joint(f'j{k + 1}', **r) for k, r in enumerate(rows)))
+    rng = np.random.default_rng(1)
+    q = rng.uniform(-0.5, 0.5, 4) + rng.uniform(-0.06, 0.06, (30, 4))
+    seen = measure(faulty(small, Cell(1e-4, 2e-4), rng), q, rng, 5e-5, 2e-4)
+    seen.joints[:, 2] += seen.joints[:, 1]
+    result = identify(Problem(small, seen))
+    before, after = result.validation.figures
+    assert after.rms_mm < 0.7 * before.rms_mm < 10.0
+    assert '--columns q3=q3-q2' in result.refusals[0]
+
+
+def test_mistakes_are_named_where_some_orientations_are_missing():
+    seen = seen_of()
+    some = np.arange(len(seen)) % 2 == 0
+    partly = replace(seen, oriented=some, positions=1e3 * seen.positions)
+    assert '--length mm' in str(explained(Problem(UR, partly)))
+
+
+def test_quarters_are_what_their_names_say():
+    assert {float(name): np.degrees(angle) for name, angle in QUARTERS.items()} == pytest.approx(
+        {90.0: 90.0, -90.0: -90.0, 180.0: 180.0}
+    )
+
+
+def test_good_results_are_not_searched(monkeypatch):
+    from calib_ros.decision import mistakes
+
+    monkeypatch.setattr(mistakes, 'explained', None)
+    assert identify(Problem(UR, seen_of())).accepted
+
+
+@pytest.mark.parametrize(
+    ('row', 'lost', 'where'), [(9, 'positions', 'below'), (31, 'joints', 'above')]
+)
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_row_lost_in_one_of_two_tables_is_named(row, lost, where, oriented):
+    """Joint values and measurements were put side by side, row by row."""
+    seen = seen_of(oriented=oriented)
+    without = np.delete(np.arange(len(seen)), row)
+    measured = seen.select(without if lost == 'positions' else slice(-1))
+    kept = seen.joints[:-1] if lost == 'positions' else seen.joints[without]
+    result = identify(Problem(UR, replace(measured, joints=kept)))
+    assert not result.accepted
+    assert result.refusals[0].startswith(
+        f'from pose {row + 1} on the joint values stand 1 row {where} their measurement'
+    )
+
+
+@pytest.mark.parametrize('count', [20, 40])
+def test_shuffled_rows_have_not_lost_one(count):
+    rng = np.random.default_rng(count)
+    seen = seen_of(count=count)
+    found = explained(Problem(UR, replace(seen, joints=seen.joints[rng.permutation(count)])))
+    assert found is None
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('joint', [0, 2, 5])
+def test_one_joint_in_another_unit_than_the_others_is_named(joint, oriented):
+    seen = seen_of(seed=5, count=60, oriented=oriented)
+    for factor, words in (
+        (np.degrees(1.0), 'is in degrees, the other joints in radians'),
+        (np.radians(1.0), 'is in radians, the other joints in degrees'),
+    ):
+        mixed = seen.joints.copy()
+        mixed[:, joint] *= factor
+        said = str(explained(Problem(UR, replace(seen, joints=mixed))))
+        assert said.startswith(f'{UR.joint_names[joint]} {words}: --columns q{joint + 1}=')
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize(('columns', 'words'), [([1], 'y'), ([0, 2], 'x, z')])
+def test_columns_that_never_change_are_named(columns, words, oriented):
+    seen = seen_of(seed=5, count=60, oriented=oriented)
+    places = seen.positions.copy()
+    places[:, columns] = places[0, columns]
+    result = identify(Problem(UR, replace(seen, positions=places)))
+    assert f'all positions have the same {words}, though' in result.refusals[0]
+    assert f'was the column {words} recorded' in result.refusals[0]
+
+
+def test_a_planar_arm_square_to_the_device_has_no_dead_column():
+    ends = {'lower': -2.5, 'upper': 2.5}
+    chain = Chain('flat', 'standard', tuple(Joint(f'j{k}', a=0.3, **ends) for k in range(3)))
+    rng = np.random.default_rng(0)
+    q = chain.random_joints(40, rng)
+    seen = measure(chain, q, rng, 0.0, 0.0, oriented=False)
+    assert np.ptp(seen.positions[:, 2]) == 0.0
+    assert dead(chain, (seen,)) is None

@@ -1,0 +1,279 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+from fits import UR10E, arm, rms
+
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.simulation import measure
+from calib_ros.decision.region import region_of_record
+from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.calibration import Calibration, load_calibration
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.jacobian import orientation_error
+from calib_ros.report.words import as_document, summary
+
+pytestmark = pytest.mark.usefixtures('unsearched')
+HOME = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])
+
+
+def around(seed, reach, count=60):
+    """Return joint values (count, 6) within `reach` [rad] of a posture."""
+    return HOME + np.random.default_rng(seed + 50).uniform(-reach, reach, (count, 6))
+
+
+def identified(true, q, seed=0):
+    seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
+    return identify(Problem(UR10E, seen))
+
+
+def with_a_still_joint(seed, reach):
+    """Return joint values (60, 6) with the elbow within `reach` [rad] of HOME."""
+    q = UR10E.random_joints(60, np.random.default_rng(seed))
+    q[:, 2] = HOME[2] + np.random.default_rng(seed).uniform(-reach, reach, 60)
+    return q
+
+
+@pytest.fixture(scope='module')
+def local():
+    """Return an arm whose elbow stood still."""
+    return identified(arm(0), with_a_still_joint(0, 3e-4))
+
+
+@pytest.fixture
+def folder(local, tmp_path):
+    path = tmp_path / 'out'
+    path.mkdir()
+    (path / 'calibration.yaml').write_text(Calibration.of(local).dump())
+    (path / 'result.json').write_text(json.dumps(as_document(local, {})))
+    return path
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
+    q = UR10E.random_joints(60, np.random.default_rng(seed))
+    found = identified(arm(seed), q, seed)
+    assert found.accepted
+    assert found.region.whole
+    assert found.region.covers(UR10E.random_joints(50, np.random.default_rng(1))).all()
+    q = UR10E.random_joints(7, np.random.default_rng(1))
+    for wrong in (q[0], q[:, :5], q.T):  # one answer a row, or none
+        with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+            found.region.covers(wrong)
+        with pytest.raises(ConfigError, match=r'must have the shape \(N, 6\)'):
+            found.pose_covariance(wrong)
+    for level in (0.0, 1.0, 95):
+        with pytest.raises(ConfigError, match='level must be between 0 and 1'):
+            found.confidence_ellipsoid(q, level)
+    assert 'valid over the whole joint range' in summary(found)
+    for share, text in ((0.0, 'under 1'), (0.4, '40'), (0.999, '99')):
+        part = replace(found.region, limit=1e-3, share=share).in_words()
+        assert f'in {text} % of the joint range; elsewhere it may make the arm worse' in part
+    assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
+
+
+@pytest.mark.parametrize('way', ['fixed', 'priors'])
+@pytest.mark.parametrize('seed', range(3))
+def test_what_is_held_nominal_is_not_known(seed, way):
+    true, q = arm(seed), with_a_still_joint(seed, 0.0)
+    seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
+    still = identify(Problem(UR10E, seen)).not_excited
+    assert still
+    held = {'fixed': still} if way == 'fixed' else {'priors': dict.fromkeys(still, 1e-3)}
+    found = identify(Problem(UR10E, seen, **held))
+    assert found.accepted
+    assert not found.region.whole
+    everywhere = UR10E.random_joints(500, np.random.default_rng(1))
+    near = everywhere[found.region.covers(everywhere)]
+    assert rms(found.chain, true, near) < rms(found.before, true, near)
+    left = found.chain.forward(near)[:, :3, 3] - true.forward(near)[:, :3, 3]
+    assert np.mean((left**2).sum(axis=1) / found.region.sigma(near) ** 2) < 2.0
+
+
+@pytest.mark.parametrize('errors', [0.1, 1.0, 10.0])
+@pytest.mark.parametrize('reach', [3e-4, 1e-3, 1e-2])
+def test_a_joint_that_hardly_moved_is_no_worse_where_it_may_be_used(reach, errors):
+    seed = int(errors == 1.0)
+    true = arm(seed, errors)
+    q = with_a_still_joint(seed, reach)
+    found = identified(true, q, seed)
+    assert found.accepted or errors < 1.0
+    if not found.accepted:
+        return
+    assert found.region.covers(q).all()
+    other = UR10E.random_joints(1000, np.random.default_rng(3))
+    used = other[found.region.covers(other)]
+    assert len(used)
+    assert rms(found.chain, true, used) < rms(found.before, true, used)
+
+
+@pytest.mark.parametrize('seed', [2, 4, 5])
+def test_a_coupling_that_hardly_shows_near_a_posture_is_not_fitted_for_elsewhere(seed):
+    """The joint values are those of motors: the sixth lacks a hundredth of the fifth's turn."""
+    name = 'wrist_3_joint.coupling_wrist_2_joint'
+    true = arm(seed, 0.1).with_effects([name]).with_offsets({name: -1e-2})
+    rng = np.random.default_rng(seed)
+    posture = rng.uniform(-1.5, 1.5, 6)
+    found = identified(true, posture + rng.uniform(-0.4, 0.4, (60, 6)))
+    assert found.accepted
+    rng = np.random.default_rng(3)
+    other = [rng.uniform(-2.5, 2.5, (2000, 6)), posture + rng.uniform(-0.8, 0.8, (500, 6))]
+    used, near = (each[found.region.covers(each)] for each in other)
+    assert len(near) > 200
+    used = np.concatenate([used, near])
+    assert rms(found.chain, true, used) < rms(found.before, true, used)
+
+
+def test_what_a_still_joint_leaves_open_is_not_covered(local):
+    region, q = local.region, with_a_still_joint(0, 3e-4)
+    assert not region.whole
+    away = q - np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0])
+    assert region.covers(q).all()
+    assert region.covers(away).mean() < 0.5
+    assert np.median(region.sigma(away)) > 2.0 * np.median(region.sigma(q))
+    other = region.covers(UR10E.random_joints(2000, np.random.default_rng(4)))
+    assert region.share == pytest.approx(other.mean(), abs=0.1)
+
+
+@pytest.mark.parametrize('group', ['eccentricity', 'gravity'])
+@pytest.mark.parametrize('seed', range(2))
+def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
+    """Measured on one side of an arm that has what the model lacks."""
+    names = effects.members(UR10E, group)
+    rng = np.random.default_rng(seed)
+    size = {'eccentricity': 2e-4, 'gravity': 3e-4}[group]
+    values = rng.normal(scale=size, size=len(names)).tolist()
+    true = arm(seed).with_effects(names).with_effect_values(dict(zip(names, values, strict=True)))
+    q = UR10E.random_joints(500, rng)
+    left = (se3.invert(true.base.matrix) @ true.forward(q))[:, 0, 3] < 0.0
+    found = identified(true, q[left][:60], seed)
+    other = q[~left]
+    axes = found.confidence_ellipsoid(other)
+    error = (found.chain.forward(other) - true.forward(other))[:, :3, 3]
+    squares = (axes**2).sum(axis=2)
+    inside = ((np.einsum('nij,nj->ni', axes, error) / squares) ** 2).sum(axis=1) <= 1.0
+    assert (inside | ~found.region.covers(other)).mean() >= 0.9
+    assert rms(found.chain, true, other) < rms(found.before, true, other)
+    turned = orientation_error(
+        *(each.trace(each.effective(q.T))[0] for each in (found.chain, true))
+    )
+    known = Calibration.of(found).sigma_turned(q)
+    assert np.sqrt(np.mean(np.sum(turned**2, axis=0)) / np.mean(known**2)) < 1.25
+
+
+@pytest.mark.parametrize('name', ['ur10e', 'ur10e_on_linear_axis'])
+def test_a_device_with_a_scale_does_not_calibrate_a_healthy_arm(name):
+    healthy = load_chain(name)
+    q = healthy.random_joints(60, np.random.default_rng(1))
+    seen = measure(healthy, q, np.random.default_rng(8), 5e-5, 2e-4)
+    found = identify(Problem(healthy, replace(seen, positions=seen.positions * (1.0 + 5e-4))))
+    assert not found.accepted
+    assert found.region is None
+    assert as_document(found, {})['region'] is None
+
+
+def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
+    """The ellipsoids hold 95 % of the positions, also where the prior alone tells the errors."""
+    held, ratios = [], []
+    for seed in range(18):
+        rng = np.random.default_rng(seed)
+        q = UR10E.random_joints(20, rng)
+        q[:, 1 + seed % 4] = HOME[1 + seed % 4] + rng.uniform(-3e-3, 3e-3, len(q))
+        true = arm(seed)
+        found = identified(true, q, seed)
+        other = UR10E.random_joints(300, rng)
+        used = other[found.region.covers(other)]
+        if not len(used):
+            continue
+        error = (found.chain.forward(used) - true.forward(used))[:, :3, 3]
+        axes = found.confidence_ellipsoid(used)
+        along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
+        held.append(((along**2).sum(axis=1) <= 1.0).mean())
+        ratios.append((error**2).sum(axis=1).mean() / (found.region.sigma(used) ** 2).mean())
+    assert len(held) > 12
+    assert np.mean(held) > 0.9
+    assert np.mean(ratios) < 1.25
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_a_device_out_of_scale_does_not_spoil_an_arm_of_small_errors(seed):
+    """A scale of 0.8 per mille is the device's, not eight lengths all too long by chance."""
+    rng = np.random.default_rng(seed)
+    seen = measure(arm(seed, 0.1), UR10E.random_joints(40, rng), rng, 5e-5, 2e-4)
+    found = identify(Problem(UR10E, replace(seen, positions=seen.positions * (1.0 + 8e-4))))
+    assert not found.accepted
+    assert found.posterior.sizes['scale'] == pytest.approx(8e-4, rel=0.3)
+    assert identify(Problem(UR10E, seen)).accepted
+
+
+@pytest.mark.parametrize(
+    'change',
+    [
+        {'limit': 'wide'},
+        {'limit': -1.0},
+        {'limit': [1.0]},
+        {'share': 2.0},
+        {'share': None},
+        {'names': ['no_joint.a']},
+        {'names': None},
+        {'root': ['1.0']},
+        {'root': []},
+        {'root': 3},
+        {'root': [[1.0]]},
+        {'base': 'nowhere'},
+    ],
+)
+def test_a_damaged_region_is_refused(local, change):
+    record = {'region': local.region.document() | change}
+    with pytest.raises((ConfigError, UnknownNameError), match=r'here: calibration\.region'):
+        region_of_record(record, local.chain, 'here')
+
+
+@pytest.mark.parametrize('what', ['yes', 3, ['limit'], {}, {'limit': None}])
+def test_what_is_no_region_is_refused(what):
+    with pytest.raises(ConfigError, match=r'here: calibration\.region is damaged'):
+        region_of_record({'region': what}, UR10E, 'here')
+
+
+def test_a_calibration_without_a_region_is_still_read(folder):
+    path = folder / 'calibration.yaml'
+    document = yaml.safe_load(path.read_text())
+    for key in ('region', 'software', 'created'):  # by hand: calib_ros always writes them
+        del document['calibration'][key]
+    path.write_text(yaml.safe_dump(document))
+    assert load_calibration(path, UR10E).region is None
+
+
+def missed(command, wanted):
+    """Return the RMS distance [m] of the true arm's flange from where the nominal one would be."""
+    true = replace(arm(0), base=Frame(), tool=Frame())
+    error = (true.forward(command) - UR10E.forward(wanted))[:, :3, 3]
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def test_programs_are_corrected_inside_the_region_only(local, folder):
+    inside = around(2, 0.1, 15)
+    other = UR10E.random_joints(50, np.random.default_rng(0))
+    outside = other[~local.region.covers(other)][:5]
+    assert local.region.covers(inside).all()
+    refused = []
+    for calibration in (local, load_calibration(folder, UR10E)):
+        compensator = Compensator(UR10E, calibration.chain, region=calibration.region)
+        result = compensate(compensator, inside)
+        assert not result.refusals
+        assert missed(result.joints, inside) < 0.2 * missed(inside, inside)
+        result = compensate(compensator, np.concatenate([inside, outside]))
+        refused.append([each.sample for each in result.refusals if 'not valid' in each.reason])
+        first = min(each.reason for each in result.refusals if 'not valid' in each.reason)
+        assert 'not valid in 25 % of the program' in first
+        said = f'valid at most {1e3 * local.region.limit:.3f} mm; identify again'
+        assert first.endswith(f'{said} with poses near it')
+    assert refused == [list(range(15, 20))] * 2

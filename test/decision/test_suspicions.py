@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import rms
+
+from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.decision.reasons import Rule
+from calib_ros.decision.suspicions import _common, scale_of
+from calib_ros.errors import ConfigError
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics.chain import Chain, Frame, Joint
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.words import as_document, summary
+
+UR = load_chain('ur10e')
+GRAVITY = {
+    'shoulder_lift_joint.gravity_wrist_3_joint': 4e-4,
+    'elbow_joint.gravity_wrist_3_joint': 3e-4,
+}
+
+
+def seen_of(true, seed=0, count=60, oriented=True):
+    rng = np.random.default_rng(seed)
+    return measure(true, true.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+
+
+def scaled(observations, ppm):
+    return replace(observations, positions=observations.positions * (1.0 + 1e-6 * ppm))
+
+
+def arm(seed=0, errors=1.0, chain=UR):
+    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
+    return faulty(chain, cell, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14'])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_the_scale_of_a_device_is_found(name, oriented):
+    chain = load_chain(name)
+    seen = seen_of(arm(0, 0.0, chain), oriented=oriented)
+    problem = Problem(chain, scaled(seen, 3000.0))
+    result = identify(problem)
+    scale, std, freedom = scale_of(problem, result)
+    assert abs(scale - 3e-3) < 4.0 * std
+    assert std < 5e-5
+    assert freedom >= 4
+    assert not result.accepted
+    assert any('alike, by 0.3 %' in each for each in result.refusals)
+
+
+def test_growth_that_arms_have_is_said_and_not_refused():
+    """An arm 10 degrees warmer has the same 230 ppm as a device's wrong metre.
+
+    Where it has no other errors nothing is gained for sure (`region.py`).
+    """
+    result = identify(Problem(UR, scaled(seen_of(arm(errors=0.0)), 230.0)))
+    assert result.region is None
+    assert not any('alike' in each for each in result.refusals)
+    (remark,) = result.remarks
+    assert 'grow alike' in remark
+    assert remark in summary(result)
+    assert as_document(result, {})['remarks'] == [remark]
+
+
+def test_offsets_that_scatter_hide_a_scale():
+    """The scale is as uncertain as the arm's own offsets make it, and honestly so."""
+    rng, held = np.random.default_rng(0), []
+    growth = rng.uniform(0.1, 0.6, 9)
+    for _ in range(2000):
+        offsets = 1e-3 * growth + rng.normal(scale=5e-4, size=9)
+        scale, std, freedom = _common(offsets, growth, 1e-10 * np.eye(9))
+        held.append(abs(scale - 1e-3) < 2.306 * std)
+        assert freedom == 8
+    assert np.mean(held) == pytest.approx(0.95, abs=0.015)
+
+
+@pytest.mark.parametrize('errors', [0.1, 1.0, 3.0])
+def test_healthy_and_faulty_arms_are_not_suspicious(errors):
+    for seed in range(4):
+        result = identify(Problem(UR, seen_of(arm(seed, errors), seed, oriented=seed % 2 == 0)))
+        assert result.remarks == ()
+        assert result.accepted
+
+
+def test_a_sister_is_named():
+    true = arm(0, 0.2, load_chain('ur10'))
+    result = identify(Problem(UR, seen_of(true)))
+    (remark,) = result.remarks
+    assert 'the arm is a ur10, not a ur10e: --chain ur10' in remark
+    near = UR.with_offsets({f'{UR.joint_names[1]}.a': 0.006})
+    (remark,) = identify(Problem(near, seen_of(arm(0, 0.2)))).remarks
+    assert 'closer to the supplied ur10e (' in remark
+    assert 'is it the right chain file?' in remark
+
+
+@pytest.mark.parametrize(('gravity', 'axis'), [((9.81, 0, 0), 'x'), ((0, -9.81, 0), 'y')])
+def test_an_arm_on_a_wall_is_noticed(gravity, axis):
+    bent = arm(1).with_effects(list(GRAVITY)).with_offsets(GRAVITY)
+    seen = seen_of(replace(bent, gravity=gravity), count=120)
+    result = identify(Problem(UR, seen, effects=('gravity',)))
+    assert f'gravity along {axis} of the base explains' in ''.join(result.remarks)
+    right = Problem(replace(UR, gravity=gravity), seen, effects=('gravity',))
+    assert identify(right).remarks == ()
+
+
+@pytest.mark.parametrize('sigma', [0.05, 5e-3])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_sigmas_in_millimetres_are_named(sigma, oriented):
+    """They make the arm's errors smaller than any noise: nothing else may be blamed for it."""
+    seen = seen_of(arm(3), count=40, oriented=oriented)
+    sigmas = {'sigma_position': sigma, 'sigma_orientation': 4.0 * sigma}
+    result = identify(Problem(UR, seen, **sigmas))
+    said = result.remarks[-1] if result.accepted else result.refusals[0]
+    assert f'sigma_position is {sigma:g} m, and only' in said
+    assert said.count('meant?') == 1 + oriented
+    assert result.accepted or result.refusals[0].rule is Rule.MISTAKE
+    for good in (5e-5, 5e-4):
+        sigmas = {'sigma_position': good, 'sigma_orientation': 4.0 * good}
+        result = identify(Problem(UR, seen, **sigmas))
+        assert result.accepted
+        assert not any('sigma' in each for each in result.remarks)
+
+
+def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
+    seen = seen_of(arm(), count=40)
+    turned = replace(seen, joints=seen.joints * [1, 1, 1, 1, 1, -1])
+    result = identify(Problem(UR, turned, sigma_position=0.1, sigma_orientation=0.4))
+    first, *_, last = result.refusals
+    assert first.startswith('wrist_3_joint counts the other way round')
+    assert last.startswith('sigma_position is 0.1 m, and only')
+
+
+@pytest.mark.parametrize('turns', [5e-3, 1e-2])
+def test_orientations_far_worse_than_their_sigma_are_named(turns):
+    """Of a camera or a small rigid body of markers: by default they spoil the positions."""
+    rng, true = np.random.default_rng(4), arm(4)
+    seen = measure(true, UR.random_joints(40, rng), rng, 1e-4, turns)
+    result = identify(Problem(UR, seen))
+    said = result.remarks[-1] if result.accepted else result.refusals[0]
+    assert 'the orientations outweigh the positions and spoil them' in said
+    value = float(said.rpartition(' ')[2])
+    assert value == pytest.approx(turns, rel=0.2)
+    mended = identify(Problem(UR, seen, sigma_orientation=value))
+    assert mended.accepted
+    assert not any('sigma' in each for each in mended.remarks)
+    q = UR.random_joints(300, rng)
+    assert rms(mended.chain, true, q) < 0.4 * rms(result.chain, true, q)
+
+
+def test_covariances_in_square_millimetres_are_named():
+    wrong = np.tile(np.diag([2.5e-3] * 3 + [4e-8] * 3), (60, 1, 1))
+    result = identify(Problem(UR, replace(seen_of(arm(3)), covariance=wrong)))
+    assert not result.accepted
+    assert result.refusals[0].rule is Rule.MISTAKE
+    assert 'by the covariances the position is known to 0.05 m, and only' in result.refusals[0]
+
+
+def test_motor_angles_are_noticed():
+    coupled = {'wrist_3_joint.coupling_wrist_2_joint': 2e-3}
+    seen = seen_of(arm().with_effects(list(coupled)).with_offsets(coupled))
+    (remark,) = identify(Problem(UR, seen)).remarks
+    assert 'couplings of the last joints explain' in remark
+    assert (
+        identify(Problem(UR, seen, effects=('coupling',), priors={'*.coupling_*': 0.01})).remarks
+        == ()
+    )
+
+
+def test_couplings_that_the_model_lacks_are_uncertainty_elsewhere(unsearched):
+    wrist = ('wrist_3_joint.coupling_wrist_2_joint', 'wrist_2_joint.coupling_wrist_1_joint')
+    coupled = dict(zip(wrist, (2e-3, 1e-3), strict=True))
+    true = arm().with_effects(list(coupled)).with_offsets(coupled)
+    rng = np.random.default_rng(0)
+    near, far = 0.5 * UR.random_joints(60, rng), UR.random_joints(300, rng)
+    result = identify(Problem(UR, measure(true, near, rng, 5e-5, 2e-4)))
+    error = (true.forward(far) - result.chain.forward(far))[:, :3, 3]
+    axes = result.confidence_ellipsoid(far)
+    along = np.einsum('nki,ni->nk', axes, error) / (axes**2).sum(axis=2)
+    assert ((along**2).sum(axis=1) < 1.0).mean() > 0.9
+
+
+ROWS = ({'d': 0.5, 'a': 0.2, 'alpha': -np.pi / 2}, {'a': 0.7}, {'a': 0.6}, {'a': 0.1})
+FOUR = Chain(
+    'four',
+    'standard',
+    tuple(Joint(f'j{k}', lower=-2.5, upper=2.5, **row) for k, row in enumerate(ROWS)),
+)
+
+
+@pytest.mark.parametrize('seed', range(1, 5))
+def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
+    """By positions alone four joints hold so few lengths that no test is certain of the scale."""
+    rng = np.random.default_rng(seed)
+    true = faulty(FOUR, Cell(length_error=3e-4, angle_error=6e-4), rng)
+    seen = measure(true, FOUR.random_joints(60, rng), rng, 5e-5, oriented=False)
+    right = Problem(FOUR, seen, sigma_position=5e-5)
+    assert identify(right).accepted
+    wrong = replace(right, observations=scaled(seen, -3000.0))
+    result = identify(wrong)
+    (refusal,) = result.refusals
+    assert refusal.rule is Rule.SCALE
+    assert 'lengths of the arm shrink alike' in refusal
+    assert 'set sigma_scale' in refusal
+    q = FOUR.random_joints(300, rng)
+    nominal = replace(FOUR, base=true.base, tool=true.tool)
+    assert rms(result.chain, true, q) > rms(nominal, true, q)
+    checked = identify(replace(wrong, sigma_scale=1e-5))
+    assert checked.accepted
+    assert not any('sigma_scale' in each for each in checked.remarks)
+
+
+def test_the_scale_of_a_device_is_a_number():
+    with pytest.raises(ConfigError, match=r'sigma_scale must be from 0 to 1, not -0\.1'):
+        Problem(FOUR, seen_of(arm()), sigma_scale=-0.1)
+
+
+POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+@pytest.mark.parametrize('errors', [0.0, 0.5])
+def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, errors):
+    rng, camera = np.random.default_rng(3), Camera()
+    true = before_camera(arm(3, errors), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
+    off = camera.lens.moved({'fx': 13.5, 'fy': 13.5, 'cx': 8.0, 'cy': -6.0})
+    near = camera.lens.moved({'fx': 4.0, 'fy': 4.0, 'cx': 3.0, 'cy': -2.0})
+    told = {'--lens fitted': False, 'lens=fitted in sources': True}
+    for lens in (camera.lens, near, off, replace(off, fixed=False)):
+        chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=lens))
+        for words, of_messages in told.items():
+            result = identify(Problem(chain, seen, sigma_pixel=0.1, of_messages=of_messages))
+            refused, remarked = (
+                [str(each) for each in said if words in str(each)]
+                for said in (result.refusals[:1], result.remarks)
+            )
+            harmful = lens is off or (lens is near and errors == 0.0)
+            assert bool(refused) == harmful
+            assert bool(remarked) == (lens is near and errors > 0.0)
+            assert result.accepted == (errors > 0.0 and not harmful)
+
+
+def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little():
+    """An arm follows so much of a wrong lens that less than half is left for other intrinsics."""
+    rng, camera = np.random.default_rng(5), Camera()
+    true = before_camera(arm(5, 0.2), camera, POINTS, False, rng)
+    seen = photograph(true, camera, POINTS, False, 25, rng, 0.1)
+    off = camera.lens.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 3.0))
+    for lens, refused in ((camera.lens, False), (off, True)):
+        chain = UR.with_frame('base', Frame(lens=lens))
+        result = identify(Problem(chain, seen, sigma_pixel=0.1))
+        assert result.accepted == (not refused)
+        assert any('--lens fitted' in each for each in result.refusals) == refused
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+def test_a_board_that_is_stretched_is_told(on_flange):
+    rng, camera = np.random.default_rng(3), Camera()
+    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
+    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
+    for stated, said in (
+        ([1.0, 1.0, 1.0], ''),
+        ([1.005, 1.005, 1.0], ''),
+        ([1.005, 1.0, 1.0], 'narrower'),
+        ([1.0, 1.005, 1.0], 'wider'),
+    ):
+        result = identify(Problem(chain, replace(seen, points=seen.points * stated)))
+        told = [each for each in result.remarks if 'for its height than stated' in each]
+        assert bool(told) == bool(said)
+        assert all(re.match(rf'the board is 0\.[345]\d? % {said}', each) for each in told)

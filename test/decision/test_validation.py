@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Figures, intervals and folds against what is known of them exactly."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fits import UR10E, measured_arm
+from scipy import stats
+
+from calib_ros.decision import validation
+from calib_ros.decision.validation import (
+    Comparison,
+    Residuals,
+    compare,
+    left_out,
+    log_gain,
+    residuals,
+)
+from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.parameter import Parameter
+
+NOWHERE = np.full((4, 2), np.nan)
+
+
+def errors_of(position, orientation=None, pixels=NOWHERE):
+    turns = np.full((4, 3), np.nan) if orientation is None else orientation
+    return Residuals(position, turns, np.arange(4), pixels)
+
+
+def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
+    position = 1e-3 * np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 1.0], [2.0, 2.0, 1.0], [9.0, 0, 0]])
+    turns = np.full((4, 3), np.nan)
+    turns[:2] = [[3e-3, 0.0, 4e-3], [0.0, 1e-3, 0.0]]
+    pixels = NOWHERE.copy()
+    pixels[2] = [3.0, -4.0]
+    which = np.array([True, True, True, False])
+    found = errors_of(position, turns, pixels).figures(which)
+    lengths = np.array([5.0, 1.0, 3.0])
+    assert (found.count, found.max_mm) == (3, pytest.approx(5.0))
+    assert found.rms_mm == pytest.approx(np.sqrt(35.0 / 3.0))
+    assert found.mean_mm == pytest.approx(3.0)
+    assert found.mean_plus_3_sigma_mm == pytest.approx(3.0 + 3.0 * lengths.std(ddof=1))
+    assert found.rms_mrad == pytest.approx(np.sqrt(13.0))
+    assert found.rms_px == pytest.approx(5.0)
+    bare = errors_of(position).figures(~which)
+    assert (bare.rms_mm, bare.rms_mrad, bare.rms_px) == (pytest.approx(9.0), None, None)
+    comparison = Comparison(errors_of(2.0 * position), errors_of(position), which)
+    assert comparison.outliers == 1
+    assert [each.count for each in comparison.figures] == [3, 3]
+    assert [each.max_mm for each in comparison.figures_of_all] == pytest.approx([18.0, 9.0])
+    assert comparison.deciding.tolist() == which.tolist()
+    repeated = np.array([False, True, False, False])
+    assert replace(comparison, repeated=repeated).deciding.tolist() == [True, False, True, False]
+
+
+def row(name, offset, std, freedom=np.inf):
+    return ParameterRow(Parameter(f'elbow_joint.{name}'), 1.0, offset, std, 'fitted', freedom)
+
+
+def test_intervals_are_students_and_limits_are_those_of_their_kind():
+    assert row('a', 0.0, 2.0).half_width() == pytest.approx(2.0 * stats.norm.ppf(0.975), rel=1e-6)
+    few = row('a', 0.0, 2.0, 5.0)
+    assert few.half_width() == pytest.approx(2.0 * stats.t.ppf(0.975, 5), rel=1e-9)
+    assert few.half_width(0.5) == pytest.approx(2.0 * stats.t.ppf(0.75, 5), rel=1e-9)
+    assert row('a', 0.0, None).half_width() is None
+    for name, beyond in (
+        ('a', (True, False)),
+        ('theta', (False, True)),
+        ('ratio', (False, False)),
+    ):
+        limits = ((0.4, 0.6), (0.6, 0.4))
+        assert tuple(row(name, -0.5, 0.01).beyond(*each) for each in limits) == beyond
+    assert row('a', 0.5, 0.09).beyond(0.2, 1.0)
+    assert not row('a', 0.5, 0.11).beyond(0.2, 1.0)  # three deviations reach it
+    assert not row('a', 0.5, None).beyond(0.2, 1.0)
+
+
+def test_a_gain_is_that_of_configurations_and_chance_by_students_t():
+    """Pairs of one configuration count as one; what was not measured does not count."""
+    rng = np.random.default_rng(0)
+    before, after = rng.normal(size=(2, 9, 3)) * [[[2.0]], [[1.0]]]
+    numbers = np.array([3, 3, 0, 0, 0, 5, 6, 7, 7])
+    before[8, 1] = np.nan
+    means = np.array(
+        [
+            [(each[[k]] ** 2).sum() / len(k) for each in (before, after)]
+            for k in ([2, 3, 4], [0, 1], [5], [6], [7])
+        ]
+    )
+    gain, limit = log_gain(before, after, numbers, 0.9)
+    total = means.mean(axis=0)
+    assert gain == pytest.approx(0.5 * np.log(total[0] / total[1]))
+    deviation = (means[:, 1] / total[1] - means[:, 0] / total[0]).std(ddof=1)
+    expected = 0.5 * stats.t.ppf(0.9, 4) * deviation / np.sqrt(5.0)
+    assert limit == pytest.approx(expected)
+    assert log_gain(before, after, numbers)[1] == pytest.approx(
+        expected * stats.t.ppf(0.95, 4) / stats.t.ppf(0.9, 4)
+    )
+    assert log_gain(before[:2], after[:2], numbers[:2]) == (0.0, np.inf)
+    assert log_gain(before[1:3], after[1:3], numbers[1:3])[1] < np.inf
+
+
+def test_every_pair_is_judged_by_the_chains_of_its_fold():
+    """In the order of the pairs, set by set, whatever that of the folds."""
+    rng, _, seen = measured_arm(0, 11)
+    sets = [seen.select(np.arange(7)), replace(seen.select(np.arange(7, 11)), base='base_B')]
+    folds = [rng.permutation(np.arange(7) % 3), np.array([2, 0, 0, 2])]
+    groups = [np.arange(7), np.arange(20, 24)]
+    base = UR10E.with_frame('base_B', UR10E.frame('base'))
+    chains = [
+        tuple(base.with_offsets({'elbow_joint.a': 1e-3 * (2 * k + side)}) for side in range(2))
+        for k in range(3)
+    ]
+    before, after = left_out(chains, sets, groups, folds)
+    for side, found in enumerate((before, after)):
+        expected = []
+        for each, numbers in zip(sets, folds, strict=True):
+            for k, fold in enumerate(numbers):
+                expected.append(residuals(chains[fold][side], each.select(np.array([k]))))
+        np.testing.assert_allclose(
+            found.position, np.concatenate([each.position for each in expected]), atol=1e-15
+        )
+        np.testing.assert_allclose(
+            found.orientation, np.concatenate([each.orientation for each in expected]), atol=1e-12
+        )
+        np.testing.assert_array_equal(found.configurations, np.concatenate(groups))
+
+
+def test_a_distance_is_an_error_along_one_axis():
+    *_, seen = measured_arm(0, 5)
+    longer = np.linalg.norm(UR10E.forward(seen.joints)[:, :3, 3], axis=1) + 1e-3
+    wire = replace(seen, distances=longer, oriented=np.zeros(5, dtype=bool))
+    both = compare(UR10E, UR10E, [seen, wire])
+    assert both.judged.all()
+    np.testing.assert_array_equal(both.before.position, both.after.position)
+    np.testing.assert_allclose(both.after.position[5:], np.tile([1e-3, 0, 0], (5, 1)), atol=1e-12)
+    assert np.isnan(both.after.orientation[5:]).all()
+    np.testing.assert_array_equal(both.after.configurations, np.tile(np.arange(5), 2))
+
+
+@pytest.mark.parametrize(
+    ('count', 'rows', 'names', 'known', 'wanted'),
+    [
+        (40, 240, 30, 0, 5),  # as many as asked for
+        (4, 24, 3, 0, 4),  # no more than configurations
+        (10, 60, 40, 0, 5),  # 48 equations of four parts for 40, and eight to spare
+        (10, 60, 41, 0, 0),
+        (10, 60, 41, 1, 10),  # priors tell one: each configuration by itself
+        (10, 60, 47, 1, 10),  # 54 of nine for 46, and eight
+        (10, 60, 48, 1, 0),
+        (1, 60, 2, 1, 0),
+    ],
+)
+def test_folds_leave_enough_to_fit_and_some_to_spare(count, rows, names, known, wanted):
+    """Parameters of effects have priors and count for nothing."""
+    problem = SimpleNamespace(
+        model=SimpleNamespace(effects=(('elbow_joint.ratio', 0.0),)),
+        folds=5,
+        informed=frozenset(f'p{k}' for k in range(known)),
+    )
+    every = [*(f'p{k}' for k in range(names)), 'elbow_joint.ratio']
+    assert validation._folds(problem, every, count, rows) == wanted
+
+
+def test_held_out_pairs_at_fitted_configurations_are_repeated():
+    *_, seen = measured_arm(0, 12)
+    first, second = seen.select(np.arange(5)), seen.select(np.arange(5, 8))
+    held_out = [seen.select(np.array([9, 3, 10])), seen.select(np.array([6, 11]))]
+    problem = Problem(UR10E, first, more=(replace(second, base='base_B'),), held_out=held_out)
+    assert validation._repeated(problem).tolist() == [False, True, False, True, False]
+    assert not len(validation._repeated(replace(problem, held_out=None)))
+    judged, text = validation.validate(
+        replace(problem, loss='none'), problem.model, problem.model, [], None
+    )
+    said = '5 held-out poses; those that repeat fitted poses (2) do not count for acceptance'
+    assert text == said
+    assert judged.deciding.tolist() == [True, False, True, False, True]
+
+
+def test_places_a_known_distance_apart_are_one():
+    problem = SimpleNamespace(
+        sets=[SimpleNamespace(base=base) for base in 'abcabde'],
+        separations=[('a', 'c', 1.0), ('c', 'a', 1.0), ('e', 'd', 2.0), ('d', 'a', 1.0)],
+    )
+    assert validation._places(problem) == [{'b'}, {'a', 'c', 'd', 'e'}]

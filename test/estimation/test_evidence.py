@@ -1,0 +1,307 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NO_PRIOR, UR10E, arm, rms
+
+from calib_ros.apply.simulation import measure
+from calib_ros.estimation import evidence
+from calib_ros.estimation.considered import considered
+from calib_ros.estimation.evidence import Posterior, _device, group_of
+from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics.parameter import Parameter
+
+pytestmark = pytest.mark.usefixtures('unsearched')
+EFFECTS = [name for group in ('eccentricity', 'gravity') for name in effects.members(UR10E, group)]
+
+
+def spread(seed, reach=2.5, count=60):
+    return np.random.default_rng(seed + 50).uniform(-reach, reach, (count, 6))
+
+
+def problem_of(true, q, seed=0, noise=1.0, **more):
+    rng = np.random.default_rng(seed + 7)
+    return Problem(UR10E, measure(true, q, rng, noise * 5e-5, noise * 2e-4), **more)
+
+
+def whole_range(chain, true):
+    """Return the RMS position error [m] over the joint range, after the best base and tool."""
+    q = np.random.default_rng(99).uniform(-2.5, 2.5, (200, 6))
+    wanted = measure(true, q, np.random.default_rng(0))
+    frames = [name for name in chain.parameter_names if chain.owns_frame(name)]
+    fit = minimise(chain, frames, System((Samples(wanted, 1e-4, 1e-2),)))
+    error = fit.chain.forward(q)[:, :3, 3] - wanted.positions
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def moved_a_little(seed, reach):
+    """Return joint values (60, 6) with the elbow within `reach` [rad]."""
+    q = spread(seed)
+    q[:, 2] = 1.0 + np.random.default_rng(seed).uniform(-reach, reach, 60)
+    return q
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_parameters_that_the_data_determine_stay_where_they_are(seed):
+    given = problem_of(arm(seed), spread(seed), seed)
+    free = identify(replace(given, priors=NO_PRIOR))
+    found = identify(given)
+    assert found.names == free.names
+    for ours, theirs in zip(found.parameters, free.parameters, strict=True):
+        if ours.std is not None and not UR10E.owns_frame(ours.name):
+            assert abs(ours.offset - theirs.offset) < 0.05 * theirs.std, ours.name
+
+
+@pytest.mark.parametrize('reach', [3e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize('seed', range(2))
+def test_a_joint_that_hardly_moved_does_no_harm(reach, seed):
+    true = arm(seed)
+    given = problem_of(true, moved_a_little(seed, reach), seed)
+    found = identify(given)
+    free = identify(replace(given, priors=NO_PRIOR))
+    error = whole_range(found.chain, true)
+    assert error < whole_range(found.before, true)
+    assert error < whole_range(free.chain, true) / 3.0
+    assert any(name.startswith('elbow_joint') for name in (*found.weak, *found.not_excited))
+
+
+@pytest.mark.parametrize('errors', [0.1, 1.0, 10.0])
+@pytest.mark.parametrize('seed', range(2))
+def test_the_size_of_the_errors_is_found(errors, seed):
+    true = arm(seed, errors)
+    found = identify(problem_of(true, spread(seed), seed))
+    assert found.accepted
+    for group, lengths in (('length', True), ('angle', False)):
+        offsets = [
+            true.offset(name, UR10E)
+            for name in found.names
+            if not UR10E.owns_frame(name) and Parameter(name).is_length == lengths
+        ]
+        ratio = found.posterior.sizes[group] / np.sqrt(np.mean(np.square(offsets)))
+        assert 0.5 < ratio < 2.0
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_one_gross_offset_is_not_shrunk(seed):
+    true = arm(seed).with_offsets({'elbow_joint.theta': 17e-3})
+    found = identify(problem_of(true, spread(seed), seed))
+    parameter = next(p for p in found.parameters if p.name == 'elbow_joint.theta')
+    assert abs(parameter.offset - true.offset('elbow_joint.theta', UR10E)) < 4.0 * parameter.std
+    assert found.posterior.sizes['angle'] < 2e-3
+
+
+def test_one_gross_offset_is_not_shrunk_where_the_poses_hardly_determine_it():
+    """The elbow moved by 0.1 rad: a normal prior of the others' size would hold its offset."""
+    true = arm(0, 0.3).with_offsets({'shoulder_lift_joint.theta': 17e-3})
+    q = spread(0)
+    q[:, 1] = -1.0 + 0.04 * q[:, 1]
+    found = identify(problem_of(true, q))
+    parameter = next(p for p in found.parameters if p.name == 'shoulder_lift_joint.theta')
+    assert abs(parameter.offset - true.offset(parameter.name, UR10E)) < 4.0 * parameter.std
+    assert abs(parameter.offset) > 14e-3
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_a_healthy_arm_has_small_errors_and_is_not_accepted(seed):
+    found = identify(problem_of(arm(seed, 0.0), spread(seed), seed))
+    assert not found.accepted
+    assert found.posterior.sizes['length'] < 2e-5
+    assert found.posterior.sizes['angle'] < 5e-5
+
+
+@pytest.mark.parametrize(('reach', 'least', 'most'), [(2.5, 0.0, 0.01), (0.15, 0.2, 2.0)])
+@pytest.mark.parametrize('seed', range(2))
+def test_effects_are_of_the_usual_size_where_the_data_cannot_refute_them(seed, reach, least, most):
+    found = identify(problem_of(arm(seed), spread(seed, reach), seed))
+    for group in ('drive', 'gravity'):
+        assert least <= found.posterior.sizes[group] / TYPICAL[group] < most
+
+
+def test_effects_that_an_arm_has_are_considered_with_their_size():
+    values = np.random.default_rng(3).normal(scale=3e-4, size=len(EFFECTS)).tolist()
+    true = arm(0).with_effects(EFFECTS)
+    true = true.with_effect_values(dict(zip(EFFECTS, values, strict=True)))
+    found = identify(problem_of(true, spread(0)))
+    more = {str(name) for name in considered(found.chain, found.names)}
+    assert {name for name in more if '.coupling_' not in name} == set(EFFECTS)
+    assert set(EFFECTS) < set(found.posterior.names)
+    told = found.posterior
+    assert 1e-4 < told.sizes['drive'] < 1e-3
+    nearer = told.chain.with_offsets(dict(zip(told.names, told.shift, strict=True)))
+    q = UR10E.random_joints(200, np.random.default_rng(1))
+    assert rms(nearer, true, q) < 0.5 * rms(found.chain, true, q)
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_a_joint_that_moves_in_outliers_only_is_told_by_its_prior(seed):
+    """Without them the fit to the rest would be singular, and the noise found nonsense."""
+    rng = np.random.default_rng(seed)
+    q = spread(seed)
+    q[15:, 0] = q[15, 0]
+    problem = problem_of(arm(seed), q, seed)
+    positions = problem.observations.positions
+    positions[:15] += rng.normal(scale=0.05, size=(15, 3))
+    seen = Observations.from_arrays(q, positions)
+    result = identify(replace(problem, observations=seen))
+    assert {outlier.sample for outlier in result.outliers} == set(range(15))
+    rest = identify(replace(problem, observations=seen.select(np.arange(15, 60))))
+    assert result.noise.position == pytest.approx(rest.noise.position, rel=1e-3)
+    assert not result.accepted
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_what_few_parameters_tell_is_judged_by_other_sizes_as_well(seed):
+    """Several sizes may be, and none is taken that all parameters refute."""
+    few = identify(problem_of(arm(seed), spread(seed, 0.1, 15), seed)).posterior
+    many = identify(problem_of(arm(seed), spread(seed), seed)).posterior
+    for told in (few, many):
+        assert sum(weight for weight, _, _ in told.doubted) == pytest.approx(1.0)
+    name = next(n for n in many.names if n.endswith('.theta') and n in few.names)
+    spans = [
+        np.ptp(
+            [
+                np.sqrt(cov[told.names.index(name), told.names.index(name)])
+                for _, _, cov in told.doubted
+            ]
+        )
+        for told in (few, many)
+    ]
+    assert spans[0] > 10.0 * spans[1]
+
+
+def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual_they_are():
+    """One group up and down at a time; a group of no size and the device's scale stay."""
+    found = object.__new__(Evidence)
+    found._names = ('length', 'angle', 'drive', 'scale')
+    found._typical = np.log([TYPICAL['length'], TYPICAL['angle'], TYPICAL['drive'], 1.0])
+    found._of = lambda tried: 0.3 * (tried - found._typical)[:, 0]
+    size = np.add(found._typical, [0.5, -0.3, -50.0, 0.0])
+    told = found.near(size, np.array([2.0, 8.0, 1.0, 1.0]))
+    assert sum(weight for weight, _ in told) == pytest.approx(1.0)
+    for k, step in ((0, 1.0), (1, 0.5)):
+        (more, up), (less, down) = told[2 * k : 2 * k + 2]
+        for each, sign in ((up, 1.0), (down, -1.0)):
+            np.testing.assert_allclose(each[:2], (size + sign * step * np.eye(4)[k])[:2])
+        ends = [((each - found._typical) / np.log(SPREAD)) ** 2 for each in (up, down)]
+        likely = 0.3 * (up - down)[0] - 0.5 * (ends[0] - ends[1]).sum()
+        assert more / less == pytest.approx(np.exp(likely))
+        assert more + less == pytest.approx(0.5)
+
+
+def test_a_rival_has_the_size_that_is_asked_for(rng):
+    root, vector = rng.normal(size=(9, 5)), rng.normal(size=5)
+    groups, typical = [None, 'length', 'length', 'angle', 'scale'], [1.0, 2.0, 0.5]
+    names = ('length', 'angle', 'scale')
+    found = Evidence(
+        root.T @ root, vector, np.zeros(5), groups, dict(zip(names, typical, strict=True))
+    )
+    _, precision = found.rival('scale', 0.25, np.log(typical), set())
+    assert precision[[0, 4]].tolist() == [0.0, 16.0]
+    assert (precision[1:4] > 0.0).all()
+
+
+def told(rng, size=3):
+    names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta')[:size]
+    root, other = rng.normal(size=(2, size, size))
+    return Posterior(
+        UR10E,
+        names,
+        rng.normal(size=size),
+        rng.normal(size=size),
+        root @ root.T,
+        rng.normal(size=(size, 2)),
+        {'elbow_joint.a': 2.0, 'elbow_joint.theta': 0.5},
+        {'length': 3e-4, 'angle': 1e-3},
+        ((0.25, rng.normal(size=size), other @ other.T), (0.75, np.zeros(size), np.eye(size))),
+    )
+
+
+def test_what_is_held_nominal_is_as_uncertain_as_others_are(rng):
+    """The fitted parameters, before considered ones, follow; of usual size if no size is known."""
+    before, slopes = told(rng), np.array([[0.5, 1.0], [-2.0, 0.0]])
+    before = replace(before, sizes={'length': 3e-4})
+    after = before.held_at(('wrist_1_joint.d', 'wrist_1_joint.beta'), slopes)
+    assert after.names == (*before.names, 'wrist_1_joint.d', 'wrist_1_joint.beta')
+    along = np.array([[0.5, -2.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0, 1.0]])
+    change = after.covariance - np.pad(before.covariance, (0, 2))
+    wanted = along.T @ np.diag([3e-4**2, 1e-3**2]) @ along
+    np.testing.assert_allclose(change, wanted, atol=1e-15)
+    for (w, m, c), (weight, mean, covariance) in zip(after.doubted, before.doubted, strict=True):
+        assert w == weight
+        np.testing.assert_array_equal(m, [*mean, 0.0, 0.0])
+        np.testing.assert_allclose(c - np.pad(covariance, (0, 2)), change, atol=1e-12)
+    for whole, part in ((after.offsets, before.offsets), (after.shift, before.shift)):
+        np.testing.assert_array_equal(whole, [*part, 0.0, 0.0])
+    np.testing.assert_array_equal(after.device, [*before.device, [0.0, 0.0], [0.0, 0.0]])
+
+
+def test_the_expected_error_is_that_of_shift_and_covariance(rng):
+    """By central differences; and what share of its variance a prior has is that of both."""
+    found = told(rng)
+    q = UR10E.random_joints(2, rng)
+    columns = []
+    for name in found.names:
+        less, more = (UR10E.with_offsets({name: step}).forward(q) for step in (-1e-6, 1e-6))
+        turn = se3.log_rotation(more[:, :3, :3] @ np.swapaxes(less[:, :3, :3], 1, 2))
+        columns.append(np.concatenate([(more - less)[:, :3, 3], turn], axis=1) / 2e-6)
+    rows = np.stack(columns, axis=2)
+    square = found.covariance + np.outer(found.shift, found.shift)
+    expected = np.einsum('nip,pq,njq->nij', rows, square, rows)
+    np.testing.assert_allclose(found.expected(q), expected, rtol=0, atol=1e-6)
+    assert found.held('base.x') == 0.0
+    assert found.held('elbow_joint.theta') == pytest.approx(found.covariance[2, 2] / 0.25)
+
+
+def test_errors_are_of_one_size_by_group():
+    for name, group in (
+        ('base.x', None),
+        ('elbow_joint.a', 'length'),
+        ('elbow_joint.beta', 'angle'),
+        ('elbow_joint.ratio', 'drive'),
+        ('elbow_joint.sin_1', 'drive'),
+        ('wrist_1_joint.coupling_elbow_joint', 'coupling'),
+        ('elbow_joint.gravity_wrist_1_joint', 'gravity'),
+    ):
+        assert group_of(UR10E, name) == group
+
+
+def test_what_another_device_adds_is_what_marginalising_leaves(rng):
+    """With a scale of its own and smooth errors, against the inverse of the whole matrix."""
+    count, size = 4, 7  # a scale, and two smooth errors after the arm's parameters
+    rows = rng.normal(size=(40, size))
+    whole = rows.T @ rows
+    precision = rng.uniform(0.5, 2.0, count + 1)
+    inner = count + 1
+    cross, doubtful = whole[:inner, inner:], whole[inner:, inner:] + np.eye(2)
+    matrix = whole[:inner, :inner]
+    found = _device(matrix, cross, doubtful, precision, count)
+    full = np.block([[matrix + np.diag(precision), cross], [cross.T, doubtful]])
+    alone = np.linalg.inv(full[:count, :count])
+    expected = np.linalg.inv(full)[:count, :count] - alone
+    np.testing.assert_allclose(found @ found.T, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_only_what_is_fitted_is_doubted(monkeypatch):
+    """Of joint values that were rounded, those whose parameters are not fitted tell nothing."""
+
+    class AskedError(Exception):
+        pass
+
+    def products_with_doubts(chain, names, system, noise, beside, *_):
+        assert (noise, beside) == (2.0, {'elbow_joint.theta': 1e-3})
+        raise AskedError
+
+    monkeypatch.setattr(evidence, 'products_with_doubts', products_with_doubts)
+    doubts = {'elbow_joint.theta': 1e-3, 'wrist_1_joint.theta': 2e-3}
+    with pytest.raises(AskedError):
+        evidence.posterior_of(
+            UR10E, UR10E, ['base.x', 'elbow_joint.theta'], System(()), 2.0, {}, doubts=doubts
+        )

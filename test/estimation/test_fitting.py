@@ -1,0 +1,207 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a fit does before and after its least squares: priors that guard it, rows, statuses."""
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fits import UR10E, measured_arm
+
+from calib_ros.apply.simulation import random_frame
+from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.estimation import fitting
+from calib_ros.estimation.fitting import SOME, Simpler, parameter_rows
+from calib_ros.estimation.identifiability import Uncertainty
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.kinematics import se3
+
+
+def seen(count=12):
+    return measured_arm(0, count)[2]
+
+
+def noise(size, consistent=False, widened=1.0):
+    return Noise(size, size, consistent, 0.0, 0.0, (), widened, size)
+
+
+@pytest.mark.parametrize(
+    ('size', 'widened', 'told'), [(6.0, 1.5, 2.0), (3.0, 2.0, 1.0), (0.8, 1.0, 0.8), (1.8, 1.0, 1)]
+)
+def test_what_the_model_lacks_weighs_priors_in_part(size, widened, told):
+    """What neighbours do not share, over two; never below the sigmas given, or the noise found."""
+    assert fitting._noise_for_priors(noise(size, widened=widened), None) == pytest.approx(told)
+    assert fitting._noise_for_priors(noise(size, True, widened), None) == size
+    assert fitting._noise_for_priors(noise(size, widened=widened), SimpleNamespace()) == size
+
+
+def test_only_what_is_told_worse_than_common_sense_is_guarded():
+    problem = Problem(UR10E, seen(), priors={'wrist_1_joint.a': 1.0})
+    names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta', 'wrist_1_joint.a', 'wrist_1_joint.d')
+    length, angle = 0.05 / 3.0, 0.1 / 3.0
+    stds = np.array([1.0, 1.1 * length, 0.9 * angle, 1.0, 0.9 * angle])
+    found = fitting._guarded(problem, names, np.diag(1.0 / stds), None)
+    assert found.learned.noise == 1.0
+    assert found.learned.priors == pytest.approx(
+        {'elbow_joint.a': length, 'wrist_1_joint.d': length}
+    )
+    good = np.eye(5) / np.array([1.0, 0.9 * length, 0.9 * angle, 1.0, 0.9 * length])
+    assert fitting._guarded(problem, names, good, None) is problem
+    simpler = Simpler(UR10E, (), noise(4.0))
+    assert fitting._guarded(problem, names, good, simpler).learned == Learned({}, 2.0)
+    learned = replace(problem, learned=Learned({'base.x': 7.0}, 3.0))
+    again = fitting._guarded(learned, names, np.diag(1.0 / stds), None).learned
+    assert again.noise == 3.0
+    assert set(again.priors) == {'base.x', 'elbow_joint.a', 'wrist_1_joint.d'}
+    assert fitting._guarded(learned, names, good, simpler) is learned
+
+
+def test_fewer_equations_than_parameters_are_refused():
+    """Of configurations, not of pairs: twice the same tells no more."""
+    twice = seen(4).select(np.repeat(np.arange(4), 2))
+    points = replace(twice, oriented=np.zeros(8, dtype=bool), base='base_B')
+    problem = Problem(UR10E, twice, more=(points,))
+    fitting._require_enough(problem, ['x'] * 36)
+    with pytest.raises(TooFewObservationsError) as caught:
+        fitting._require_enough(problem, ['x'] * 37)
+    assert (caught.value.configurations, caught.value.needed) == (8, 7)
+    empty = replace(problem, more=(points.select(np.zeros(0, dtype=int)),))
+    with pytest.raises(InputError, match='no pairs to fit between base_B and tool'):
+        fitting._require_enough(empty, [])
+
+
+@pytest.mark.parametrize(('count', 'share'), [(2 * SOME, 1), (2 * SOME + 1, 2), (5 * SOME, 3)])
+def test_of_many_pairs_some_tell_the_priors_of_a_richer_model(count, share):
+    first = seen(5).select(np.arange(count - SOME) % 5)
+    second = replace(first.select(np.arange(SOME) % 5), base='base_B')
+    problem = Problem(UR10E, first, more=(second,))
+    simpler = Simpler(UR10E, (np.arange(count - SOME), np.arange(SOME)), noise(1.0))
+    few, told = fitting._some(problem, simpler)
+    assert [len(each) for each in few.sets] == [-(-len(each) // share) for each in problem.sets]
+    for distances, given in zip(told.distances, simpler.distances, strict=True):
+        np.testing.assert_array_equal(distances, given[::share])
+    np.testing.assert_array_equal(few.sets[0].joints, first.joints[::share])
+    assert fitting._some(problem, None) == (problem, None)
+
+
+def test_turns_of_frames_become_rotation_vectors():
+    """By the central difference of log R; other parameters stay as they are."""
+    chain = UR10E.with_frame('base', random_frame(np.random.default_rng(0), 1.0))
+    names = ['tool.rx', 'base.rz', 'base.x', 'base.rx', 'elbow_joint.theta', 'base.ry']
+    expected = np.eye(6)
+    order = [3, 5, 1]
+    for k in order:
+        ends = [
+            se3.log_rotation(chain.with_offsets({names[k]: step}).base.matrix[:3, :3])
+            for step in (-1e-6, 1e-6)
+        ]
+        expected[order, k] = (ends[1] - ends[0]) / 2e-6
+    np.testing.assert_allclose(fitting._to_values(chain, names), expected, atol=1e-8)
+
+
+def test_every_parameter_has_a_row_with_what_became_of_it():
+    problem = Problem(UR10E, seen(), fixed=('elbow_joint.beta',))
+    names = ['base.x', 'elbow_joint.a']
+    chain = UR10E.with_offsets({'elbow_joint.a': 2e-3})
+    parts = np.array([np.diag([1.0, 4.0]), np.diag([0.0, 12.0])])
+    uncertainty = Uncertainty(parts, np.array([10.0, np.inf]))
+    rows = parameter_rows(problem, chain, [*names, 'elbow_joint.theta'], names, uncertainty)
+    assert [row.name for row in rows] == list(chain.parameter_names)
+    found = {row.name: row for row in rows}
+    assert found['elbow_joint.a'].offset == pytest.approx(2e-3)
+    assert found['elbow_joint.a'].value == pytest.approx(chain.value('elbow_joint.a'))
+    assert found['elbow_joint.a'].std == pytest.approx(4.0)
+    assert found['elbow_joint.a'].freedom == pytest.approx(10.0 * 4.0**2)  # a fourth of it
+    assert found['base.x'].std == pytest.approx(1.0)
+    assert found['base.x'].freedom == pytest.approx(10.0)
+    assert [found[name].status for name in names] == ['fitted', 'fitted']
+    for name, status in (('theta', 'not excited'), ('alpha', 'gauge'), ('beta', 'fixed')):
+        row = found[f'elbow_joint.{name}']
+        assert (row.status, row.std, row.freedom) == (status, None, np.inf)
+
+
+def test_priors_matter_if_they_hold_a_parameter_that_has_none():
+    problem = Problem(UR10E, seen(), priors={'elbow_joint.a': 1.0})
+    held = {'elbow_joint.a': 0.9, 'elbow_joint.d': 0.04}
+    told = SimpleNamespace(held=held.get)
+    assert not fitting._priors_matter(problem, tuple(held), told)
+    held['elbow_joint.d'] = 0.06
+    assert fitting._priors_matter(problem, tuple(held), told)
+    held['elbow_joint.d'] = 0.0
+    assert fitting._priors_matter(replace(problem, learned=Learned({}, 1.0)), tuple(held), told)
+    assert fitting._priors_matter(replace(problem, effects=('ratio',)), tuple(held), told)
+
+
+@pytest.mark.parametrize('count', [120, 600])
+def test_parameters_that_some_poses_do_not_excite_may_be_by_all(count, monkeypatch):
+    """The elbow moves at one pose that the spread leaves out."""
+    monkeypatch.setattr(fitting, 'SOME', 100)
+    *_, poses = measured_arm(0, count)
+    joints = poses.joints.copy()
+    joints[:, 2] = 0.5
+    joints[7, 2] = 1.5
+    problem = Problem(UR10E, replace(poses, joints=joints))
+    wanted = [*problem.free[:12], 'elbow_joint.a', 'elbow_joint.theta', 'wrist_1_joint.theta']
+    names, factor = fitting._excited_names(problem, wanted, UR10E)
+    assert names == tuple(n for n in problem.free if n in wanted)
+    assert factor.shape == (len(names), len(names))
+
+
+@dataclass(frozen=True)
+class Done:
+    """A fit that is told: its factor, its noise, and what its data tell."""
+
+    factor: np.ndarray
+    noise: Noise
+    size: float
+    chain: object
+    told: dict
+
+    def posterior(self, size, judging):
+        assert (size, judging) == (self.noise.size, False)
+        return SimpleNamespace(priors=self.told, held=lambda name: float(name == 'elbow_joint.a'))
+
+
+def test_a_fit_is_repeated_with_guards_and_with_what_it_tells(monkeypatch):
+    """Without its outliers a session tells less; priors are no wider than common sense."""
+    names, chains = ('base.x', 'elbow_joint.a', 'elbow_joint.theta'), iter('abc')
+    problem, length = Problem(UR10E, seen()), 0.05 / 3.0
+    told, calls = {'elbow_joint.a': 1.0, 'elbow_joint.theta': 2e-3}, []
+    poor = np.diag([1.0, 0.9 / length, 100.0])
+
+    def fit(problem, simpler, chain, names, again=False):
+        calls.append((problem.learned, chain, again))
+        size = 2.0 + len(calls)
+        return Done(poor, noise(size, True), size, next(chains), told)
+
+    monkeypatch.setattr(fitting, '_fit', fit)
+    found = fitting._fit_all(problem, names, UR10E, 100.0 * np.eye(3), None)
+    guards, priors = {'elbow_joint.a': length}, {**told, 'elbow_joint.a': length}
+    assert calls == [
+        (None, UR10E, False),
+        (Learned(guards, 1.0), UR10E, False),
+        (Learned(priors, 4.0), 'b', True),
+    ]
+    assert (found.chain, found.size) == ('c', 4.0)
+    calls.clear()
+    chains = iter('ab')
+    told['elbow_joint.theta'] = 1.0
+    poor = 100.0 * np.eye(3)
+    found = fitting._fit_all(problem, names, UR10E, poor, None)
+    priors['elbow_joint.theta'] = 0.1 / 3.0
+    assert calls == [(None, UR10E, False), (Learned(priors, 3.0), 'a', True)]
+
+
+@pytest.mark.parametrize('held', [('elbow_joint.a', 'base.x'), ('base.x',), ()])
+def test_what_other_kinds_of_measurement_would_tell_is_held(held, monkeypatch):
+    """Unless a prior tells it, so that it is fitted."""
+    told = ('base.x',)
+    monkeypatch.setattr(fitting.identifiability, 'identifiable_and_held', lambda *_: (told, held))
+    monkeypatch.setattr(fitting, 'start_frames', lambda *_: 'start')
+    monkeypatch.setattr(fitting, '_excited_names', lambda *_: (told, np.eye(1)))
+    monkeypatch.setattr(fitting, '_fit_all', lambda *_: 'fitted')
+    monkeypatch.setattr(fitting, '_widened', lambda fitted, names: (fitted, names))
+    found = ('fitted', held[:1]) if len(held) == 2 else 'fitted'
+    assert fitting.fit(Problem(UR10E, seen())) == (told, 'start', found)

@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E, measured_arm
+from scipy import stats
+
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.estimation.identifiability import (
+    correlated,
+    covariance,
+    independent,
+    observability,
+    trades,
+)
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics.jacobian import ErrorModel
+
+ALIGNED = ('shoulder_lift_joint', 'elbow_joint', 'wrist_1_joint')
+
+
+def assert_trades_hold(result, q, oriented=True):
+    """What is left out must be the sum of its partners alone, at the joint values given."""
+    rows = 6 if oriented else 3
+    for name, partners in result.gauges.items():
+        columns = ErrorModel(result.chain, [name, *partners]).jacobian(q)[:, :rows]
+        columns = columns.reshape(-1, 1 + len(partners))
+        shares = np.linalg.lstsq(columns[:, 1:], columns[:, 0], rcond=None)[0]
+        left = columns[:, 0] - columns[:, 1:] @ shares
+        assert np.linalg.norm(left) <= 5e-3 * np.linalg.norm(columns[:, 0])
+        assert np.abs(shares).min(initial=1.0) > 1e-6
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_trades_of_a_six_axis_arm_with_its_frames(oriented, rng):
+    *_, seen = measured_arm(rng, 60, oriented=oriented)
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    gauges = {name: set(partners) for name, partners in result.gauges.items()}
+    assert gauges['wrist_3_joint.d'] == {'tool.z'}
+    assert gauges['wrist_3_joint.a'] == {'tool.x'}
+    assert gauges['shoulder_pan_joint.d'] == {'base.x', 'base.y', 'base.z'}  # the base is turned
+    assert gauges['shoulder_pan_joint.theta'] == {'base.rx', 'base.ry', 'base.rz'}
+    ends = [*UR10E.joints[-1].parameters[:4], *UR10E.joints[0].parameters[2:4]]
+    turns = [] if oriented else ['tool.rx', 'tool.ry', 'tool.rz']
+    assert set(result.gauges) == set(result.unidentifiable) == {*ends, *turns}
+    assert result.rank == (30 if oriented else 27)
+    assert not result.not_excited
+    if not oriented:
+        assert gauges['tool.rx'] == gauges['tool.ry'] == gauges['tool.rz'] == set()
+    assert_trades_hold(result, UR10E.random_joints(100, rng), oriented)
+
+
+def test_an_upright_base_trades_along_one_axis_alone(rng):
+    true = replace(faulty(UR10E, Cell(), rng), base=None)
+    seen = measure(true, UR10E.random_joints(60, rng), rng)
+    gauges = identify(Problem(UR10E, seen)).gauges
+    assert gauges['shoulder_pan_joint.d'] == ['base.z']
+    assert gauges['shoulder_pan_joint.theta'] == ['base.rz']
+
+
+@pytest.mark.parametrize('exact', [True, False])
+def test_lengths_along_parallel_axes_trade_where_no_tilt_is_modelled(exact, rng):
+    nominal = replace(UR10E, parallel=())
+    true = faulty(nominal, Cell(), rng)
+    if exact:
+        true = replace(nominal, base=true.base, tool=true.tool)
+    seen = measure(true, UR10E.random_joints(60, rng), rng, *NOISE)
+    result = identify(Problem(nominal, seen, **SIGMAS))
+    assert result.rank == 28
+    for joint in ALIGNED[1:]:
+        partners = result.gauges[f'{joint}.d']
+        assert 'shoulder_lift_joint.d' in partners
+        if exact:
+            assert partners == ['shoulder_lift_joint.d']
+    assert f'{ALIGNED[0]}.d' in result.names
+    assert_trades_hold(result, UR10E.random_joints(100, rng))
+    assert result.gauges['wrist_3_joint.d'] == ['tool.z']
+    assert result.gauges['elbow_joint.d']
+
+
+def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(60, rng)
+    q[:, 2] = 0.7
+    result = identify(Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS))
+    assert 'elbow_joint.theta' in result.not_excited
+    assert set(result.not_excited) < set(result.gauges)
+    assert any('do not determine' in text for text in result.refusals)
+    kept = {p.name: p.offset for p in result.parameters}
+    assert all(kept[name] == 0.0 for name in result.not_excited)
+    assert_trades_hold(result, q)
+
+
+def test_a_fixed_partner_makes_its_trade_identifiable(rng):
+    tool = replace(random_frame(rng, 0.2), fixed=True)
+    nominal = replace(UR10E, tool=tool)
+    true = replace(faulty(UR10E, Cell(), rng), tool=tool)
+    result = identify(Problem(nominal, measure(true, UR10E.random_joints(60, rng), rng)))
+    assert 'wrist_3_joint.d' in result.names
+    assert not {name for name in result.gauges if name.startswith('wrist_3')}
+
+
+def test_dependent_columns_by_hand():
+    """Columns of a, b, a + 2 b, nothing, c: the third trades against the first two."""
+    a, b, c = np.eye(3)
+    matrix = np.stack([a, b, a + 2.0 * b, np.zeros(3), c], axis=1)
+    factor = np.zeros((5, 5))
+    factor[:3] = matrix
+    names = ('a', 'b', 'sum', 'nothing', 'c')
+    assert independent(factor, names) == ('a', 'b', 'c')
+    assert trades(factor.T @ factor, names, ('a', 'b', 'c')) == {'sum': ['a', 'b'], 'nothing': []}
+    swapped = factor[:, [2, 1, 0, 3, 4]]
+    others = ('sum', 'b', 'a', 'nothing', 'c')
+    assert independent(swapped, others) == ('sum', 'b', 'c')
+    assert trades(swapped.T @ swapped, others, ('sum', 'b', 'c'))['a'] == ['sum', 'b']
+
+
+def test_a_trade_is_named_though_a_fitted_parameter_shows_nowhere():
+    """A prior keeps a parameter that no pose depends on; its column is zero."""
+    a, b, _ = np.eye(3)
+    factor = np.stack([a, np.zeros(3), 2.0 * a], axis=1)
+    assert trades(factor.T @ factor, ('a', 'hidden', 'twice'), ('a', 'hidden')) == {'twice': ['a']}
+    factor = np.stack([b, np.zeros(3), 2.0 * a], axis=1)
+    assert independent(factor, ('b', 'hidden', 'a')) == ('b', 'a')
+
+
+@pytest.mark.parametrize(
+    ('diagonal', 'poses', 'o1', 'o2', 'o3', 'o4', 'o5'),
+    [
+        ((2.0, 8.0), 4, 4.0 / 2.0, 0.25, 2.0, 0.5, 1.6),
+        ((1.0, 1.0, 1.0), 1, 1.0, 1.0, 1.0, 1.0, 1.0 / 3.0),
+        ((10.0, 0.1, 1.0), 9, 1.0 / 3.0, 0.01, 0.1, 0.001, 1.0 / 11.1),
+    ],
+)
+def test_observability_indices_by_hand(diagonal, poses, o1, o2, o3, o4, o5, rng):
+    turned = np.linalg.qr(rng.normal(size=(len(diagonal),) * 2))[0]
+    for matrix in (np.diag(diagonal), turned @ np.diag(diagonal)):
+        found = observability(matrix, poses)
+        assert (found.o1, found.o2, found.o3, found.o4, found.o5) == pytest.approx(
+            (o1, o2, o3, o4, o5)
+        )
+
+
+def test_indices_of_a_problem_are_those_of_its_jacobian(rng):
+    true = faulty(UR10E, Cell(), rng)
+    q = UR10E.random_joints(30, rng)
+    seen = measure(true, q, rng, *NOISE)
+    result = identify(Problem(UR10E, seen, loss='none', **SIGMAS))
+    jacobian = ErrorModel(result.chain, result.names).jacobian(q)
+    jacobian = jacobian / np.repeat(NOISE, 3)[:, np.newaxis]
+    singular = np.linalg.svd(jacobian.reshape(-1, result.rank), compute_uv=False)
+    found = result.observability
+    assert found.o1 == pytest.approx(np.exp(np.log(singular).mean()) / np.sqrt(30), rel=1e-3)
+    assert found.o2 == pytest.approx(singular[-1] / singular[0], rel=1e-3)
+    assert found.o3 == pytest.approx(singular[-1], rel=1e-3)
+    assert found.o4 == pytest.approx(singular[-1] ** 2 / singular[0], rel=1e-3)
+    assert found.o5 == pytest.approx(1.0 / (1.0 / singular).sum(), rel=1e-3)
+
+
+def test_correlated_pairs_by_hand():
+    matrix = np.array([[4.0, 1.9, 0.0], [1.9, 1.0, -0.95], [0.0, -0.95, 1.0]])
+    names = ('a', 'b', 'c')
+    assert correlated(matrix, names, 0.9) == (
+        ('a', 'b', pytest.approx(0.95)),
+        ('b', 'c', pytest.approx(-0.95)),
+    )
+    assert correlated(matrix, names, 0.96) == ()
+
+
+def test_the_covariance_of_a_factor_by_hand():
+    factor = np.array([[2.0, 1.0], [0.0, 0.5]])
+    normal = factor.T @ factor
+    np.testing.assert_allclose(covariance(factor), np.linalg.inv(normal), rtol=1e-12)
+    # noise of double size has the middle 4 H, and four times the covariance
+    np.testing.assert_allclose(
+        covariance(factor, 4.0 * normal), 4.0 * np.linalg.inv(normal), rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize(('size', 'level'), [(0.9, 0.5), (0.9, 0.95), (5.0, 0.95)])
+def test_the_ellipsoid_is_that_of_the_covariance_of_a_position(size, level, rng):
+    """By chi-squared where the sigmas given are right, by F where the noise is estimated."""
+    *_, seen = measured_arm(0, 40, (size * NOISE[0], size * NOISE[1]))
+    result = identify(Problem(UR10E, seen, loss='none', **SIGMAS))
+    assert result.noise.consistent == (size < 1.0)
+    q = UR10E.random_joints(5, rng)
+    axes = result.confidence_ellipsoid(q, level)
+    found = np.swapaxes(axes, 1, 2) @ axes
+    squares = [stats.chi2.ppf(level, 3)] * 2
+    if size > 1.0:
+        squares = [3.0 * stats.f.ppf(level, 3, each) for each in (180.0, 60.0)]
+    square = (found / result.pose_covariance(q)[:, :3, :3]).mean(axis=(1, 2))
+    assert (square >= squares[0] - 1e-6).all()
+    assert (square <= squares[1] + 1e-6).all()
+    np.testing.assert_allclose(
+        found / square[:, None, None], result.pose_covariance(q)[:, :3, :3], rtol=1e-6, atol=1e-15
+    )
+    products = axes @ np.swapaxes(axes, 1, 2) / found.max()
+    lengths = np.einsum('nii->ni', products)
+    np.testing.assert_allclose(
+        products - lengths[:, None] * np.eye(3), 0.0, atol=1e-6 * lengths.max()
+    )

@@ -1,0 +1,180 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The size of the noise, and of the parameters' uncertainty, against whole matrices."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E, fitted, measured_arm
+from scipy import stats
+
+from calib_ros.apply.simulation import measure
+from calib_ros.estimation import noise as noise_module
+from calib_ros.estimation.leastsquares import (
+    Prior,
+    System,
+    minimise,
+    stacked,
+    triangular_factor,
+)
+from calib_ros.estimation.noise import noise_of
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.shared_errors import Shared
+
+NAMES = [*(name for name in UR10E.parameter_names if UR10E.owns_frame(name)), 'elbow_joint.theta']
+
+
+@pytest.fixture(autouse=True)
+def nothing_shared(monkeypatch):
+    nothing = Shared(0.1, 0.2, (), {})
+    monkeypatch.setattr(noise_module, 'shared_errors', lambda *_: nothing)
+
+
+def found(seen, sigmas=NOISE, weights=None, prior=None):
+    """Return the noise, its uncertainty, and by hand: H, by part the squares and the freedom."""
+    samples = Samples(seen, *sigmas).weighted(weights)
+    system = System((samples,), prior)
+    fit = minimise(UR10E, NAMES, system)
+    factor = triangular_factor(fit.chain, NAMES, system)
+    noise, uncertainty = noise_of(fit, NAMES, system, factor)
+    rows = samples.rows_of(fit.chain, NAMES)
+    parts = [stacked([each]) for each in (rows[:, :3], rows[:, 3:]) if each.size]
+    matrix = factor.T @ factor
+    shares = [part[:, :-1].T @ part[:, :-1] for part in parts]
+    squares = np.array([part[:, -1] @ part[:, -1] for part in parts])
+    number = 3.0 * (len(seen) if weights is None else weights.sum())
+    freedom = np.array([number - np.trace(np.linalg.solve(matrix, each)) for each in shares])
+    return noise, uncertainty, matrix, shares, squares, freedom
+
+
+def test_the_noise_is_the_root_of_squares_over_their_freedom():
+    *_, seen = measured_arm(0, 30)
+    weights = np.where(np.arange(30) % 5, 1.0, 0.25)
+    for given in (None, weights):
+        noise, _, _, _, squares, freedom = found(seen, weights=given)
+        expected = np.sqrt(squares / freedom)
+        assert (noise.position, noise.orientation) == pytest.approx(tuple(expected), rel=1e-6)
+        assert (noise.successive, noise.near, noise.widened) == (0.1, 0.2, 1.0)
+    rng = np.random.default_rng(0)
+    alone = measure(UR10E, UR10E.random_joints(30, rng), rng, *NOISE, oriented=False)
+    assert (
+        Problem(UR10E, alone, **SIGMAS).sigmas
+        == fitted(Problem(UR10E, alone, **SIGMAS)).noise.given
+    )
+
+
+@pytest.mark.parametrize('part', [0, 1])
+@pytest.mark.parametrize('level', [0.0005, 0.9995])
+@pytest.mark.parametrize('inside', [True, False])
+def test_sigmas_are_consistent_as_far_as_a_chi_squared_test_says(part, level, inside):
+    """Both parts by themselves; beyond a limit the deviations are those of the noise found."""
+    rng = np.random.default_rng(0)
+    seen = measure(UR10E, UR10E.random_joints(30, rng), rng, *NOISE)
+    sigmas = np.array(NOISE)
+    for _ in range(3):  # weights of the parts change what each takes of the freedom
+        *_, squares, freedom = found(seen, sigmas)
+        wanted = 0.98 * freedom
+        towards = 0.99 if inside == (level > 0.5) else 1.01
+        wanted[part] = towards * stats.chi2.ppf(level, freedom[part])
+        sigmas *= np.sqrt(squares / wanted)
+    noise, uncertainty, matrix, shares, squares, freedom = found(seen, sigmas)
+    assert noise.consistent is inside
+    variances = squares / freedom
+    sizes = np.maximum(variances, 1.0) if inside else variances
+    middle = sum(size * share for size, share in zip(sizes, shares, strict=True))
+    inverse = np.linalg.inv(matrix)
+    expected = inverse @ middle @ inverse
+    np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-5, atol=1e-16)
+    assert noise.size == pytest.approx(
+        np.sqrt(np.median(np.diag(expected) / np.diag(inverse))), rel=1e-4
+    )
+    if inside and level < 0.5:  # the sigmas given are the larger ones: nothing was estimated
+        assert uncertainty.freedom.tolist() == [np.inf]
+        assert noise.size == 1.0
+    else:
+        estimated = np.where([not inside or size > 1.0 for size in sizes], freedom, np.inf)
+        np.testing.assert_allclose(uncertainty.freedom, [*estimated, np.inf], rtol=1e-4)
+
+
+def test_pairs_of_a_configuration_that_share_their_error_count_once():
+    """Three of each: the sums of their residuals are three times as large as if independent."""
+    rng = np.random.default_rng(1)
+    once = measure(UR10E, UR10E.random_joints(40, rng), rng, *NOISE)
+    first, plain, *_ = found(once)
+    noise, uncertainty, _, _, squares, freedom = found(once.select(np.repeat(np.arange(40), 3)))
+    np.testing.assert_allclose(squares / freedom, [noise.position**2, noise.orientation**2])
+    ratio = np.diag(uncertainty.covariance) / np.diag(plain.covariance)
+    # residuals of as many degrees of freedom as 120 pairs would leave are taken for the size
+    np.testing.assert_allclose(np.sqrt(ratio), 1.0, atol=0.15)
+    taken = 360.0 - freedom
+    np.testing.assert_allclose(uncertainty.freedom[:2], 120.0 - taken, rtol=1e-6)
+    assert first.size == pytest.approx(noise.size / np.sqrt(3.0), rel=0.2)
+
+
+def test_deviations_of_neighbours_that_share_errors_are_wider(monkeypatch):
+    """By the middle that they give for a part; the median of the ratio is told."""
+    *_, seen = measured_arm(2, 30)
+    wide = 9.0
+    _, plain, matrix, shares, *_ = found(seen)
+    middles = {0: wide * shares[0]}
+    monkeypatch.setattr(
+        noise_module, 'shared_errors', lambda *_: Shared(0.5, 0.0, ('near',), middles)
+    )
+    noise, uncertainty, matrix, shares, squares, freedom = found(seen)
+    inverse = np.linalg.inv(matrix)
+    size = max(squares[1] / freedom[1], 1.0) if noise.consistent else squares[1] / freedom[1]
+    expected = inverse @ (wide * shares[0] + size * shares[1]) @ inverse
+    np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-5, atol=1e-16)
+    assert noise.shared == ('near',)
+    own = squares[0] / freedom[0]
+    own = max(own, 1.0) if noise.consistent else own
+    alone = inverse @ (own * shares[0] + size * shares[1]) @ inverse
+    ratio = np.median(np.sqrt(np.diag(expected) / np.diag(alone)))
+    assert noise.widened == pytest.approx(ratio, rel=1e-4)
+    assert plain.covariance.shape == uncertainty.covariance.shape
+    np.testing.assert_allclose(uncertainty.freedom[0], freedom[0], rtol=1e-6)
+
+
+def test_a_prior_is_as_uncertain_as_it_says_whatever_the_noise():
+    """Weighed by three times the noise given, its own variance is what it was."""
+    rng = np.random.default_rng(3)
+    seen = measure(UR10E, UR10E.random_joints(30, rng), rng, 4.0 * NOISE[0], 4.0 * NOISE[1])
+    prior = Prior(UR10E, {'elbow_joint.theta': 1e-5}, noise=3.0)
+    noise, uncertainty, matrix, shares, squares, freedom = found(seen, prior=prior)
+    assert not noise.consistent
+    middle = sum(s * v for s, v in zip(shares, squares / freedom, strict=True))
+    middle[-1, -1] += (3.0 * 3.0 / 1e-5) ** 2
+    inverse = np.linalg.inv(matrix)
+    np.testing.assert_allclose(
+        uncertainty.covariance, inverse @ middle @ inverse, rtol=1e-5, atol=1e-16
+    )
+
+
+def test_noise_of_covariances_is_that_of_all_components_together():
+    """Whitened as a whole, position and orientation are one."""
+    rng = np.random.default_rng(4)
+    seen = measure(UR10E, UR10E.random_joints(30, rng), rng, NOISE[0], 2.0 * NOISE[1])
+    own = np.diag(np.repeat(NOISE, 3) ** 2)
+    own[3:, :3] = own[:3, 3:] = 0.3 * NOISE[0] * NOISE[1] * np.eye(3)
+    seen = replace(seen, covariance=np.tile(own, (30, 1, 1)))
+    noise, uncertainty, matrix, shares, squares, _ = found(seen)
+    variance = squares.sum() / (180.0 - len(NAMES))
+    assert noise.position == pytest.approx(np.sqrt(variance), rel=1e-6)
+    assert noise.orientation is None
+    np.testing.assert_allclose(sum(shares), matrix, rtol=1e-9, atol=1e-6 * matrix.max())
+    expected = variance * np.linalg.inv(matrix)
+    np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-6, atol=1e-16)
+
+
+def test_a_part_with_less_than_one_degree_of_freedom_tells_its_noise():
+    """Weights that leave half an equation more than the parameters take of the positions."""
+    *_, seen = measured_arm(5, 30)
+    taken = 90.0 - found(seen)[-1]
+    least = int(np.argmax(taken))
+    weights = np.full(30, (taken[least] + 0.5) / 90.0)
+    noise, _, _, _, squares, freedom = found(seen, weights=weights)
+    assert freedom[least] == pytest.approx(0.5, abs=1e-3)
+    expected = tuple(np.sqrt(squares / freedom))
+    assert (noise.position, noise.orientation) == pytest.approx(expected, rel=1e-6)

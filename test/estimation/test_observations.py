@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib_ros.errors import InputError
+from calib_ros.estimation.configurations import STILL, configurations
+from calib_ros.estimation.observations import Observations
+from calib_ros.kinematics import se3
+
+
+def test_standing_still_is_one_configuration(rng):
+    places = np.repeat([[0.0, 0.0], [0.0, 0.5], [0.3, 0.5], [0.0, 0.0]], [3, 1, 4, 2], axis=0)
+    jitter = rng.uniform(-0.4 * STILL, 0.4 * STILL, places.shape)
+    expected = [0, 0, 0, 1, 2, 2, 2, 2, 0, 0]  # the first is visited again
+    assert configurations(places + jitter).tolist() == expected
+    observations = Observations.from_arrays(places + jitter, np.zeros((10, 3)))
+    assert observations.configurations.tolist() == expected
+
+
+@pytest.mark.parametrize(('step', 'count'), [((0.9, 0.9), 1), ((1.1, 0.0), 2), ((0.0, -1.1), 2)])
+def test_the_joint_that_moved_most_makes_a_configuration(step, count):
+    assert len(set(configurations(np.array([(0.0, 0.0), step]) * STILL).tolist())) == count
+
+
+def test_configurations_of_nothing():
+    assert configurations(np.zeros((0, 6))).tolist() == []
+    assert configurations(np.zeros((1, 6))).tolist() == [0]
+
+
+def test_arrays_that_do_not_fit_together_are_refused():
+    with pytest.raises(InputError, match=r'positions of 3 observations .*\(3, 3\), not \(2, 3\)'):
+        Observations.from_arrays(np.zeros((3, 6)), np.zeros((2, 3)))
+    with pytest.raises(InputError, match='rotations of 3 observations'):
+        Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3)), np.zeros((3, 4)))
+
+
+@pytest.mark.parametrize('bad', [np.nan, np.inf])
+@pytest.mark.parametrize('name', ['joints', 'positions'])
+def test_numbers_that_are_none_are_refused(name, bad):
+    arrays = {'joints': np.zeros((3, 6)), 'positions': np.zeros((3, 3))}
+    arrays[name][1, 2] = bad
+    with pytest.raises(InputError, match=f'{name} .* NaN or infinite'):
+        Observations.from_arrays(**arrays)
+
+
+def test_lists_will_do_as_arrays(rng):
+    joints, positions = rng.normal(size=(5, 6)), rng.normal(size=(5, 3))
+    rotations = se3.exp_rotation(rng.normal(size=(5, 3)))
+    seen = Observations.from_arrays(joints.tolist(), positions.tolist(), rotations.tolist())
+    np.testing.assert_array_equal(seen.rotations, rotations)
+    np.testing.assert_array_equal(seen.joints, joints)
+
+
+@pytest.mark.parametrize(
+    ('joints', 'positions', 'complaint'),
+    [
+        (None, None, r'joints must have the shape \(N, n\)'),
+        ([['a'] * 6], [[0.0] * 3], 'joints must be numbers'),
+        (1.0, 2.0, r'joints must have the shape \(N, n\)'),
+        ([0.0] * 6, [0.0] * 3, r'joints must have the shape \(N, n\)'),
+        ([], [], r'joints must have the shape \(N, n\)'),
+    ],
+)
+def test_what_is_no_array_is_refused(joints, positions, complaint):
+    with pytest.raises(InputError, match=complaint):
+        Observations.from_arrays(joints, positions)
+
+
+def test_masked_values_are_missing():
+    positions = np.ma.masked_array(np.zeros((3, 3)), mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
+    with pytest.raises(InputError, match='positions of the observations hold NaN'):
+        Observations.from_arrays(np.zeros((3, 6)), positions)
+
+
+@pytest.mark.parametrize(
+    ('turn', 'complaint'),
+    [
+        (np.diag([1.0, 1.0, -1.0]), 'pair 1 .* left-handed: 1 of 3'),
+        (np.zeros((3, 3)), 'pair 1 .* not orthogonal'),
+        (1.1 * np.eye(3), 'pair 1 .* not orthogonal'),
+    ],
+)
+def test_matrices_that_are_no_rotations_are_refused(turn, complaint):
+    with pytest.raises(InputError, match=complaint):
+        Observations.from_arrays(
+            np.zeros((3, 6)), np.zeros((3, 3)), np.stack([np.eye(3), turn, np.eye(3)])
+        )
+
+
+def test_rotations_rounded_to_two_digits_are_rotations(rng):
+    rotations = np.round(se3.exp_rotation(rng.normal(size=(200, 3))), 2)
+    seen = Observations.from_arrays(np.zeros((200, 6)), np.zeros((200, 3)), rotations)
+    assert seen.oriented.all()
+
+
+def test_a_joint_that_stands_at_half_a_turn_is_one_configuration():
+    joints = np.array([[3.14159], [-3.14159], [3.14159], [3.0]])
+    assert configurations(joints).tolist() == [0, 0, 0, 1]
+
+
+def moving(rng, count=20, order=2):
+    """Return observations with joints that follow parabolas, and the parabolas."""
+    start, speed, bend = rng.normal(size=(3, count, 2))
+
+    def joints(before):
+        return start - before * speed + 0.5 * before**2 * bend
+
+    seen = Observations.from_arrays(joints(0.0), np.zeros((count, 3)))
+    optional = {'velocity': speed, 'acceleration': bend} if order == 2 else {'velocity': speed}
+    return replace(seen, **optional), joints
+
+
+def test_earlier_follows_velocity_and_acceleration(rng):
+    seen, joints = moving(rng)
+    sooner = seen.earlier(0.07)
+    np.testing.assert_allclose(sooner.joints, joints(0.07), atol=1e-12)
+    np.testing.assert_array_equal(sooner.delay, np.full(20, 0.07))
+    np.testing.assert_array_equal(sooner.positions, seen.positions)
+    # what has been taken into account is not taken again, and there is a way back
+    np.testing.assert_allclose(sooner.earlier(0.1).joints, joints(0.1), atol=1e-12)
+    np.testing.assert_allclose(sooner.earlier(0.0).joints, seen.joints, atol=1e-12)
+    assert sooner.earlier(0.07) is sooner
+
+
+def test_an_arm_that_stood_was_nowhere_else_earlier(rng):
+    seen = Observations.from_arrays(rng.normal(size=(5, 2)), np.zeros((5, 3)))
+    assert seen.earlier(0.5) is seen
+
+
+@pytest.mark.parametrize('name', ['velocity', 'acceleration', 'delay', 'approach'])
+def test_optional_arrays_must_fit_too(rng, name):
+    seen, _ = moving(rng)
+    with pytest.raises(InputError, match=f'{name} of 20 observations must have the shape'):
+        replace(seen, **{name: np.zeros((19, 2))})
+
+
+def test_select_takes_optional_arrays_along(rng):
+    seen, _ = moving(rng)
+    seen = replace(seen, delay=rng.normal(size=20))
+    part = seen.select(np.array([3, 1]))
+    for name in ('velocity', 'acceleration', 'delay'):
+        np.testing.assert_array_equal(getattr(part, name), getattr(seen, name)[[3, 1]])
+
+
+def test_a_part_keeps_the_configurations_of_the_whole(rng):
+    """Known or found anew, they are the same, whatever order the part is in."""
+    joints = rng.uniform(-3.0, 3.0, (30, 6))[rng.integers(0, 30, 90)]
+    whole = Observations.from_arrays(joints, np.zeros((90, 3)))
+    for part in (np.arange(90) % 3 == 0, rng.permutation(90)[:40], np.zeros(90, bool)):
+        anew = Observations.from_arrays(joints[part], np.zeros((len(joints[part]), 3)))
+        assert whole.configurations.max() > 10
+        known = whole.select(part).configurations
+        same = known[:, np.newaxis] == known
+        np.testing.assert_array_equal(
+            same, anew.configurations[:, np.newaxis] == anew.configurations
+        )
+        assert set(known) == set(range(len(set(known))))

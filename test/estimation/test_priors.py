@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Priors: tolerances of manufacture where poses are few."""
+
+import numpy as np
+import pytest
+from fits import SIGMAS, UR10E, measured_arm, rms
+
+from calib_ros.apply.simulation import Cell, measure
+from calib_ros.errors import ConfigError, TooFewObservationsError, UnknownNameError
+from calib_ros.estimation.identifiability import (
+    structurally_independent,
+)
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.identification import identify
+from calib_ros.kinematics.parameter import Parameter
+from calib_ros.report.words import summary
+
+
+def manufacture(scale=1.0):
+    """Return the tolerances by which `faulty` makes arms, for what is no gauge freedom."""
+    cell = Cell()
+    names = structurally_independent(UR10E, UR10E.parameter_names)
+    return {
+        name: scale * (cell.length_error if Parameter(name).is_length else cell.angle_error)
+        for name in names
+        if not name.startswith(('base', 'tool'))
+    }
+
+
+def test_priors_allow_fewer_poses_than_parameters():
+    """Four poses have 24 equations for 30 parameters."""
+    errors = []
+    for seed in range(8):
+        rng, true, seen = measured_arm(seed, 4)
+        with pytest.raises(TooFewObservationsError):
+            identify(Problem(UR10E, seen, **SIGMAS))
+        result = identify(Problem(UR10E, seen, priors=manufacture(), **SIGMAS))
+        assert result.rank == 30
+        unseen = UR10E.random_joints(300, rng)
+        errors.append([rms(chain, true, unseen) for chain in (result.before, result.chain)])
+    before, after = np.median(errors, axis=0)
+    assert after < 0.6 * before
+
+
+def test_a_prior_on_a_gauge_makes_it_fitted_with_its_own_deviation(rng):
+    *_, seen = measured_arm(rng, 60)
+    plain = identify(Problem(UR10E, seen, **SIGMAS))
+    result = identify(Problem(UR10E, seen, priors={'wrist_3_joint.d': 1e-3}, **SIGMAS))
+    row = {p.name: p for p in result.parameters}['wrist_3_joint.d']
+    assert 'wrist_3_joint.d' in plain.unidentifiable
+    assert row.status == 'fitted'
+    assert row.std == pytest.approx(1e-3, rel=1e-3)
+    assert row.offset == pytest.approx(0.0, abs=1e-6)
+    assert result.rank == plain.rank + 1
+    assert 'wrist_3_joint.d' not in result.gauges
+    # the poses do not know of it: predictions and their uncertainty stay as they are, but for the
+    # size of the noise, which is the median over one parameter more
+    unseen = UR10E.random_joints(50, rng)
+    np.testing.assert_allclose(
+        result.chain.forward(unseen), plain.chain.forward(unseen), rtol=0, atol=1e-8
+    )
+    sizes = [(each.noise.size / each.noise.position) ** 2 for each in (result, plain)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=1e-3)
+    np.testing.assert_allclose(
+        result.pose_covariance(unseen) / result.noise.size**2,
+        plain.pose_covariance(unseen) / plain.noise.size**2,
+        rtol=0,
+        atol=1e-13,
+    )
+
+
+def test_priors_are_off_by_default_and_told_when_on(rng):
+    *_, seen = measured_arm(rng, 40)
+    without = identify(Problem(UR10E, seen, **SIGMAS))
+    assert without.priors == {}
+    assert 'prior' not in summary(without)
+    priors = {'elbow_joint.a': 1e-5, '*_joint.a': 1e-3}
+    result = identify(Problem(UR10E, seen, priors=priors, **SIGMAS))
+    assert result.priors == {
+        f'{name}.a': 1e-5 if name == 'elbow_joint' else 1e-3 for name in UR10E.joint_names
+    }
+    assert 'priors on 6 parameters' in summary(result)
+
+
+def test_priors_that_make_no_sense_are_refused(rng):
+    seen = measure(UR10E, UR10E.random_joints(20, rng), rng)
+    with pytest.raises(UnknownNameError, match=r'elbow_joint\.a'):
+        Problem(UR10E, seen, priors={'elbow.a': 1e-3})
+    for sigma in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ConfigError, match='prior'):
+            Problem(UR10E, seen, priors={'elbow_joint.a': sigma})

@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Weights, distances and second fits of a robust fit, one by one."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E, measured_arm, spoiled
+from scipy import special, stats
+
+from calib_ros.apply.simulation import measure
+from calib_ros.estimation import robust
+from calib_ros.estimation.leastsquares import System, minimise
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import INNER, OUTER, Robust, distances_of, weights_of
+from calib_ros.estimation.samples import Samples
+from calib_ros.kinematics import se3
+
+
+def test_weights_that_swing_come_to_rest(monkeypatch):
+    """A pose that comes near without weight, and goes far with it, has no rest at either end."""
+    _, true, seen = measured_arm(0, 40)
+    system = Problem(UR10E, seen, **SIGMAS).system([seen])
+    weight = 1.0
+
+    def minimised(chain, names, weighted, *_):
+        nonlocal weight
+        weight = float(weighted.sets[0].weights[0]) ** 2
+        return minimise(chain, names, weighted)
+
+    def far(*_):
+        distances = np.ones(40)
+        distances[0] = INNER + 2.0 * weight
+        return (distances,)
+
+    monkeypatch.setattr(robust, 'minimise', minimised)
+    monkeypatch.setattr(robust, 'distances_of', far)
+    found = robust.reweighted(true, ['tool.x'], system, 'redescending')
+    assert found.settled
+    assert weight == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_weights_are_those_of_the_losses():
+    distance = np.array([0.0, 1.0, INNER, 0.25 * INNER + 0.75 * OUTER, OUTER, 2.0 * OUTER])
+    np.testing.assert_array_equal(weights_of(distance, 'none'), 1.0)
+    np.testing.assert_allclose(weights_of(distance, 'redescending'), [1, 1, 1, 0.25, 0, 0])
+    bounded = weights_of(distance, 'huber')
+    np.testing.assert_allclose(bounded * np.maximum(distance, INNER), INNER)
+
+
+@pytest.mark.parametrize('dimensions', [3, 1])
+def test_distances_are_lengths_in_standard_deviations(dimensions):
+    """Of Gaussian errors half are below their median; one is 20 standard deviations long."""
+    rng = np.random.default_rng(0)
+    seen = measure(UR10E, UR10E.random_joints(2001, rng), rng)
+    away, turns = 1e-3 * rng.normal(size=(2, 2001, 3))
+    away[0], turns[0], away[1], turns[1] = [0.0, 0.02, 0.0], 0.0, 0.0, [0.0, 0.0, 0.03]
+    part = np.arange(2001) < 1500
+    seen = replace(
+        seen,
+        positions=seen.positions + away,
+        rotations=se3.exp_rotation(turns) @ seen.rotations,
+        oriented=part,
+    )
+    if dimensions == 1:
+        along = away[:, 0] + np.linalg.norm(seen.positions - away, axis=1)
+        along[0] += 0.02
+        seen = replace(seen, distances=along, oriented=np.zeros(2001, dtype=bool))
+    (found,) = distances_of(UR10E, ['tool.x'], System((Samples(seen, 1e-4, 7e-4),)))
+    assert found[0] == pytest.approx(20.0, rel=0.05)
+    if dimensions == 1:
+        expected = np.abs(away[2:, 0]) / 1e-3
+    else:
+        assert found[1] == pytest.approx(30.0, rel=0.05)
+        position, turn = (np.linalg.norm(each[2:], axis=1) / 1e-3 for each in (away, turns))
+        expected = np.maximum(position, np.where(part[2:], turn, 0.0))
+    np.testing.assert_allclose(found[2:], expected, rtol=0.05, atol=1e-6)
+
+
+@pytest.mark.parametrize(('out', 'share'), [(2, 0.3), (5, 0.05), (5, 0.6), (0, 0.3), (1, 0.999)])
+def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, monkeypatch):
+    """Chernoff's bound is above the tail of the beta distribution, and not by far."""
+    system = SimpleNamespace(rows=90, count=30, prior=SimpleNamespace(sigmas={'a': 1.0}))
+    normal = SimpleNamespace(cost=200.0 * share)
+    second = SimpleNamespace(
+        outliers=np.arange(30) < out, fit=SimpleNamespace(normal=normal, chain=None)
+    )
+    least = SimpleNamespace(normal=SimpleNamespace(cost=200.0))
+    monkeypatch.setattr(robust, 'minimise', lambda *_, **__: least)
+    found = robust._chance(['a', 'b', 'c', 'd'], system, second, second)
+    spare, shifts = 0.5 * (90 - 3 - 3 * out), 0.5 * 3 * out
+    if not out or share > 0.99:  # all of them, or more than left out by chance
+        assert found == (1.0 if out else 0.0)
+        return
+    ways = special.comb(30, out) * stats.beta.cdf(share, spare, shifts)
+    assert min(ways, 1.0) <= found <= min(60.0 * ways, 1.0)
+    mean = spare / (spare + shifts)
+    tail = (share / mean) ** spare * ((1.0 - share) / (1.0 - mean)) ** shifts
+    assert found == pytest.approx(min(special.comb(30, out) * tail, 1.0), rel=1e-9, abs=0.0)
+    second.fit.normal.cost = 0.0  # too small for a float
+    assert 0.0 <= robust._chance(['a', 'b', 'c', 'd'], system, second, second) < 1e-200
+
+
+@pytest.mark.parametrize('loss', ['redescending', 'huber'])
+def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(loss, monkeypatch):
+    """One more reweighting by 1 / distance hardly moves the start of the last phase."""
+    rng, true, clean = measured_arm(1, 80)
+    seen, _ = spoiled(clean, rng, 0.45, shift=(0.1, 1.5), turn=(0.1, 2.0))
+    system = System((Samples(seen, *NOISE),))
+    names = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
+    steps, starts, reweighted = [], [], robust.reweighted
+
+    def counted(*arguments, **options):
+        found = minimise(*arguments, **options)
+        steps.append(found.iterations)
+        return found
+
+    def kept(chain, *arguments):
+        starts.append(chain)
+        return reweighted(chain, *arguments)
+
+    monkeypatch.setattr(robust, 'minimise', counted)
+    monkeypatch.setattr(robust, 'reweighted', kept)
+    far = true.with_offsets({'base.x': 0.5, 'base.rz': 0.5, 'tool.y': 0.3})
+    found = robust.robust_fit(far, names, system, loss)
+    assert found.iterations == sum(steps)
+    assert found.settled
+    size = max(1.0, found.fit.normal.rms(found.system))
+    assert found.fit.left < robust.STEP_TOLERANCE * size
+    (last,) = distances_of(starts[0], names, system)
+    bounded = system.weighted([1.0 / np.maximum(last, 1.0)])
+    (again,) = distances_of(minimise(starts[0], names, bounded).chain, names, system)
+    np.testing.assert_allclose(again, last, rtol=0.1, atol=0.1)
+    weights = weights_of(distances_of(found.fit.chain, names, system)[0], loss)
+    np.testing.assert_allclose(found.system.sets[0].weights ** 2, weights, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('out', 'rms', 'loss', 'sums', 'chance', 'second'),
+    [
+        (True, 1.0, 'redescending', 2.26, 0.9e-3, True),
+        (False, 1.21, 'redescending', 2.26, 0.9e-3, True),
+        (False, 1.19, 'redescending', 2.26, 0.9e-3, False),  # nothing suspicious
+        (True, 1.0, 'huber', 2.26, 0.9e-3, False),
+        (True, 1.0, 'redescending', 2.24, 0.9e-3, False),  # a detail of the first
+        (True, 1.0, 'redescending', 2.26, 1.1e-3, False),  # it may be chance
+    ],
+)
+def test_a_second_fit_is_kept_where_it_shrinks_half_of_the_residuals(
+    out, rms, loss, sums, chance, second, monkeypatch
+):
+    """By more than ALIKE, and by more than chance allows at 99.9 %."""
+    normal = SimpleNamespace(rms=lambda _: rms)
+    first, another = (
+        Robust(SimpleNamespace(chain=size, normal=normal), None, distances, True, count, loss)
+        for size, distances, count in ((sums, (np.array([0, 100 * out]),), 3), (1.0, (), 4))
+    )
+    monkeypatch.setattr(robust, 'robust_fit', lambda *_: first)
+    monkeypatch.setattr(robust, 'reweighted', lambda *_: another)
+    monkeypatch.setattr(robust, 'trimmed_start', lambda *_: None)
+    monkeypatch.setattr(robust, 'trimmed_sum', lambda chain, _: chain)
+    monkeypatch.setattr(robust, '_chance', lambda *_: chance)
+    found = robust.thorough_fit(None, [], SimpleNamespace(count=10), loss)
+    assert found.iterations == (7 if second else 3)
