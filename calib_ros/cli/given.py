@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -39,16 +38,17 @@ WRITTEN = 'give the folder written by identify --out'
 
 
 class Unread(NamedTuple):
-    """Measurements before they are read; without files where they come through a pipe."""
+    """What is to be read, measurements first; without files if any comes through a pipe."""
 
-    path: Path
+    paths: tuple[Path, ...]
     files: tuple[tuple[str, int, int], ...]  # with sizes [bytes] and times of change [ns]
 
     @classmethod
-    def of(cls, path: Path) -> Unread:
-        """Return the measurements at a path."""
-        found = ((str(each), each.stat()) for each in page.files_of(path))
-        return cls(path, tuple((name, now.st_size, now.st_mtime_ns) for name, now in found))
+    def of(cls, *paths: Path) -> Unread:
+        """Return the files at some paths as they are now."""
+        each = [page.files_of(path) for path in paths]
+        found = ((str(file), file.stat()) for files in each if all(each) for file in files)
+        return cls(paths, tuple((name, now.st_size, now.st_mtime_ns) for name, now in found))
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
@@ -71,8 +71,9 @@ def history_of(options: argparse.Namespace) -> tuple[History, Unread] | None:
         return None
     if not options.serial:
         raise InputError('--history files results by serial number: add --serial')
-    named = (getattr(options, name, None) for name in ('csv', 'detections', 'measured'))
-    return History(options.history), Unread.of(next(filter(None, named), Path(os.devnull)))
+    values = map(vars(options).get, ('csv', 'detections', 'measured', *OF_TABLES))
+    paths = dict.fromkeys(value for value in values if isinstance(value, Path))
+    return History(options.history), Unread.of(*paths)
 
 
 def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Calibration:
@@ -98,23 +99,16 @@ def filing_of(
     *judged_by: object,
 ) -> Filing:
     """Return what is filed with a result: by its files, or by the samples where these changed."""
-    settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.path
-    content, changed = samples_hash(sets), None
-    if unread.files and unread == Unread.of(measured):
-        content = content_hash(_read(options, measured), options.session or '')
+    settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.paths[0]
+    read, changed = [samples_hash(sets)], None
+    if unread.files and unread == Unread.of(*unread.paths):
+        read = [each.sha256 for each in page.inputs_of(unread.paths)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
+    for name in (*OF_TABLES[1:], 'joints_preset'):  # a session is told apart anyway
+        value = vars(options).get(name)  # the same table in other units is another result
+        read += [f'{name} {value}'] if value and not isinstance(value, Path) else []
+    content = content_hash(read, options.session or '')
     return Filing(options.serial, measured_at(sets, changed), content, settings, str(measured))
-
-
-def _read(options: argparse.Namespace, measured: Path) -> list[str]:
-    """Return hashes of all that was read, and how: the same table in other units is another."""
-    found = [each.sha256 for each in page.input_of(measured)]
-    for name in (*OF_TABLES[1:], 'joints_preset', 'commanded'):  # a session is told apart anyway
-        value = getattr(options, name, None)
-        if isinstance(value, Path):
-            value = [each.sha256 for each in page.input_of(value)]
-        found += [f'{name} {value}'] if value else []
-    return found
 
 
 def origin_of(

@@ -48,7 +48,8 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
         found = verify(arm, sets, tolerance, confidence, moved[0], commanded, moved[1], work)
     if filed is not None:
         history, unread = filed
-        judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved)
+        wanted = None if commanded is None else commanded.tolist()
+        judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
         about = given.filing_of(options, nominal, sets, unread, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:

@@ -239,8 +239,9 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
 class Uncertainty(Shown):
     """Covariance of the fitted parameters, by source of error.
 
-    `parts` (K, P, P) belong to position, orientation, and priors; `freedom` (K,) are the degrees
-    of freedom of each noise estimate, infinite if known.
+    `parts` (K, P, P) belong to position, orientation, priors, and parameters held at nominal, or
+    to all of these; `freedom` (K,) are the degrees of freedom of each, infinite if the noise is
+    known.
     """
 
     parts: FloatArray

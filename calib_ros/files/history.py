@@ -138,11 +138,13 @@ def content_hash(files: Sequence[str], session: str = '') -> str:
 
 
 def samples_hash(sets: Sequence[Observations]) -> str:
-    """Return the hash of samples without a file."""
+    """Return the hash of samples without a file, by all that was measured."""
     found = hashlib.sha256()
     for each in sets:
-        for array in (each.stamps_ns, each.joints, each.positions, each.rotations):
-            found.update(np.ascontiguousarray(array).tobytes())
+        for part in fields(each):
+            value = getattr(each, part.name)
+            data = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
+            found.update(data)
     return found.hexdigest()
 
 

@@ -196,7 +196,7 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
 
 
 def stuck(seconds: float) -> Hint:
-    """Tell that targets moved for some time [s] while no joint did, as far as anybody told."""
+    """Report that targets moved for some time [s] while the joint states stood still."""
     return Hint(
         'the target moves but no joint does: are joint states frozen?',
         f'the target moved for {seconds:.0f} s or more while the joint states stood still: does '

@@ -98,6 +98,36 @@ def test_the_same_table_read_or_judged_in_another_way_is_another_result(folder):
     assert sorted(row.verdict for row in rows) == ['FAIL', 'FAIL', 'PASS', 'PASS']
 
 
+def test_programs_and_logs_through_pipes_make_other_results(folder, monkeypatch):
+    """They were not part of what was filed, so the second result was taken for the first."""
+    plants.write_plant(folder, ['0042'], 2)
+    common = ['--chain', 'ur10e', '--history', 'history', '--serial', '0042']
+    assert main(['identify', 'nights/0042/000.csv', *common, '--out', 'result']) == 0
+    table = Path('nights/0042/001.csv')
+    verify = [*common, '--calibration', 'result', '--tolerance', '0.5']
+
+    def piped(text):
+        end, begin = os.pipe()
+        os.write(begin, text)
+        os.close(begin)
+        return f'/dev/fd/{end}'
+
+    for more in ([], ['--commanded', str(table)]):
+        main(['verify', piped(table.read_bytes()), *verify, *more])
+    rows = History('history').rows('0042')[1:]
+    assert sorted(row.verdict for row in rows) == ['FAIL', 'PASS']
+
+    read = pandas.read_csv(table)
+    joints = [name for name in read if name[0] == 'q' and name[1:].isdigit()]
+    assert len(joints) == 6
+    read.drop(columns=joints).to_csv('poses.csv', index=False)
+    for turn in (0.0, 1.0):
+        log = (read[['stamp_ns', *joints]] + [0.0, *[turn] * 6]).to_csv(index=False).encode()
+        main(['verify', 'poses.csv', '--joints', piped(log), *verify])
+    rows = History('history').rows('0042')[3:]
+    assert sorted(row.verdict for row in rows) == ['FAIL', 'PASS']
+
+
 def test_an_impatient_operator_ends_a_fleet_in_good_order(folder, monkeypatch, capsys):
     plants.write_plant(folder, ['A'], 1)
     ended = []

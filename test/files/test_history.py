@@ -13,7 +13,15 @@ import pytest
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.history import Filing, History, Row, identified, measured_at, settings_hash
+from calib_ros.files.history import (
+    Filing,
+    History,
+    Row,
+    identified,
+    measured_at,
+    samples_hash,
+    settings_hash,
+)
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import Settings
@@ -161,6 +169,17 @@ def test_the_time_is_that_of_the_measurement():
     stamps = np.array([0, 1, 2], np.int64) + 1_700_000_000_000_000_000
     at = measured_at([replace(rows, stamps_ns=stamps)])
     assert at == datetime.fromtimestamp(1.7e9, timezone.utc)
+
+
+def test_all_that_was_measured_tells_samples_apart():
+    """Of distances, touches and images only the joint values counted."""
+    rng = np.random.default_rng(0)
+    rows = simulation.measure(CHAIN, CHAIN.random_joints(3, rng), rng)
+    near = replace(rows, distances=np.ones(3))
+    several = [rows, near, replace(near, distances=np.full(3, 1.1)), replace(rows, tool='other')]
+    several += [replace(rows, covariance=np.tile(k * np.eye(6), (3, 1, 1))) for k in (1, 2)]
+    assert len({samples_hash([each]) for each in several}) == len(several)
+    assert samples_hash([rows]) == samples_hash([rows.select(slice(None))])
 
 
 def test_writers_that_race_file_each_result_once(tmp_path):
