@@ -174,7 +174,7 @@ def regular(
         return found and replace(found, lines=lines)
     if ends is None:
         return None
-    lines = above + 1 + int(begin > 0) + np.arange(len(ends) // width)
+    lines = above + 1 + int(begin > 0) + np.arange((len(ends) - 1) // width)
     return TextColumns(path, names, lines, separator, data, ends)
 
 

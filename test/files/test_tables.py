@@ -7,6 +7,7 @@ import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files import loading
+from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
@@ -280,3 +281,13 @@ def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
     found = loading.table(path, Chain('arm', 'standard', joints), Settings())
     np.testing.assert_array_equal(found.fitted[0].joints, [[0.1, 0.2], [-0.3, 0.4]])
     assert noted in ' '.join(found.warnings)
+
+
+@pytest.mark.parametrize('header', ['q1', '"q1"'])
+def test_one_column_has_a_line_for_each_row(tmp_path, header):
+    """Split at separators it had one more."""
+    path = tmp_path / 'axis.csv'
+    path.write_text(f'{header}\n0.1\n0.2\n')
+    found = read_columns(path, ['q1'])
+    assert found.lines.tolist() == [2, 3]
+    assert found.select(slice(1, None)).lines.tolist() == [3]
