@@ -114,7 +114,7 @@ def whole_folder(
 
 
 def refuse_to_replace(path: Path, overwrite: bool = False, cure: str = 'move it') -> None:
-    """Refuse to write where something is but a file to `overwrite`; a `cure` is told for files."""
+    """Refuse a path in use, except a file to `overwrite`; the message offers a `cure`."""
     if path.exists() and not path.is_file():
         raise InputError(f'{path} is not a file: choose another name')
     if path.exists() and not overwrite:

@@ -163,7 +163,8 @@ def verify(
     sets : sequence of Observations
         New measurements of poses or positions, in the frames of the calibration.
     tolerance : float, optional
-        Largest acceptable RMS position error [m]; without it there is no verdict.
+        Largest acceptable RMS position error [m]; without it the verdict is whether the
+        calibration holds.
     confidence : float
         Of the verdict.
     new_base, new_tool : bool

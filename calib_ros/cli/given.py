@@ -66,7 +66,7 @@ def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | No
 
 
 def history_of(options: argparse.Namespace) -> tuple[History, Unread] | None:
-    """Return where a result is filed, if it is to be; refuse one without a serial number."""
+    """Return the history for a result and what is to be read, or None without --history."""
     if options.history is None:
         return None
     if not options.serial:

@@ -160,8 +160,8 @@ class _Parser(argparse.ArgumentParser):
         if message.endswith(': --chain'):
             message += ' (calib_ros robots lists the arms supplied)'
         self.print_usage(sys.stderr)
-        said = fitted(f'{self.prog}: error: {message}', '  ', sys.stderr)
-        self.exit(2, f'{said}\nexample: {self.example.lstrip()}\n')
+        text = fitted(f'{self.prog}: error: {message}', '  ', sys.stderr)
+        self.exit(2, f'{text}\nexample: {self.example.lstrip()}\n')
 
 
 def _parser(given: Iterable[str]) -> argparse.ArgumentParser:

@@ -251,8 +251,8 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
 def _together(mistakes: Sequence[Suspect]) -> Suspect:
     published = [f'{each.what} ({each.published})' for each in mistakes]
     of_tables = [
-        f'{each.what} ({each.remedy})' if each.part == 'measured' else said
-        for each, said in zip(mistakes, published, strict=True)
+        f'{each.what} ({each.remedy})' if each.part == 'measured' else setting
+        for each, setting in zip(mistakes, published, strict=True)
     ]
     what = 'several mistakes at once'
     return Suspect(what, '; '.join(of_tables), published='; '.join(published))

@@ -214,10 +214,12 @@ def _gravity(problem: Problem, result: Identification) -> str:
 
 
 def _motion(problem: Problem, result: Identification) -> str:
-    """Return in words that what is left is larger where the arm moves faster."""
+    """Return that residuals are larger where the arm is faster or accelerates more."""
+    if result.noise.position <= 1.0:
+        return ''
     for each, far in zip(problem.sets, result.distances, strict=True):
         for what, rates in (('speed', each.velocity), ('acceleration', each.acceleration)):
-            if rates is None or result.noise.position <= 1.0:
+            if rates is None:
                 continue
             size = np.linalg.norm(rates, axis=1)
             low, high = np.quantile(size, [1.0 / 3.0, 2.0 / 3.0])

@@ -192,7 +192,7 @@ def _cross_validate(
     after: Chain,
     names: Sequence[str],
     robust: Robust,
-    said: str,
+    note: str,
 ) -> tuple[Comparison | None, str]:
     groups = problem.configurations
     count = distinct(np.concatenate(groups))
@@ -212,7 +212,7 @@ def _cross_validate(
     first, second = left_out(chains, problem.sets, groups, numbers)
     return (
         Comparison(first, second, ~robust.outliers),
-        f'{folds}-fold cross-validation over {count} different poses{said}',
+        f'{folds}-fold cross-validation over {count} different poses{note}',
     )
 
 

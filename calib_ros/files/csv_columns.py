@@ -245,7 +245,7 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
 
 
 def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
-    """Return the option that names missing columns: with those of a header like them, or NAME."""
+    """Return --columns for the missing columns, with similar names of the header or NAME."""
     if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
         return 'Its first line holds numbers, not names: --columns "q1=#1,q2=#2,..."'
     found = {

@@ -183,10 +183,10 @@ class Calibration(Shown):
         return 0.0 if self.rows is None else self.rows.share(sets)
 
     def frames_of(self, owners: Mapping[str, records.Owner]) -> dict[str, str]:
-        """Return which of its frames those of new measurements are, by their names.
+        """Return the calibration's frame for each frame of new measurements.
 
-        They are of the same session, device or target; else of that in another session; else those
-        that have the names, unless these are of others.
+        That of the same session and device or target; else of the same one in another session;
+        else of the same name. If that is taken, the name becomes one that no frame has.
         """
         same = {(name[:4], *owner): name for name, owner in self.owners.items()}
         other = {(side, *what): n for (side, _, *what), n in reversed(same.items()) if what[-1]}

@@ -259,7 +259,7 @@ def _is_number(cell: str) -> bool:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return a file, or those of a folder; none of a pipe, which cannot be read once more."""
+    """Return a file, or those of a folder; none for a pipe, which cannot be read twice."""
     return sorted(each for each in (path, *path.rglob('*')) if each.is_file())
 
 

@@ -73,12 +73,12 @@ def summary(
 
 
 def between(judged: Comparison | None, when: int) -> str:
-    """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty where not known."""
+    """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty if unknown."""
     return ' to '.join(map(rounded, limits_mm(judged, when) or ()))
 
 
 def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:
-    """Return that interval; None where it is not known: of a fit, it would prove nothing."""
+    """Return that interval, or None if unknown; that of a fit would prove nothing."""
     limits = [1e3 * x for x in interval_of(judged, when, INTERVAL)] if judged else [np.inf]
     return limits if np.isfinite(limits).all() else None
 
@@ -117,7 +117,7 @@ def notes(result: Identification) -> list[str]:
 
 
 def in_part(result: Identification) -> str:
-    """Return what errors are of measurements that are no places in space; empty where all are."""
+    """Return what errors of distances, planes and corners mean; empty for positions alone."""
     position = result.fitted.after.position
     if (position[:, 0] != 0.0)[~position[:, 1:].any(axis=1)].any():
         return (
@@ -199,8 +199,8 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
 
     def comparison(which: Comparison) -> dict[str, Any]:
         before, after = map(asdict, which.figures)
-        for when, told in enumerate((before, after) if which is judged else ()):
-            told['rms_lower_mm'], told['rms_upper_mm'] = limits_mm(which, when) or (None, None)
+        for when, rms in enumerate((before, after) if which is judged else ()):
+            rms['rms_lower_mm'], rms['rms_upper_mm'] = limits_mm(which, when) or (None, None)
         with_outliers = asdict(which.figures_of_all[1])
         found = {'before': before, 'after': after, 'outliers': which.outliers}
         return found | {'after_with_outliers': with_outliers}

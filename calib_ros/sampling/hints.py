@@ -205,7 +205,7 @@ def stuck(seconds: float) -> Hint:
 
 
 def frozen(samples: Sequence[Sample]) -> Hint | None:
-    """Report a device that measures the same to the nanometre wherever the arm is, if it does."""
+    """Report a device that repeats one position, to the nanometre, wherever the arm is."""
     places: dict[tuple[object, ...], list[FloatArray]] = {}
     for each in samples:
         if each.position is not None and not each.socket:
