@@ -69,7 +69,7 @@ class CalibrationSession:
         self.recording = True
         self.calibration: Calibration | None = None
         """The last one accepted or loaded."""
-        self._known: frozenset[Sample] = frozenset()  # fitted by it
+        self._known: frozenset[Sample] = frozenset()  # those it must not be judged by
         self.clear()
 
     def clear(self) -> None:
