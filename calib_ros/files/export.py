@@ -78,12 +78,13 @@ def exports(
     q = anywhere(chain)
     arm = replace(chain, effects=())
     wanted = arm.forward(q)
-    lost = _distance(chain.forward(q), wanted) if chain.effects else 0.0
+    lost = _distance(chain.forward(q), replace(chain, effects=nominal.effects).forward(q))
+    counting = ', with the effects of the nominal chain' * bool(nominal.effects)
     digest = table_hash(chain)
     found = []
     for convention in get_args(Convention):
         form = converted(arm, convention)
-        what = f'{convention} Denavit-Hartenberg table'
+        what = f'{convention} Denavit-Hartenberg table{counting}'
         beyond = cut_off(arm, convention)
         text = _csv(form, f'{what}{beyond and f" ({beyond})"}', lost, digest)
         again = _read_csv(text, form)
@@ -101,8 +102,7 @@ def exports(
     ):
         best = _approximated(chain, nominal, kinds, region)
         error = _distance(best.forward(region), chain.forward(region))
-        what += ', with the effects of the nominal chain' * bool(nominal.effects)
-        text = _csv(best, f'{nominal.convention} {what}', error, digest)
+        text = _csv(best, f'{nominal.convention} {what}{counting}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
 

@@ -196,13 +196,15 @@ def test_what_a_table_cannot_say_is_said_at_its_head():
     assert 'off the calibrated arm' in table.content.splitlines()[0]
 
 
-def test_tables_without_beta_count_on_effects_that_the_controller_knows():
-    """A palletiser's coupled joints: without the coupling the best offsets were a metre off."""
+def test_tables_count_on_effects_that_the_controller_knows():
+    """A palletiser's coupled joints: without the coupling each table was up to a metre off."""
     nominal, chain = corrected('kuka_youbot')
     coupled = (('arm_joint_4.coupling_arm_joint_3', -1.0),)
     nominal, chain = (replace(each, effects=coupled) for each in (nominal, chain))
-    for table in exports(chain, nominal)[-2:]:
-        assert table.error < 0.02
+    *exact, without_beta, offsets = exports(chain, nominal)
+    assert {each.error for each in exact} == {0.0}
+    assert max(without_beta.error, offsets.error) < 0.02
+    for table in (*exact[:4], without_beta, offsets):
         assert 'with the effects of the nominal chain' in table.content.splitlines()[0]
 
 
