@@ -39,6 +39,7 @@ from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.identifiability import growth
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, chance_of
+from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
 from calib_ros.estimation.samples import seen_residuals
@@ -219,7 +220,7 @@ def _motion(problem: Problem, result: Identification) -> str:
         return ''
     for each, far in zip(problem.sets, result.distances, strict=True):
         for what, rates in (('speed', each.velocity), ('acceleration', each.acceleration)):
-            if rates is None:
+            if rates is None or len(rates) < SOME_POSES:  # few do by chance
                 continue
             size = np.linalg.norm(rates, axis=1)
             low, high = np.quantile(size, [1.0 / 3.0, 2.0 / 3.0])

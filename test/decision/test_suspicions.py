@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from fits import rms
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.suspicions import _common, scale_of
+from calib_ros.decision.suspicions import _common, _motion, scale_of
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
@@ -274,3 +275,18 @@ def test_a_board_that_is_stretched_is_told(on_flange):
         told = [each for each in result.remarks if 'for its height than stated' in each]
         assert bool(told) == bool(said)
         assert all(re.match(rf'the board is 0\.[345]\d? % {said}', each) for each in told)
+
+
+@pytest.mark.parametrize(('count', 'named'), [(30, 0), (200, 100)])
+def test_few_samples_show_no_errors_of_time(count, named):
+    """Of 30 the fastest third is 1.5 times worse by chance in some sessions."""
+    rng = np.random.default_rng(0)
+    found = 0
+    for _ in range(100):
+        speeds = rng.normal(size=(count, 6))
+        seen = SimpleNamespace(velocity=speeds, acceleration=None)
+        sizes = np.linalg.norm(rng.normal(size=(count, 3)), axis=1)
+        sizes *= np.linalg.norm(speeds, axis=1) ** 3 if named else 1.0
+        result = SimpleNamespace(distances=[sizes], noise=SimpleNamespace(position=1.1))
+        found += 'speed' in _motion(SimpleNamespace(sets=[seen]), result)
+    assert found == named
