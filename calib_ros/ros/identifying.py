@@ -94,6 +94,10 @@ class Filer:
         return ''
 
 
+ANSWER_LENGTH = LONGEST // 2
+"""Characters of an answer: a few terminal lines; the rest is in a file and the log."""
+
+
 class Snapshot(NamedTuple):
     """The input of an identification, and its settings."""
 
@@ -214,12 +218,12 @@ class Identifying:
         The whole is in the log, and beside the journal.
         """
         success, text = answer
-        if len(text) > LONGEST:
+        if len(text) > ANSWER_LENGTH:
             path = self._archive.note(f'{text}\n')
             path = self._report or path
             more = f' ... full text: {path.name if path else "in the log"}'
             before, advice, _ = text.partition(self._advice or text)
-            text = _without_middle(before + advice, LONGEST - len(more)) + more
+            text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
         return success, text
 
 
