@@ -405,6 +405,20 @@ def test_distances_and_outliers_have_pages():
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
 
 
+def test_outliers_held_out_are_listed_too():
+    """They have no weight to lose; the table had those of the fit only."""
+    problem = problem_of()
+    problem.judging[0].positions[3] += 0.02
+    for fitted in (False, True):
+        if fitted:
+            problem.sets[0].positions[7] += 0.03
+        report = report_of(problem, identify(problem))
+        (table,) = (each for each in report.sections if each.name == 'outliers')
+        assert table.title == f'Outliers: {1 + fitted} of {TRAIN + TEST} poses'
+        assert [row[2] for row in table.rows][fitted:] == ['held out']
+        assert [float(row[3]) > 10.0 for row in table.rows] == [True] * (1 + fitted)
+
+
 def test_poses_and_measurements_are_two_counts(solved):
     """A bag gives several measurements of each pose; what is empty is no fact."""
     counts = {'samples': TRAIN, 'poses': 3 * TRAIN, 'foreign_names': (), 'unused': {}}
