@@ -367,8 +367,14 @@ def test_a_verification_has_its_verdict_first(solved):
     where = [page.text.index(words) for words in order]
     assert where == sorted(where)
     assert page.text.count('not the corrected robot') == 1
+    assert f'Poses {TEST}  Different poses {TEST}' in page.text
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
+    sets = (problem.held_out.select(np.arange(TEST) // 2),)
+    found = verify(Calibration.of(result), sets, 1e-3)
+    poses = poses_to_verify(result.chain, sets, found.comparison)
+    page = page_of(verification_report(result.chain, found, poses, Origin()))
+    assert f'Measurements {TEST}  Different poses {TEST // 2}' in page.text
 
 
 def packed(text):
