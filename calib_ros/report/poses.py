@@ -140,6 +140,7 @@ def _poses(
     groups: Sequence[tuple[Sequence[Samples], Comparison, NDArray[np.str_], FloatArray]],
     lines: bool,
     images: Mapping[int, str],
+    repeats: bool = False,
 ) -> Poses:
     """Return the poses of sets with residuals, roles (N,) and sizes (N,), in stamp order."""
     parts: list[dict[str, NDArray[Any]]] = []
@@ -179,7 +180,7 @@ def _poses(
     tools = arrays.pop('tools')
     order = np.argsort(arrays['stamps_ns'], kind='stable')
     ordered = {name: array[order] for name, array in arrays.items()}
-    return Poses(**ordered, tools=tools, lines=lines, images=images)
+    return Poses(**ordered, tools=tools, lines=lines, images=images, repeats=repeats)
 
 
 def poses_of(
@@ -211,7 +212,7 @@ def poses_to_verify(
     samples = [samples_of(each, sigmas, Settings.sigma_pixel) for each in sets]
     groups = [(samples, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     repeats = distinct(comparison.after.configurations) < count
-    return replace(_poses(chain, groups, lines, NAMELESS), repeats=repeats)
+    return _poses(chain, groups, lines, NAMELESS, repeats)
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:

@@ -8,7 +8,7 @@ from pages import problem_of
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
-from calib_ros.decision.validation import ErrorFigures
+from calib_ros.decision.validation import Comparison, Residuals
 from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
@@ -27,10 +27,13 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
     """By ~/validate, and by ~/check where no change shows besides."""
     arm = load_chain('ur10e')
     previous = Calibration(arm, arm, residual=1e-4)
-    now = ErrorFigures(20, rms_mm, rms_mm, rms_mm, rms_mm, None)
+    away = np.tile([1e-3 * rms_mm, 0.0, 0.0], (20, 1))
+    off = Residuals(away, np.nan * away, np.arange(20), np.nan * away)
+    both = Comparison(off, off, np.ones(20, bool))
+    now = both.figures[1]
     for told in (
         verdict(previous, now, now),
-        checked(previous, Recalibration(previous, (), 1.0, now, now, 1e-4, 1e-4, 0.0)),
+        checked(previous, Recalibration(previous, (), 1.0, both, 1e-4, 1e-4, 0.0)),
     ):
         assert told[0] == holds
         assert ('no longer holds: RMS 0.160 mm' in told[1]) != holds
