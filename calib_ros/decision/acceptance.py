@@ -71,7 +71,7 @@ def _of_the_fit(
         named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
         spans = np.ptp(np.concatenate([each.joints for each in problem.sets]), axis=0)
         still = [problem.chain.joint_names[k] for k in np.flatnonzero(spans <= STILL)]
-        stood = f'{", ".join(still)} stood still: ' if still else ''
+        stood = f'{", ".join(still)} stood still (or was not recorded): ' if still else ''
         yield Reason(Rule.EXCITATION, f'{stood}the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
