@@ -14,11 +14,12 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report import words
 from calib_ros.report.applied import verification_report
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import in_words
-from calib_ros.report.words import checked, verdict
+from calib_ros.report.words import between, checked, verdict
 from calib_ros.shown import rounded
 
 
@@ -80,3 +81,12 @@ def test_no_figure_is_rounded_to_nothing():
     values = (0.00042, 0.0996, 0.31, 12.3456, 0.0, -0.00042)
     wanted = ['0.00042', '0.100', '0.310', '12.346', '0.000', '-0.00042']
     assert [rounded(value) for value in values] == wanted
+
+
+@pytest.mark.parametrize(
+    ('limits', 'said'),
+    [([0.00899, 0.0131], '0.009 to 0.013'), ([4e-4, 6e-4], '0.00040 to 0.00060'), (None, '')],
+)
+def test_the_limits_of_an_interval_have_the_same_decimals(monkeypatch, limits, said):
+    monkeypatch.setattr(words, 'limits_mm', lambda *_: limits)
+    assert between(None, 0) == said
