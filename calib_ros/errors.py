@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterable
+from itertools import islice
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -101,7 +102,9 @@ def unreadable(path: Path, err: OSError, what: str = '') -> str:
     text = f'cannot read {what}{path}: {err.strerror or err}'
     if not isinstance(err, FileNotFoundError) or not path.parent.is_dir():
         return text
-    hint = near(path.name, (each.name for each in path.parent.iterdir()), 0.7)
+    some = islice(path.parent.iterdir(), MOST_ENTRIES)
+    likely = (each.name for each in some if near(path.stem, [each.stem], 0.7))
+    hint = near(path.name, likely, 0.7)  # any two tables share their ending
     return f'{text}: {hint}' if hint else text
 
 

@@ -15,15 +15,16 @@ from scipy.spatial import cKDTree
 from calib_ros.apply.compensation import Compensator
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 
 
 def meant(
     nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
-) -> FloatArray:
+) -> tuple[FloatArray, Index]:
     """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
 
-    The nearest of the program (M, n), as it is or corrected by the calibration.
+    The nearest of the program (M, n), as it is or corrected by the calibration, and which (N,)
+    were nearer to it corrected (1) or as it is (0).
 
     Raises
     ------
@@ -40,4 +41,5 @@ def meant(
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])
     _, nearest = cKDTree(both).query(joints, p=np.inf)
-    return np.asarray(commanded[nearest % len(commanded)])
+    corrected, point = np.divmod(nearest, len(commanded))
+    return commanded[point], corrected

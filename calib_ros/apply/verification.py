@@ -109,6 +109,8 @@ class Verification(Shown):
         Whether the error agrees with that of the calibration (`Calibration.holds`), if known.
     reused : float
         Share of the measurements that the calibration was fitted to (`Calibration.reused`).
+    uncorrected : bool
+        Whether all measurements were taken at the joint values of the program as it was given.
     """
 
     comparison: Comparison
@@ -126,6 +128,7 @@ class Verification(Shown):
     fitted: tuple[str, ...] = ()
     holds: bool | None = None
     reused: float = 0.0
+    uncorrected: bool = False
 
     @property
     def configurations(self) -> int:
@@ -185,7 +188,7 @@ def verify(
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm.chain, sets, tolerance, confidence, fitted)
-    comparison, left = _compared(arm, sets, commanded, fitted)
+    comparison, left, uncorrected = _compared(arm, sets, commanded, fitted)
     progress(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
@@ -202,7 +205,7 @@ def verify(
     if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, holds, arm.reused(sets))
+    known = (commanded is not None, fitted, holds, arm.reused(sets), uncorrected)
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 
@@ -211,21 +214,26 @@ def _compared(
     sets: Sequence[Observations],
     commanded: FloatArray | None,
     fitted: tuple[str, ...],
-) -> tuple[Comparison, FloatArray]:
-    """Return the residuals, and those of position (N, 3) [m] without one common motion."""
+) -> tuple[Comparison, FloatArray, bool]:
+    """Return the residuals, and those of position (N, 3) [m] without one common motion.
+
+    And whether all were measured at the commanded joint values, not at corrected ones.
+    """
     before, after = arm.before, arm.chain
-    wanted = sets
+    wanted, uncorrected = sets, False
     if commanded is not None:
         commanded = before.joint_values(commanded)
         if not np.isfinite(commanded).all():
             raise InputError('the commanded joint values are not all finite numbers')
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         arms = arm.before, arm.chain
-        wanted = [replace(s, joints=meant(*arms, s.joints, commanded)) for s in sets]
+        found = [meant(*arms, each.joints, commanded) for each in sets]
+        wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
+        uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
     reached = compare(before, after, wanted).after
     shaped = compare(before, _rebased(after, wanted), wanted).after
-    return replace(compare(before, after, sets), after=reached), shaped.position
+    return replace(compare(before, after, sets), after=reached), shaped.position, uncorrected
 
 
 def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:

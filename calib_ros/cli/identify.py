@@ -17,6 +17,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
+from calib_ros.decision.validation import Comparison
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -128,6 +129,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
             ('robot', found.calibration.chain.name),
             ('new poses', f'{after.count}, each judged by the others'),
             ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm'),
+            *_interval(found.comparison),
             ('arm known to', f'{known} over the joint range (one sigma)'),
         )
     )
@@ -140,6 +142,12 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
         perhaps = 'perhaps ' if why else ''
         for reasons in found.changed:
             screen.bullet(perhaps + reason_in_words(reasons))
+
+
+def _interval(judged: Comparison | None) -> tuple[tuple[str, str], ...]:
+    """Return the row with the intervals of the RMS errors; none where they are not known."""
+    likely = [words.between(judged, when) for when in (0, 1)]
+    return (('95 % interval', f'RMS {" -> ".join(likely)} mm'),) if all(likely) else ()
 
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
@@ -303,15 +311,13 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     if before.rms_px is not None and after.rms_px is not None:
         second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
     valid: tuple[tuple[str, str], ...] = ()
-    likely = [words.between(result.validation, when) for when in (0, 1)]
-    known = (('95 % interval', f'RMS {" -> ".join(likely)} mm'),) if all(likely) else ()
     if result.accepted and result.region is not None:
         valid = (('valid', result.region.in_words().removeprefix('valid ')),)
     return (
         ('robot', f'{result.chain.name}, {fitted}'),
         ('fitted to', measured),
         ('position error', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm{proof}'),
-        *known,
+        *_interval(result.validation),
         second,
         ('judged by', result.validated_by),
         *valid,

@@ -13,7 +13,7 @@ from calib_ros.apply.workspace import Spread, Survey, in_base, regions, task_of
 from calib_ros.cli import given, options as common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.files.programs import csv_of, joints_csv, read_poses
+from calib_ros.files.programs import check_limits, csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -92,7 +92,8 @@ def _task(
             f'--joint-box: give {size} lower and {size} upper values, not '
             f'{len(options.joint_box)} in all'
         )
-    lower, upper = np.reshape(options.joint_box, (2, size))
+    lower, upper = box = np.reshape(options.joint_box, (2, size))
+    check_limits(box, arm.chain, lambda *_: '--joint-box: ')
     if not (lower <= upper).all():
         raise InputError('--joint-box: give all lower values first, then all upper ones')
     joints = rng.uniform(lower, upper, (30, size))

@@ -17,6 +17,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step
 from calib_ros.decision.validation import COUNTS, Comparison, log_gain, mean_squares
+from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.shown import some
@@ -68,7 +69,10 @@ def _of_the_fit(
         for each in missing:
             kinds.setdefault(each.owner, []).append(each.kind)
         named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
-        yield Reason(Rule.EXCITATION, f'the poses do not determine {named}')
+        spans = np.ptp(np.concatenate([each.joints for each in problem.sets]), axis=0)
+        still = [problem.chain.joint_names[k] for k in np.flatnonzero(spans <= STILL)]
+        stood = f'{", ".join(still)} stood still (or was not recorded): ' if still else ''
+        yield Reason(Rule.EXCITATION, f'{stood}the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])

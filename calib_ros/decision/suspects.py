@@ -281,7 +281,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
             columns = ', '.join('xyz'[k] for k in held)
             return Suspect(
                 f'all positions have the same {columns}, though the arm moves in all directions',
-                f'was the column {columns} recorded, and read correctly?',
+                f'give the column {columns} as it was measured, or measure again with it',
                 published='check the positions where they are published',
             )
     return None

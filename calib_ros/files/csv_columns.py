@@ -122,7 +122,7 @@ def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
         refuse_separator(found.path, found.header)
         raise InputError(
             f'{found.path} has no column {", ".join(missing)}; expected {", ".join(needed)}; '
-            f'found {", ".join(found.header) or "nothing"}'
+            f'found {", ".join(found.header) or "nothing"}: name the columns in the first line'
         )
     if not len(found.lines):
         raise InputError(f'{found.path} has no rows')
@@ -203,7 +203,7 @@ def _irregular(path: Path, text: str, progress: Notify, above: int) -> MadeColum
             refuse_separator(path, header)
             raise ColumnsError(
                 f'{path}, line {line}: more values than the {len(header)} columns of its header; '
-                'a table with other lines above that: calib_ros import'
+                'remove other lines above that (of measurements: calib_ros import)'
             )
         if len(rows) == MOST_ROWS:
             raise InputError(

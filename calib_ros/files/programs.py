@@ -40,15 +40,20 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     found = read_columns(path, ())
     names = _header_of(found, chain.joint_names)
     values = found.block(names)
-    check_turns(values, chain, lambda k, i: f'{found.where(k, names[i])} ')
+    check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ')
+    return values
+
+
+def check_limits(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:
+    """Refuse joint values (N, n) 1e-3 beyond their limits, or as `check_turns`."""
+    check_turns(values, chain, where)
     lower, upper = limits(chain)
     beyond = (values < lower - 1e-3) | (values > upper + 1e-3)
     for k, i in np.argwhere(beyond)[:1].tolist():
         raise InputError(
-            f'{found.where(k, names[i])} {values[k, i]:.6g} is beyond the limits of '
-            f'{chain.joint_names[i]}, {lower[i]:.6g} to {upper[i]:.6g} (rad or m)'
+            f'{where(k, i)}{values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
+            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m, not degrees)'
         )
-    return values
 
 
 def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Explanation
-from calib_ros.decision.validation import ErrorFigures
+from calib_ros.decision.validation import Comparison, ErrorFigures
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import reused_in_words
@@ -21,7 +21,7 @@ class Recalibration(Shown):
     """An earlier calibration, updated with new poses.
 
     `changed` lists the changes, each with those indistinguishable from it; `unexplained` is the
-    probability of residuals as large as the remaining ones. `before` and `after` are errors of the
+    probability of residuals as large as the remaining ones. `comparison` holds the errors of the
     new poses by the earlier calibration, and predicted from the other poses. `known_before` and
     `known_after` are the RMS uncertainty [m] of positions over the joint range, `moved` is their
     change. If new frames are fitted to all new poses for `before`, `refitted` is the ratio by
@@ -33,14 +33,23 @@ class Recalibration(Shown):
     calibration: Calibration
     changed: tuple[tuple[Explanation, ...], ...]
     unexplained: float
-    before: ErrorFigures
-    after: ErrorFigures
+    comparison: Comparison
     known_before: float
     known_after: float
     moved: float
     reused: float = 0.0
     refitted: float = 1.0
     odd: str = ''
+
+    @property
+    def before(self) -> ErrorFigures:
+        """Return the errors of the new poses by the earlier calibration."""
+        return self.comparison.figures[0]
+
+    @property
+    def after(self) -> ErrorFigures:
+        """Return the errors of the new poses predicted from the others."""
+        return self.comparison.figures[1]
 
     @property
     def accepted(self) -> bool:

@@ -23,7 +23,7 @@ import numpy as np
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
-from calib_ros.decision.validation import ErrorFigures, left_out, residuals
+from calib_ros.decision.validation import Comparison, left_out, residuals
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import products_with_doubts
@@ -148,7 +148,7 @@ def _recalibrated(
         _updated(arm, found, problem, changed),
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
-        *_judged(arm, earlier, found, system, sets),
+        _judged(arm, earlier, found, system, sets),
         *_known(arm, before, found),
         previous.reused(sets),
         _left_out_ratio(system.rows, len(names)),
@@ -323,7 +323,7 @@ def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
 
 def _judged(
     arm: _Arm, earlier: Chain, found: _Found, system: System, sets: Sequence[Observations]
-) -> tuple[ErrorFigures, ErrorFigures]:
+) -> Comparison:
     """Return the errors of the new poses by the earlier arm, and predicted from the others."""
     groups = numbered(sets)
     count = min(SOME_POSES, distinct(np.concatenate(groups)))
@@ -337,7 +337,7 @@ def _judged(
         chains.append((earlier, arm.changed(rest.mean(arm.square)[0])))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
-    return before.figures(every), after.figures(every)
+    return Comparison(before, after, every)
 
 
 def _updated(

@@ -160,6 +160,8 @@ def coverage(
         lower, upper = min(lower, low), max(upper, high)
         counts[k] = np.histogram(joints[:, k], parts, (lower, upper))[0]
         ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}'
+        if joint.lower is None and joint.upper is None:
+            ends = 'no limits'
         labels.append(f'{label(joint.name)}: {ends}')
         used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
         share = 100.0 * float(np.mean(counts[k] > 0))

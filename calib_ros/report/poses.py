@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import Comparison
+from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.pixels import samples_of
@@ -73,6 +74,7 @@ class Poses:
     tools: FloatArray  # (S, 4, 4) of the sets
     lines: bool = False  # stamps are the lines of a table, in seconds
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
+    repeats: bool = False  # some rows measure the same pose
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -92,7 +94,7 @@ class Poses:
     def things(self) -> str:
         """Return the plural name of the rows."""
         if not self.corner.any():
-            return 'poses'
+            return 'measurements' if self.repeats else 'poses'
         return 'corners' if self.corner.all() else 'measurements'
 
     def source(self, row: int) -> str:
@@ -106,7 +108,7 @@ class Poses:
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
         """Return some poses by a mask (N,) or indices (K,)."""
-        of_all = ('tools', 'lines', 'images')
+        of_all = ('tools', 'lines', 'images', 'repeats')
         names = (each.name for each in fields(self) if each.name not in of_all)
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
@@ -138,6 +140,7 @@ def _poses(
     groups: Sequence[tuple[Sequence[Samples], Comparison, NDArray[np.str_], FloatArray]],
     lines: bool,
     images: Mapping[int, str],
+    repeats: bool = False,
 ) -> Poses:
     """Return the poses of sets with residuals, roles (N,) and sizes (N,), in stamp order."""
     parts: list[dict[str, NDArray[Any]]] = []
@@ -177,7 +180,7 @@ def _poses(
     tools = arrays.pop('tools')
     order = np.argsort(arrays['stamps_ns'], kind='stable')
     ordered = {name: array[order] for name, array in arrays.items()}
-    return Poses(**ordered, tools=tools, lines=lines, images=images)
+    return Poses(**ordered, tools=tools, lines=lines, images=images, repeats=repeats)
 
 
 def poses_of(
@@ -208,7 +211,8 @@ def poses_to_verify(
     sigmas = (Settings.sigma_position, Settings.sigma_orientation)
     samples = [samples_of(each, sigmas, Settings.sigma_pixel) for each in sets]
     groups = [(samples, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
-    return _poses(chain, groups, lines, NAMELESS)
+    repeats = distinct(comparison.after.configurations) < count
+    return _poses(chain, groups, lines, NAMELESS, repeats)
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:

@@ -219,7 +219,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
             *map(words.chance_in_words, () if result.chance is None else (result.chance,)),
         ),
     )
-    if result.outliers:
+    if poses.outlier.any():
         yield _outliers(poses)
     yield from _offsets(problem, result)
     yield _parameters(result)
@@ -267,19 +267,21 @@ def _effects(result: Identification) -> Section:
 
 
 def _outliers(poses: Poses) -> Section:
-    rows = np.flatnonzero(poses.outlier & ~np.isnan(poses.size))
-    rows = rows[np.argsort(-poses.size[rows])]
     after = 1e3 * np.linalg.norm(poses.after, axis=1)
+    rows = np.flatnonzero(poses.outlier)
+    rows = rows[np.argsort(-after[rows])]
     more = ' The 50 largest are shown.' if len(rows) > 50 else ''
     return section(
         'outliers',
-        f'Outliers: little or no weight for {len(rows):,} of {len(poses):,} {poses.things}',
-        'They differ from the others by more than this arm and device explain. Measure them '
-        f'again, or find out what happened.{more}',
+        f'Outliers: {len(rows):,} of {len(poses):,} {poses.things}',
+        'They differ from the others by more than this arm and device explain: little or no '
+        'weight in the fit, none in the figures. Measure them again, or find out what happened.'
+        f'{more}',
         head=('from', poses.things[:-1], 'times the usual error', 'error after [mm]'),
         rows=tuple(
-            (poses.source(k), str(k + 1), f'{poses.size[k]:.1f}', f'{after[k]:.3f}')
+            (poses.source(k), str(k + 1), size, f'{after[k]:.3f}')
             for k in rows[:50].tolist()
+            for size in ('held out' if np.isnan(poses.size[k]) else f'{poses.size[k]:.1f}',)
         ),
     )
 

@@ -77,6 +77,12 @@ def hints(found: Verification) -> list[str]:
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide')
+    if found.uncorrected and found.verdict in ('FAIL', 'does not hold'):
+        lines.append(
+            'the arm stood at the joint values of --commanded themselves: either the correction '
+            'is not active, or this is the corrected program: give the program as it was before '
+            'calib_ros compensate'
+        )
     if found.verdict == 'does not hold':
         lines.append('the error has grown since the calibration was made')
     if found.common < NEARER:

@@ -74,7 +74,11 @@ def summary(
 
 def between(judged: Comparison | None, when: int) -> str:
     """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty if unknown."""
-    return ' to '.join(map(rounded, limits_mm(judged, when) or ()))
+    limits = limits_mm(judged, when)
+    if limits is None:
+        return ''
+    upper = rounded(limits[1])
+    return f'{limits[0]:.{len(upper.partition(".")[2])}f} to {upper}'
 
 
 def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:

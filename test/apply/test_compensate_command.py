@@ -257,6 +257,8 @@ WRONG = [
     ('.csv', 'q1,q2,q3,q4,q5\n1,2,3,4,5\n', 'has no column q6'),
     ('.csv', 'q1,q2,q3,q4,q5,q6,q7\n1,0,0,1,0,1,0\n', 'q7, but the arm has 6 joints only'),
     ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'several columns q1'),
+    ('.csv', 'Q1,Q2,Q3,Q4,Q5,Q6\n1,2,3,4,5,6\n', 'Q6: name the columns in the first line'),
+    ('.csv', '# picks\nq1,q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', 'header; remove other lines above'),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a finite number, not ''"),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a finite number, not 'x'"),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,nan\n', 'q6 must be a finite number'),

@@ -106,6 +106,8 @@ def test_a_correction_that_did_not_arrive_shows(cell, arm, program):
         seen = [measured(true, joints[::-1])]
         found = verify(arm, seen, 5e-4, commanded=meant)
         assert found.verdict == verdict
+        assert found.uncorrected is ('is the corrected program' in in_words(found))
+        assert found.uncorrected is (verdict == 'FAIL')
         assert verify(arm, seen, 5e-4).verdict == 'PASS'  # the calibration itself is right
     corrected = verify(arm, [measured(true, moved)], 5e-4, commanded=meant)
     by_model = verify(arm, [measured(true, moved)], 5e-4)

@@ -56,6 +56,10 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, capsys):
             assert 'about the calibration' not in out
             assert '15 times at 5 poses' in out
             assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
+    judge[judge.index('tests.csv')] = 'corrected.csv'
+    assert main([*judge, 'result', '--tolerance', '1']) == Status.NOT_ACCEPTED
+    out = ' '.join(capsys.readouterr().out.split())
+    assert 'give the program as it was before calib_ros compensate' in out
 
 
 def test_an_arm_without_correction_passes_only_with_a_remark(cell, folder, capsys):

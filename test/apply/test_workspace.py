@@ -199,6 +199,11 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     [
         (('--joint-box', 0, 1), '--joint-box: give 6 lower and 6 upper values, not 2'),
         (('--joint-box', *[1.0] * 6, *[-1.0] * 6), '--joint-box: give all lower values first'),
+        (
+            ('--joint-box', *[-30.0] * 6, *[30.0] * 6),
+            '--joint-box: -30 is beyond the limits of shoulder_pan_joint, -6.28319 to 6.28319 '
+            '(rad or m, not degrees)',
+        ),
         (('--poses', 1), '--poses must be at least 100'),
         (('--task', 'missing.csv'), 'cannot read missing.csv'),
         (('--task', 'x.csv', '--joint-box', 0), 'either --task or --joint-box'),

@@ -16,6 +16,11 @@ def bad_inputs():
     yield 'two inputs', (*good, 'bag'), 'give a bag, or a table'
     yield 'no such table', (*csv_of, 'missing.csv'), 'missing.csv'
     yield 'a table almost of this name', (*csv_of, 'godo.csv'), 'did you mean "good.csv"'
+    yield (
+        'only the ending is alike',
+        (*csv_of, 'jugs.csv'),
+        'cannot read jugs.csv: No such file or directory\n',
+    )
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
     yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'

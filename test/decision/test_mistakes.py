@@ -344,7 +344,7 @@ def test_columns_that_never_change_are_named(columns, words, oriented):
     places[:, columns] = places[0, columns]
     result = identify(Problem(UR, replace(seen, positions=places)))
     assert f'all positions have the same {words}, though' in result.refusals[0]
-    assert f'was the column {words} recorded' in result.refusals[0]
+    assert f': give the column {words} as it was measured' in result.refusals[0]
 
 
 def test_a_planar_arm_square_to_the_device_has_no_dead_column():

@@ -88,7 +88,8 @@ def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
     result = identify(Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS))
     assert 'elbow_joint.theta' in result.not_excited
     assert set(result.not_excited) < set(result.gauges)
-    assert any('do not determine' in text for text in result.refusals)
+    first = 'elbow_joint stood still (or was not recorded): the poses do not determine '
+    assert any(text.startswith(first) for text in result.refusals)
     kept = {p.name: p.offset for p in result.parameters}
     assert all(kept[name] == 0.0 for name in result.not_excited)
     assert_trades_hold(result, q)

@@ -18,7 +18,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.effects import Verdict
-from calib_ros.report.figures import against_noise, cumulated, drives
+from calib_ros.report.figures import against_noise, coverage, cumulated, drives
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.settings import Settings
@@ -107,6 +107,13 @@ def test_harmonics_of_gears_are_drawn_and_counted_but_not_listed():
     assert 'the 2 harmonics of gears are in result.json.' in page.text
     assert WAVES[0] not in page.text
     assert 'elbow_joint.sin_1' in page.text
+
+
+def test_joints_without_limits_are_not_given_any(rng):
+    free = replace(UR10E.joints[0], lower=None, upper=None)
+    chain = replace(UR10E, joints=(free, *UR10E.joints[1:]))
+    _, rows = coverage(chain, chain.random_joints(50, rng))
+    assert [row[1] for row in rows[:2]] == ['no limits', '-360 to 360 °']
 
 
 @pytest.mark.parametrize('count', [1, 5, 30, 3001])

@@ -367,8 +367,14 @@ def test_a_verification_has_its_verdict_first(solved):
     where = [page.text.index(words) for words in order]
     assert where == sorted(where)
     assert page.text.count('not the corrected robot') == 1
+    assert f'Poses {TEST}  Different poses {TEST}' in page.text
     assert f'{1e3 * found.upper:.3f} mm' in page.text
     assert len(page.data['explorer']['role']) == TEST
+    sets = (problem.held_out.select(np.arange(TEST) // 2),)
+    found = verify(Calibration.of(result), sets, 1e-3)
+    poses = poses_to_verify(result.chain, sets, found.comparison)
+    page = page_of(verification_report(result.chain, found, poses, Origin()))
+    assert f'Measurements {TEST}  Different poses {TEST // 2}' in page.text
 
 
 def packed(text):
@@ -403,6 +409,20 @@ def test_distances_and_outliers_have_pages():
     assert 'Outliers: ' in page.text
     assert 'touched planes are along one direction' in page.text
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
+
+
+def test_outliers_held_out_are_listed_too():
+    """They have no weight to lose; the table had those of the fit only."""
+    problem = problem_of()
+    problem.judging[0].positions[3] += 0.02
+    for fitted in (False, True):
+        if fitted:
+            problem.sets[0].positions[7] += 0.03
+        report = report_of(problem, identify(problem))
+        (table,) = (each for each in report.sections if each.name == 'outliers')
+        assert table.title == f'Outliers: {1 + fitted} of {TRAIN + TEST} poses'
+        assert [row[2] for row in table.rows][fitted:] == ['held out']
+        assert [float(row[3]) > 10.0 for row in table.rows] == [True] * (1 + fitted)
 
 
 def test_poses_and_measurements_are_two_counts(solved):

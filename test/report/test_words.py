@@ -8,17 +8,18 @@ from pages import problem_of
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
-from calib_ros.decision.validation import ErrorFigures
+from calib_ros.decision.validation import Comparison, Residuals
 from calib_ros.files.history import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report import words
 from calib_ros.report.applied import verification_report
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import in_words
-from calib_ros.report.words import checked, verdict
+from calib_ros.report.words import between, checked, verdict
 from calib_ros.shown import rounded
 
 
@@ -27,10 +28,13 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
     """By ~/validate, and by ~/check where no change shows besides."""
     arm = load_chain('ur10e')
     previous = Calibration(arm, arm, residual=1e-4)
-    now = ErrorFigures(20, rms_mm, rms_mm, rms_mm, rms_mm, None)
+    away = np.tile([1e-3 * rms_mm, 0.0, 0.0], (20, 1))
+    off = Residuals(away, np.nan * away, np.arange(20), np.nan * away)
+    both = Comparison(off, off, np.ones(20, bool))
+    now = both.figures[1]
     for told in (
         verdict(previous, now, now),
-        checked(previous, Recalibration(previous, (), 1.0, now, now, 1e-4, 1e-4, 0.0)),
+        checked(previous, Recalibration(previous, (), 1.0, both, 1e-4, 1e-4, 0.0)),
     ):
         assert told[0] == holds
         assert ('no longer holds: RMS 0.160 mm' in told[1]) != holds
@@ -77,3 +81,12 @@ def test_no_figure_is_rounded_to_nothing():
     values = (0.00042, 0.0996, 0.31, 12.3456, 0.0, -0.00042)
     wanted = ['0.00042', '0.100', '0.310', '12.346', '0.000', '-0.00042']
     assert [rounded(value) for value in values] == wanted
+
+
+@pytest.mark.parametrize(
+    ('limits', 'said'),
+    [([0.00899, 0.0131], '0.009 to 0.013'), ([4e-4, 6e-4], '0.00040 to 0.00060'), (None, '')],
+)
+def test_the_limits_of_an_interval_have_the_same_decimals(monkeypatch, limits, said):
+    monkeypatch.setattr(words, 'limits_mm', lambda *_: limits)
+    assert between(None, 0) == said
