@@ -21,7 +21,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain, table_hash
+from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import verification_report, workspace_report
 from calib_ros.report.page import Input, Origin, Verdict, markdown, render
@@ -160,32 +160,6 @@ def test_every_figure_is_one_that_plotly_knows(solved):
     assert count >= 8
 
 
-@pytest.mark.parametrize('rule', Rule)
-def test_every_refusal_is_told_in_plain_words(rule):
-    (told,) = advice.advice([Reason(rule, 'something new')])
-    assert told.heading
-    assert told.steps
-    assert told.meaning
-    assert told.refusal == 'something new'
-
-
-@pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])
-def test_far_too_coarse_measurements_are_to_be_checked_first(rule):
-    (usual,) = advice.advice([Reason(rule, 'little gain')], advice.Situation(left=2.0))
-    (coarse,) = advice.advice([Reason(rule, 'little gain')], advice.Situation(left=47.6))
-    assert '48 times' in coarse.steps[0]
-    assert coarse.steps[1:] == tuple(each for each in usual.steps if 'stood still' not in each)
-
-
-def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
-    refused = [Reason(Rule.GAIN, 'little gain')]
-    (few,) = advice.advice(refused, advice.Situation(poses=14, left=2.5, sigma=1e-4))
-    assert few.meaning.startswith('Only 14 different poses')
-    assert few.steps == advice.rules()[Rule.CONFIGURATIONS].steps
-    (enough,) = advice.advice(refused, advice.Situation(poses=50, left=4.62, sigma=1e-4))
-    assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
-
-
 def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
     problem, result = solved
     origin = Origin(
@@ -213,30 +187,6 @@ def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
     assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == (state == 'info')
 
 
-@pytest.mark.parametrize(
-    ('rules', 'steps', 'last'),
-    [
-        (
-            (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.OUTLIERS),
-            (True, True, False),
-            'LARGEST_ERROR; GAIN',
-        ),
-        ((Rule.MISTAKE, Rule.ENCODER), (True, False), 'ENCODER'),
-        ((Rule.MOVED, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
-        ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
-        ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
-        ((Rule.OUTLIERS,), (True,), 'OUTLIERS'),
-    ],
-)
-def test_what_follows_from_another_reason_sends_nobody_elsewhere(rules, steps, last):
-    """From a wrong setting, a bump, or a joint that hardly moved."""
-    here = advice.Situation(left=1000.0)
-    told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
-    assert tuple(bool(each.steps) for each in told) == steps
-    assert told[-1].refusal == last
-    assert told[0].heading in told[-1].heading
-
-
 def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubtful(solved):
     """And that the robot is not changed yet."""
     problem, result = solved
@@ -262,55 +212,6 @@ def test_no_pose_is_called_judged_where_none_was_left_out():
     poses = poses_of(problem, result)
     assert set(poses.role) == {'fitted'}
     assert poses.judged.any()
-
-
-def test_a_refused_page_says_why_and_what_to_do():
-    rng = np.random.default_rng(3)
-    rows = measured(chain=UR, count=40)
-    problem = Problem(UR, replace(rows, positions=rows.positions + rng.normal(0, 1e-3, (40, 3))))
-    result = identify(problem)
-    assert not result.accepted
-    page = page_of(report_of(problem, result))
-    where = [
-        page.text.index(words)
-        for words in ('Not accepted', 'Why it was refused', 'What to do:', 'Accuracy of the')
-    ]
-    assert where == sorted(where)
-    for each in advice.advice(result.refusals):
-        assert each.heading in page.text
-        assert each.refusal in page.text
-    assert 'none: not accepted' in page.text
-    assert 'map' not in page.data['figures']
-
-
-@pytest.mark.parametrize('sigma', [1e-4, 1e-5])
-def test_an_arm_as_good_as_the_device_can_see_is_no_bad_one(sigma):
-    """It is not accepted all the same; where the device should have seen more, it is refused."""
-    rows = measured(chain=UR, count=40)
-    problem = Problem(UR, rows, sigma_position=sigma, sigma_orientation=4 * sigma)
-    result = identify(problem)
-    assert {each.rule for each in result.refusals} == {Rule.GAIN}
-    verdict = report_of(problem, result).verdict
-    assert verdict.state == ('info' if sigma == 1e-4 else 'bad')
-    assert 'Not accepted' in ' '.join((verdict.heading, *verdict.text))
-
-
-def test_a_mistake_is_the_first_reason_and_what_follows_has_no_steps():
-    problem = Problem(load_chain('ur10'), measured(chain=UR, count=40))
-    report = report_of(problem, identify(problem))
-    first, *others = report.advice
-    assert '--chain ur5e' in first.refusal
-    assert report.verdict.text[0] == f'Why: {first.heading}.'
-    assert [each.steps for each in others] == [()]
-
-
-def test_poses_in_one_spot_do_not_show_a_good_arm():
-    rng = np.random.default_rng(4)
-    joints = np.array([0.3, -1.2, 1.4, -0.8, 1.1, 0.5]) + rng.normal(0.0, 0.01, (40, 6))
-    rows = simulation.measure(UR, joints, rng, 5e-5, 2e-4)
-    problem = Problem(UR, rows, sigma_position=1e-4, sigma_orientation=4e-4)
-    (told,) = report_of(problem, identify(problem)).advice
-    assert told == replace(advice.GOOD_HERE, refusal=told.refusal)
 
 
 def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
