@@ -208,6 +208,7 @@ class Clocks:
         self._moves: deque[tuple[float, int]] = deque(maxlen=NAMED)
         """Changes of the delay [s], and the least number of samples before."""
         self._deaf = 0  # how often targets moved while no joint did
+        self._stuck = False  # whether they did last, and no joint has moved since
 
     @property
     def delay(self) -> Delay | None:
@@ -259,8 +260,10 @@ class Clocks:
         for rows in (joints, *poses):
             rows.sort()
         measured = [(rows.stamps, rows.values) for rows in poses]
-        follow = [self._follows(joints.values, rows.values[:, POSITION]) for rows in poses]
-        self._deaf += bool(follow) and not any(follow)
+        stand = np.ptp(joints.values, axis=0).max() <= self.settings.still
+        deaf = stand and bool(poses) and all(map(self._moves_much, poses))
+        self._deaf += deaf
+        self._stuck = deaf or (stand and self._stuck)
         found = self._delay_of((joints.stamps, joints.values), measured)
         joints.release(joints.count)
         self._poses.clear()
@@ -280,11 +283,11 @@ class Clocks:
         self._agreed = self._taken
         self._awake = self._continuous
 
-    def _follows(self, joints: FloatArray, places: FloatArray) -> bool:
-        """Tell whether joints move if a target does, by more than errors are."""
+    def _moves_much(self, rows: Rows) -> bool:
+        """Tell whether a target moves by more than errors are."""
+        places = rows.values[:, POSITION]
         far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
-        stand = np.ptp(joints, axis=0).max() <= self.settings.still
-        return not (stand and np.median(far) > self.settings.largest_error)
+        return bool(np.median(far) > self.settings.largest_error)
 
     def find(self, collector: Collector, now_ns: int | None) -> None:
         """Estimate the delay for a collector, at intervals until it is clear.
@@ -321,7 +324,7 @@ class Clocks:
         found = []
         delay, known = self.delay, self.settings.delay
         if self._deaf:
-            found.append(stuck(1e-9 * WATCH_NS * self._deaf))
+            found.append(stuck(1e-9 * WATCH_NS * self._deaf, self._stuck))
         if self._moves:
             found.append(moved(self._moves))
         elif delay is not None and not self._continuous and self._spoils(delay.seconds):

@@ -195,10 +195,10 @@ def moved(steps: Collection[tuple[float, int]]) -> Hint:
     )
 
 
-def stuck(seconds: float) -> Hint:
-    """Report that targets moved for some time [s] while the joint states stood still."""
+def stuck(seconds: float, still: bool) -> Hint:
+    """Report that targets moved for some time [s] while joint states stood, as they `still` do."""
     return Hint(
-        'the target moves but no joint does: are joint states frozen?',
+        'the target moves but no joint does: are joint states frozen?' if still else '',
         f'the target moved for {seconds:.0f} s or more while the joint states stood still: does '
         'the driver of the robot send live data? Restart it, and repeat the poses of that time',
     )

@@ -111,6 +111,33 @@ def test_errors_of_time_are_told(jitter, smoothing, said, unsearched):
     assert said in ''.join(remarks)
 
 
+def test_a_target_that_was_carried_to_the_arm_stays_in_the_account_alone():
+    """Once a joint moves, the status asks no longer whether joint states are frozen."""
+    true, _, rng = true_cell(0)
+    motion = stops(UR10E.random_joints(60, rng) * 0.5, 0.5, 0.5)
+    session = CalibrationSession(UR10E)
+    times = np.arange(0.05, 49.7, 0.02)
+    seen = measure(true, motion(np.maximum(times - 20.0, 0.0)), rng, *NOISE)
+    carried = np.clip(18.0 - times, 0.0, None)[:, np.newaxis] * [0.1, 0.0, 0.05]
+    joint_times = np.arange(0.0, 50.0, 0.005)
+    joints = motion(np.maximum(joint_times - 20.0, 0.0))
+    for part in (times < 19.0, times >= 19.0):
+        now = (joint_times < 19.0) == part[0]
+        hear(
+            session,
+            (joint_times[now], stamps(joint_times[now]), joints[now]),
+            (
+                times[part] + 0.005,
+                stamps(times[part]),
+                (seen.positions + carried)[part],
+                seen.rotations[part],
+            ),
+        )
+        assert ('are joint states frozen?' in session.status()) == part[0]
+    session.finish()
+    assert 'joint states stood still' in ''.join(session.warnings)
+
+
 @pytest.mark.parametrize('last', [9.9, 10.25, None])  # at rest, on the way, never
 def test_joint_states_that_freeze_are_told(last):
     """Where they go on nothing is told, though the target is lost for a tenth of the time."""
