@@ -234,7 +234,8 @@ class CalibrationSession:
     @property
     def hints(self) -> list[Hint]:
         """Return what looks wrong in the received messages."""
-        found = [] if self.samples else unheard(self.received)
+        in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
+        found = [] if self.samples or in_sockets else unheard(self.received)
         if words := self._kept.different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):

@@ -166,6 +166,10 @@ def test_a_silent_device_is_told():
     (words,) = made.warnings
     with pytest.raises(InputError, match=re.escape(words)):
         made.identify()
+    in_sockets = CalibrationSession(UR5E, Settings(mode='triggered'))
+    assert in_sockets.warnings != ()
+    drive(in_sockets, where, [])
+    assert in_sockets.warnings == ()
     drive(made, where, [tracker()], start=20.0)
     made.finish()
     assert made.warnings == ()
