@@ -35,8 +35,9 @@ def write_together(contents: Mapping[Path, str | bytes], *, overwrite: bool = Fa
     All are on disk before the first is moved into place. If one cannot be moved, the others are
     restored. A process killed meanwhile leaves the first, old or new, and no mismatched others.
     """
-    for path in reversed(tuple(contents)):  # the first is the one that was asked for
+    for path in contents:
         refuse_to_replace(path, overwrite)
+    path = next(iter(contents))  # the one that was asked for
     placed: list[Path] = []
     try:
         with _beside(path) as mark:

@@ -81,8 +81,8 @@ def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
         try:
             files, pattern = _file_system(each.files)
             matched = files.glob(pattern, detail=True)
-            if not _is_hidden(pattern):  # nor are copies until they are whole
-                matched = {path: matched[path] for path in matched if not _is_hidden(path)}
+            hidden = _hidden(pattern)  # copies are, until they are whole, and what is half written
+            matched = {path: matched[path] for path in matched if _hidden(path) == hidden}
         except CalibrationError as err:
             wrong[each.files] = str(err)
             continue
@@ -161,8 +161,9 @@ def _file_system(url: str) -> tuple[Any, str]:
     return files, path
 
 
-def _is_hidden(path: str) -> bool:
-    return PurePosixPath(path).name.startswith('.')
+def _hidden(path: str) -> int:
+    """Return how many folders and files on a path are hidden."""
+    return sum(part.startswith('.') for part in PurePosixPath(path).parts)
 
 
 def _is_folder(files: Any, path: str) -> bool:

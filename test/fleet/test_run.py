@@ -212,10 +212,12 @@ def test_hidden_files_are_no_nights(plant, tmp_path):
     expected = [str(path) for path in sorted(nights.iterdir())]
     (nights / '.002.csv').write_text('half a night')
     (nights / '.002.csv.Xy12Za').write_text('half a night')
-    (nights / '.bag.partial').mkdir()
-    found, wrong = sources(replace(plant[0], measured=(pattern,)))
-    assert [each.name for each in found] == expected
-    assert wrong == {}
+    (nights / '.bag.partial/bag').mkdir(parents=True)
+    (nights / '.bag.partial/bag/001.csv').write_text('half a night')
+    for each in (pattern, Measured(str(nights / '**/*.csv'))):
+        found, wrong = sources(replace(plant[0], measured=(each,)))
+        assert [source.name for source in found] == expected
+        assert wrong == {}
     (own,), _ = sources(replace(plant[0], measured=(Measured(str(nights / '.002.csv')),)))
     assert own.name == str(nights / '.002.csv')
 
