@@ -16,6 +16,7 @@ import fcntl
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from hashlib import sha256
@@ -116,9 +117,13 @@ def whole_folder(
 
 def refuse_to_replace(path: Path, overwrite: bool = False, cure: str = 'move it') -> None:
     """Refuse a path in use, except a file to `overwrite`; the message offers a `cure`."""
-    if path.exists() and not path.is_file():
+    try:
+        mode = path.stat().st_mode  # once: another process may move it meanwhile
+    except OSError:  # nothing is there
+        return
+    if not stat.S_ISREG(mode):
         raise InputError(f'{path} is not a file: choose another name')
-    if path.exists() and not overwrite:
+    if not overwrite:
         raise InputError(f'{path} exists already: choose another name or {cure}')
 
 
