@@ -29,12 +29,13 @@ def refusals(
     own_behaviour: str | None,
     may_be_rounding: bool,
     sized: bool,
+    scaled: float = 0.0,
 ) -> tuple[Reason, ...]:
     """Return the acceptance rules that fail.
 
     `own_behaviour` describes outliers that are the arm's own (`misfits.py`), `may_be_rounding` is
-    the verdict of `rounding.py`, and `sized` tells whether the measurements fix the size and
-    shape of the arm.
+    the verdict of `rounding.py`, `sized` tells whether the measurements fix the size and shape of
+    the arm, and `scaled` is the scale of the device, minus one, that alone leaves no region.
     """
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
@@ -50,7 +51,7 @@ def refusals(
             'predictions do not belong together'
         )
         return (*failed, Reason(Rule.OUTLIERS, text))
-    gained = _of_the_gain(problem, result, validation, sized)
+    gained = _of_the_gain(problem, result, validation, sized, scaled)
     return (*failed, *gained, *_of_harm(validation, may_be_rounding))
 
 
@@ -89,7 +90,7 @@ def _gain(
 
 
 def _of_the_gain(
-    problem: Problem, result: Identification, validation: Comparison, sized: bool
+    problem: Problem, result: Identification, validation: Comparison, sized: bool, scaled: float
 ) -> Iterator[Reason]:
     before, after = validation.figures
     if after.rms_mm > 1e3 * problem.largest_error:
@@ -115,6 +116,8 @@ def _of_the_gain(
             f'residuals are explained just as well in {100.0 * result.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
+    elif scaled:
+        yield Reason(Rule.SCALE, out_of_scale(scaled))
     elif result.region is None:
         text = (
             'what the correction removes is not larger than its own uncertainty, even at the '
@@ -126,6 +129,26 @@ def _of_the_gain(
                 'sockets a known distance apart'
             )
         yield Reason(Rule.REGION, text)
+
+
+def out_of_scale(scale: float) -> str:
+    """Return that a scale of the device, given minus one, may make the calibrated arm worse."""
+    return (
+        f'{grown(scale)}, as by a measuring device that is out of scale; '
+        'then the correction would make the arm worse. If a known length shows the right scale, '
+        'set sigma_scale'
+    )
+
+
+def grown(scale: float) -> str:
+    """Return how the lengths of the arm change with the scale of the device, given minus one."""
+    way = 'grow' if scale > 0.0 else 'shrink'
+    return f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
+
+
+def percent(share: float) -> str:
+    """Return a small share in percent, with two digits."""
+    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
 
 
 def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:

@@ -29,6 +29,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.acceptance import grown, out_of_scale, percent
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
@@ -86,7 +87,10 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
     refusals = list(result.refusals)
     if certain:
+        refusals = [each for each in refusals if each.rule is not Rule.SCALE]
         refusals.append(Reason(Rule.SCALE, scale))
+    if any(each.rule is Rule.SCALE for each in refusals):
+        scale = ''
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))
         lens = ''
@@ -134,8 +138,9 @@ def _common(
 
 def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     """Return the suspicion of a common scale in words, and whether it refuses."""
-    if text := _out_of_scale(result):
-        return text, True
+    risk = result.region.by_scale if result.region is not None else 0.0
+    if not result.refusals and result.posterior.rival is not None and risk >= HARMFUL:
+        return out_of_scale(result.posterior.rival[1]), True
     scale, std, freedom = scale_of(problem, result)
     if freedom < 2.0 or abs(scale) < LEAST_SCALE:
         return '', False
@@ -143,30 +148,9 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     if abs(scale) < limit:
         return '', False
     certain = abs(scale) - limit > LARGEST_SCALE and not problem.sigma_scale
-    text = f'{_grown(scale)} (sigma {_percent(std)} %): '
+    text = f'{grown(scale)} (sigma {percent(std)} %): '
     advice = 'check the scale of the measuring device, and the temperature'
     return text + ('no arm does' if certain else advice), certain
-
-
-def _out_of_scale(result: Identification) -> str:
-    """Return that the scale of the device may make the calibrated arm worse."""
-    region, rival = result.region, result.posterior.rival
-    if result.refusals or region is None or rival is None or region.by_scale < HARMFUL:
-        return ''
-    return (
-        f'{_grown(rival[1])}, as by a measuring device that is out of scale; '
-        'then the correction would make the arm worse. If a known length shows the right scale, '
-        'set sigma_scale'
-    )
-
-
-def _grown(scale: float) -> str:
-    way = 'grow' if scale > 0.0 else 'shrink'
-    return f'all lengths of the arm {way} alike, by {_percent(abs(scale))} %'
-
-
-def _percent(share: float) -> str:
-    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
 
 
 def _sister(problem: Problem, result: Identification) -> str:
@@ -335,7 +319,7 @@ def _board(problem: Problem, result: Identification) -> str:
         if abs(mean) > LARGEST_SCALE + special.stdtrit(len(count) - 1, SURE) * error:
             way = 'wider' if mean > 0.0 else 'narrower'
             return (
-                f'the board is {_percent(abs(mean))} % {way} for its height than stated: print it '
+                f'the board is {percent(abs(mean))} % {way} for its height than stated: print it '
                 'unstretched, else the arm becomes as wrong'
             )
     return ''

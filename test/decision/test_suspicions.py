@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import rms
+from fits import SIGMAS, rms
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.reasons import Rule
@@ -213,6 +213,20 @@ def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
     checked = identify(replace(wrong, sigma_scale=1e-5))
     assert checked.accepted
     assert not any('sigma_scale' in each for each in checked.remarks)
+
+
+@pytest.mark.parametrize('scale', [5e-4, 2e-3])
+def test_a_scale_that_leaves_no_region_is_the_reason(scale):
+    """Where the device is checked to 100 ppm the arm itself is of another size."""
+    rng = np.random.default_rng(0)
+    true = faulty(UR, Cell(length_error=1e-4, angle_error=2e-4), rng)
+    lengths = [n for n in UR.parameter_names if n.is_length and not UR.owns_frame(n)]
+    true = true.with_offsets({n: scale * UR.value(n) for n in lengths})
+    problem = Problem(UR, measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4), **SIGMAS)
+    result = identify(problem)
+    assert [each.rule for each in result.refusals] == [Rule.SCALE]
+    assert not any('alike' in each for each in result.remarks)
+    assert identify(replace(problem, sigma_scale=1e-4)).accepted
 
 
 def test_the_scale_of_a_device_is_a_number():
