@@ -55,6 +55,17 @@ PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
 
 
+def nearly_parallel(tilt: float, apart: float) -> bool:
+    """Tell whether axes are better described by beta than by d.
+
+    From the sine of their angle f and how far apart [m] they are. Errors of the usual sizes (0.5
+    mm, 1 mrad, so 0.5 m) turn the common normal 1 / sin f times as much, and the line to where the
+    next axis pierces the plane across this one (0.5 m / apart) / cos f times.
+    """
+    across = min(2.0 * abs(apart), 1.0) * math.sqrt(max(1.0 - tilt**2, 0.0))
+    return tilt < max(math.sin(PARALLEL_TOLERANCE), across)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Chain(Shown):
     """A serial chain; immutable: offsets return a new one.
@@ -118,8 +129,7 @@ class Chain(Shown):
         return tuple(
             row.name
             for row, *axes in zip(rows, self.joints, self.joints[1:], strict=False)
-            if any(joint.type == 'revolute' for joint in axes)
-            and np.hypot(np.sin(row.alpha), np.sin(row.beta)) < np.sin(PARALLEL_TOLERANCE)
+            if any(joint.type == 'revolute' for joint in axes) and nearly_parallel(row.tilt, row.a)
         )
 
     @cached_property

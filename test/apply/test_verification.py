@@ -16,6 +16,7 @@ from calib_ros.apply.verification import Attained, verify
 from calib_ros.decision.validation import Residuals
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
 from calib_ros.report.applied import _by_configuration
@@ -56,9 +57,19 @@ def test_the_test_poses_are_those_of_the_standard(name, rng):
     assert ((limits[:, 0] <= found.joints) & (found.joints <= limits[:, 1])).all()
 
 
-def test_an_arm_that_keeps_no_orientation_is_told_so(rng):
-    with pytest.raises(InputError, match='in no cube of its workspace'):
-        iso_9283_poses(design_of(load_chain('kuka_youbot')), rng)
+def test_an_arm_that_cannot_keep_its_orientation_reaches_the_places(rng):
+    design = design_of(load_chain('kuka_youbot'))
+    found = iso_9283_poses(design, rng)
+    places = design.targets(found.joints)[:, :3, 3]
+    assert not found.oriented
+    assert found.edge > 0.1
+    np.testing.assert_allclose(np.abs(places[1:] - places[0]), 0.4 * found.edge, atol=1e-6)
+
+
+def test_an_arm_that_moves_in_a_plane_reaches_no_cube(rng):
+    rows = tuple(Joint(f'j{k}', a=0.3) for k in range(3))
+    with pytest.raises(InputError, match='no cube'):
+        iso_9283_poses(design_of(Chain('planar', 'standard', rows)), rng)
 
 
 # The verdict

@@ -86,6 +86,15 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
     assert (by_name['dh_without_beta.csv'].error < 1e-7) == (not nominal.parallel)
 
 
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_axes_six_degrees_from_parallel_need_no_beta(convention):
+    rows = load_chain('puma560').with_offsets({'joint_2.beta': 0.1})
+    nominal = replace(converted(rows, convention), base=None, tool=None)
+    chain = faulty(nominal, Cell(), np.random.default_rng(0))
+    by_name = {each.name: each for each in exports(chain, nominal)}
+    assert by_name['dh_without_beta.csv'].error < 1e-7
+
+
 @pytest.mark.filterwarnings('ignore:Gimbal lock')
 @pytest.mark.parametrize('digits', [6, 7, 8, 9])
 def test_right_angles_of_a_few_digits_are_exported(digits):
