@@ -296,7 +296,8 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
 
 
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
-    before, after = (result.validation or result.fitted).figures
+    judged = result.validation or result.fitted
+    before, after = judged.figures
     proof = '' if result.validation else '; on the poses fitted, which proves nothing'
     measured = words.measured(result)
     if result.outliers:
@@ -318,10 +319,18 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
         ('fitted to', measured),
         ('position error', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm{proof}'),
         *_interval(result.validation),
+        *_with_outliers(judged),
         second,
         ('judged by', result.validated_by),
         *valid,
     )
+
+
+def _with_outliers(judged: Comparison) -> tuple[tuple[str, str], ...]:
+    if not judged.outliers:
+        return ()
+    before, after = judged.figures_of_all
+    return (('with outliers', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm'),)
 
 
 def _document(found: Identified) -> str:

@@ -51,8 +51,10 @@ def refusals(
             'predictions do not belong together'
         )
         return (*failed, Reason(Rule.OUTLIERS, text))
-    gained = _of_the_gain(problem, result, validation, sized, scaled)
-    return (*failed, *gained, *_of_harm(validation, may_be_rounding))
+    gained = tuple(_of_the_gain(problem, result, validation, sized, scaled))
+    before, after = validation.figures
+    helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
+    return (*failed, *gained, *_of_harm(validation, may_be_rounding, helps))
 
 
 def _of_the_fit(
@@ -93,14 +95,15 @@ def _of_the_gain(
     problem: Problem, result: Identification, validation: Comparison, sized: bool, scaled: float
 ) -> Iterator[Reason]:
     before, after = validation.figures
-    if after.rms_mm > 1e3 * problem.largest_error:
+    judged = validation.deciding
+    gain, limit = _gain(validation, 'position', judged)
+    largest = 1e3 * problem.largest_error
+    if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(
             Rule.LARGEST_ERROR,
             f'RMS {after.rms_mm:.1f} mm remains on held-out poses, more than '
-            f'{1e3 * problem.largest_error:g} mm (largest_error)',
+            f'{largest:g} mm (largest_error)',
         )
-    judged = validation.deciding
-    gain, limit = _gain(validation, 'position', judged)
     if not gain > limit:
         text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
         if gain > 0.0:
@@ -151,8 +154,8 @@ def percent(share: float) -> str:
     return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
 
 
-def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
-    if validation.outliers:
+def _of_harm(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
+    if helps and validation.outliers:
         first, second = validation.figures_of_all
         gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
         limit = max(limit, _loss_by_chance(validation), COUNTS)

@@ -98,6 +98,11 @@ class Comparison(Shown):
         """Return the number of outliers, which are left out of the figures."""
         return int((~self.judged).sum())
 
+    @property
+    def omitted(self) -> str:
+        """Return in words which pairs are not in the figures."""
+        return f', {of_them(self.outliers, "outlier")} not in the figures' if self.outliers else ''
+
     @cached_property
     def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after, without outliers."""
@@ -173,9 +178,7 @@ def validate(
             judged = np.concatenate(distances) <= OUTLIER
             judged |= np.False_ if explained is None else explained
             comparison = replace(comparison, judged=judged)
-        text = f'{len(comparison.judged)} held-out poses'
-        if comparison.outliers:
-            text += f', {of_them(comparison.outliers, "outlier")} not in the figures'
+        text = f'{len(comparison.judged)} held-out poses{comparison.omitted}'
         if count := repeated.sum():
             text += f'; those that repeat fitted poses ({count}) do not count for acceptance'
         return comparison, text
@@ -210,10 +213,9 @@ def _cross_validate(
         strict=True,
     )
     first, second = left_out(chains, problem.sets, groups, numbers)
-    return (
-        Comparison(first, second, ~robust.outliers),
-        f'{folds}-fold cross-validation over {count} different poses{note}',
-    )
+    judged = Comparison(first, second, ~robust.outliers)
+    over = f'{folds}-fold cross-validation over {count} different poses'
+    return judged, f'{over}{note}{judged.omitted}'
 
 
 def left_out(
@@ -334,10 +336,8 @@ def _leave_one_place_out(
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
     first = _joined([part.before for part in parts], groups)
     second = _joined([part.after for part in parts], groups)
-    return (
-        Comparison(first, second, ~robust.outliers),
-        f'leaving out one of {len(places)} places at a time',
-    )
+    judged = Comparison(first, second, ~robust.outliers)
+    return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'
 
 
 def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:

@@ -156,9 +156,8 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     held_out = () if judged is None or judged.repeated is None else (judged,)
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
     poses = sum(map(distinct, numbers))
-    return advice(
-        result.refusals, Situation(poses, noise, result.noise.given.get('sigma_position'))
-    )
+    sigma = result.noise.given.get('sigma_position')
+    return advice(result.refusals, Situation(poses, noise, sigma, bool(result.verdicts)))
 
 
 def _refused(reasons: Sequence[Advice]) -> Verdict:

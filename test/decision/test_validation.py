@@ -11,6 +11,8 @@ from fits import UR10E, measured_arm
 from scipy import stats
 
 from calib_ros.decision import validation
+from calib_ros.decision.acceptance import refusals
+from calib_ros.decision.reasons import Rule
 from calib_ros.decision.validation import (
     Comparison,
     Residuals,
@@ -55,6 +57,37 @@ def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
     assert comparison.deciding.tolist() == which.tolist()
     repeated = np.array([False, True, False, False])
     assert replace(comparison, repeated=repeated).deciding.tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'rules'),
+    [
+        (3e-4, 0.4, {Rule.GAIN}),  # folds that diverge
+        (0.3, 0.4, {Rule.GAIN, Rule.LARGEST_ERROR}),
+        (0.4, 0.3, {Rule.LARGEST_ERROR, Rule.GAIN_WITH_OUTLIERS}),
+    ],
+)
+def test_an_arm_that_fits_is_not_called_wrong_for_a_bad_correction(rng, before, after, rules):
+    away = rng.normal(size=(40, 3))
+    worse = np.where(np.arange(40)[:, np.newaxis] < 2, 100.0, 1.0)
+    numbers, pixels = np.arange(40), np.full((40, 2), np.nan)
+    parts = [
+        Residuals(x, np.full((40, 3), np.nan), numbers, pixels)
+        for x in (before * away, after * worse * away)
+    ]
+    comparison = Comparison(*parts, worse[:, 0] == 1.0)
+    problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0)
+    result = SimpleNamespace(
+        step=None,
+        converged=True,
+        not_excited=(),
+        parameters=(),
+        chance=None,
+        region=1,
+        validation=comparison,
+    )
+    problem.sets = ()
+    assert {each.rule for each in refusals(problem, result, None, False, True)} == rules
 
 
 def row(name, offset, std, freedom=np.inf):

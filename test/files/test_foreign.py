@@ -14,7 +14,14 @@ from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Expression, Layout, load_layout, parse_columns, presets
+from calib_ros.files.layouts import (
+    Expression,
+    Layout,
+    layout_of,
+    load_layout,
+    parse_columns,
+    presets,
+)
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
@@ -85,6 +92,16 @@ def test_targets_and_differences_of_a_tracker_as_published(tmp_path):
     known = read_table(raw.parents[1] / 'uniform.csv', 6)
     for found, expected in zip(both_rows(table), both_rows(known), strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def test_later_columns_may_use_our_names_of_earlier_ones():
+    """As messages about a wrong setting name them."""
+    given = ['q*=J*', 'q1=q2,q2=q1', 'q2=q2-{q1},target=q1']
+    columns = layout_of('', given, {}).columns
+    assert (columns['q1'], columns['q2']) == ('(J2)', '((J1))-{q1}')
+    assert columns['target'] == 'q1'
+    coupled = layout_of('fanuc', ['q3=q3-q2'], {}).columns['q3']
+    assert coupled == '(J3 + J2)-(J2)'
 
 
 EULER = [a + b + c for a in 'XYZ' for b in 'XYZ' for c in 'XYZ' if a != b and b != c]

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
@@ -60,6 +61,9 @@ def test_a_held_out_gross_error_is_counted_where_the_figures_are():
     count = result.validation.figures[1].count
     said = f'{count + 1} held-out poses, 1 of them an outlier not in the figures'
     assert result.validated_by == said
+    problem.sets[0].positions[3] += 0.02
+    folded = identify(replace(problem, held_out=None))
+    assert folded.validated_by.endswith(' poses, 1 of them an outlier not in the figures')
 
 
 def test_the_error_told_is_the_one_within_its_limits():
