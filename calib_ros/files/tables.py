@@ -245,10 +245,11 @@ def _rows(
     try:
         found = columns_of(path, header + b''.join(lines), above=above)
         made = measurements(found, joints)
-        if damaged is not None and found.blank('split').any():
-            raise InputError(f'{path} has incomplete rows')
-        for text in filter(None, made.view[1]):
-            _view_of(text, f'{path}: view')
+        if damaged is not None:
+            if found.blank('split').any():
+                raise InputError(f'{path} has incomplete rows')
+            for text in filter(None, made.view[1]):
+                _view_of(text, '')
     except InputError:
         if damaged is None:
             raise
