@@ -183,11 +183,11 @@ def _gravity(problem: Problem, result: Identification) -> str:
         return ''
     rest = [name for name in result.names if name not in bent]
     straight = result.chain.with_offsets({n: -result.chain.value(n) for n in bent})
-    given = _explained(problem, straight, rest, bent)
+    given = explained(problem, straight, rest, bent)
     best, words = 0.0, ''
     for axis, along in zip('xyz', np.linalg.norm(problem.chain.gravity) * np.eye(3), strict=True):
         x, y, z = along.tolist()  # coefficients have the sign
-        share = _explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
+        share = explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
         best, words = max((best, words), (share, axis))
     if not best - given > EXPLAINED * (1.0 - given):
         return ''
@@ -264,30 +264,31 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
         freedom = IN_A_FRAME * count - len(result.names)
         if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
             continue
-        left = 1.0 - _explained(problem, result.chain, result.names, names)
+        left = 1.0 - explained(problem, result.chain, result.names, names)
         rest = freedom - len(names)
         if chance_of((1.0 - left) / max(left, EXACT) * rest, len(names), rest) > 1.0 - SURE:
             continue
         fitted = replace(frame, lens=replace(frame.lens, fixed=False))
-        imitated = _imitated(problem, result, problem.chain.with_frame(camera, fitted))
+        freed = replace(problem, chain=problem.chain.with_frame(camera, fitted))
+        imitates = imitated(freed, result)
         share = 1.0 - left * freedom / rest
-        if imitated or share > EXPLAINED:
+        if imitates or share > EXPLAINED:
             lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
             text = f'other intrinsics of the camera than those given explain {100.0 * share:.0f} %'
             text += f' of what is left: {lens}, or calibrate the camera as it is used'
-            return text, imitated
+            return text, imitates
     return '', False
 
 
-def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
-    """Tell whether a fit with a free lens finds another arm, within the region of this one."""
+def imitated(freed: Problem, result: Identification) -> bool:
+    """Tell whether a fit with more freedom finds another arm, within the region of this one."""
     try:
-        other = fit(replace(problem, chain=freed))[2].chain
+        other = fit(freed)[2].chain
     except (InputError, np.linalg.LinAlgError):
         return True
-    joints = [each.spread().joints for each in problem.sets]
+    joints = [each.spread().joints for each in freed.sets]
     if result.region is not None:
-        drawn = freed.random_joints(SHELL, np.random.default_rng(0))
+        drawn = freed.chain.random_joints(SHELL, np.random.default_rng(0))
         joints.append(drawn[result.region.covers(drawn)])
     before, after = (
         _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
@@ -334,11 +335,11 @@ def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) 
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
     if not added or noise < SUSPICIOUS:  # nothing is left to explain
         return 0.0
-    share = _explained(problem, chain.with_effects([*known, *added]), names, added)
+    share = explained(problem, chain.with_effects([*known, *added]), names, added)
     return share if share >= EXPLAINED else 0.0
 
 
-def _explained(
+def explained(
     problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""

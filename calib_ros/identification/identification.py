@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.decision import mistakes, suspicions
+from calib_ros.decision import lag, mistakes, suspicions
 from calib_ros.decision.acceptance import refusals, remarks
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, outliers_of
@@ -129,7 +129,8 @@ def _identified(
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
-    return suspicions.remarked(problem, named, another=named is result)
+    found = suspicions.remarked(problem, named, another=named is result)
+    return lag.remarked(problem, found)
 
 
 def _region(

@@ -81,6 +81,7 @@ WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
     rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
 }
+BRINGS[Rule.LAG] = {*WRONG, Rule.OUTLIERS}
 BRINGS[Rule.MISTAKE] = {*WRONG, Rule.ENCODER, Rule.MOVED}
 BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
 """Consequences of each cause; the first cause present counts."""

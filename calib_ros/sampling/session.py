@@ -237,11 +237,13 @@ class CalibrationSession:
         in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
         found = [] if self.samples or in_sockets else unheard(self.received)
         if words := self._kept.different:
-            found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
+            found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
         found += self._road.hints(self.received[POSES])
-        return found or losses(self.received, self._dropped) or self._road.unsettled()
+        if any(hint.explains for hint in found):
+            return found
+        return found + (losses(self.received, self._dropped) or self._road.unsettled())
 
     @property
     def delay(self) -> Delay | None:

@@ -304,3 +304,32 @@ def test_few_samples_show_no_errors_of_time(count, named):
         result = SimpleNamespace(distances=[sizes], noise=SimpleNamespace(position=1.1))
         found += 'speed' in _motion(SimpleNamespace(sets=[seen]), result)
     assert found == named
+
+
+@pytest.mark.parametrize(('share', 'refused'), [(0.0, False), (1e-4, False), (1e-3, True)])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_harms(
+    share, refused, oriented
+):
+    """A device that smoothed over 0.8 s made an arm worse, 2.2 mm -> 3.3 mm, and was accepted."""
+    rng = np.random.default_rng(1)
+    joints = UR.random_joints(40, rng)
+    behind = joints - share * np.diff(joints, axis=0, prepend=joints[:1])
+    seen = replace(measure(arm(), behind, rng, 5e-5, 2e-4, oriented), joints=joints)
+    result = identify(Problem(UR, seen))
+    assert result.accepted == (not refused)
+    assert (Rule.LAG in [each.rule for each in result.refusals]) == refused
+    assert any('towards the stop before' in each for each in result.remarks) == (share == 1e-4)
+
+
+@pytest.mark.parametrize('size', [3e-4, 1e-3])
+def test_backlash_is_not_taken_for_a_lag_that_harms(size):
+    true = arm().with_effects([f'{joint.name}.backlash' for joint in UR.joints])
+    true = true.with_offsets({name: -size for name, _ in true.effects})
+    rng = np.random.default_rng(1)
+    joints = true.random_joints(60, rng)
+    approach = np.sign(np.diff(joints, axis=0, prepend=joints[:1]))
+    seen = measure(true, joints, rng, 5e-5, 2e-4)
+    poses = true.forward(joints, approach)
+    seen = replace(seen, positions=poses[:, :3, 3], rotations=poses[:, :3, :3])
+    assert identify(Problem(UR, seen)).accepted

@@ -164,11 +164,10 @@ def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
     written(path, [many[0]])
     with pytest.raises(InputError, match='line 33: stamp_ns 1 already exists'):
         read_journal(path, JOINTS)
-    for damage, said in ((b'x,' * 40, 'line 34'), (bytes(2000), 'line 34 is incomplete')):
-        copy = tmp_path / 'copy.csv'
-        copy.write_bytes(path.read_bytes() + damage + b'\n' * (damage[:1] == b'x'))
-        with pytest.raises(InputError, match=said):
-            read_journal(copy, JOINTS)
+    with path.open('ab') as file:
+        file.write(bytes(2000))
+    with pytest.raises(InputError, match='line 34 is incomplete'):
+        read_journal(path, JOINTS)
 
 
 @pytest.mark.parametrize('sessions', [('b', 'a'), ('a',)])

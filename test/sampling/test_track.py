@@ -228,6 +228,14 @@ def test_of_two_publishers_of_a_joint_the_one_that_names_more_counts():
     np.testing.assert_allclose(at(made, 55).joints, [[1.0, 2.0]])
 
 
+@pytest.mark.parametrize('order', [1, -1])
+def test_of_two_that_name_as_many_it_does_not_count_which_came_first(order):
+    made = track((True, True, True))
+    for columns, values in [((0, 1), (1.0, 2.0)), ((1, 2), (9.0, 3.0))][::order]:
+        fill(made, [(ms, values) for ms in range(0, 100, 10)], columns)
+    np.testing.assert_allclose(at(made, 55).joints, [[1.0, 9.0, 3.0]])
+
+
 def test_a_publisher_that_falls_silent_holds_nothing_up_while_others_name_its_joints():
     """As a driver that publishes the gripper's and one joint of the arm once, at the start."""
     made = filled([(10, (0.0,))], (1,))
