@@ -29,7 +29,7 @@ def before_after_png(result: Identification) -> bytes:
     """Return the figure of held-out position errors before and after."""
     comparison = result.validation or result.fitted
     before, after = (
-        1e3 * np.linalg.norm(residuals.position[comparison.judged], axis=1)
+        1e3 * np.linalg.norm(residuals.position[comparison.deciding], axis=1)
         for residuals in (comparison.before, comparison.after)
     )
     figure = _figure(10.0, 3.8)
