@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How often do the limits of `calib_ros verify` hold the true RMS error?
+"""How often do the intervals of `calib_ros verify` hold the true RMS error?
 
     CALIB_ROS_DATA=FOLDER python benchmarks/verification.py [--quick] [--json]
 
-Every limit is one-sided at 95 %: the share of draws in which the upper (lower) limit is above
-(below) the truth should be 0.95 or a little more.
+Of an interval of 95 %, each limit may fail in one draw of forty: the share of draws in which the
+upper (lower) limit is above (below) the truth should be 0.975 or a little more.
 
 Drawn: errors of Gaussian noise alone, and those that a geometric calibration leaves of arms with
 compliance or eccentricities, 5 to 100 at a time, against 20,000 of the same arm (six arms each);
@@ -108,7 +108,7 @@ def measured(name, session, draws):
     problem = problem_of(name, session, 'chain.yaml')
     result = identify(problem)
     arm = Calibration.of(result)
-    held_out = problem.judging[0].select(result.validation.judged)
+    held_out = problem.judging[0].select(result.validation.deciding)
     _, first = np.unique(held_out.configurations, return_index=True)
     held_out = held_out.select(first)
     truth = rms(residuals(arm.chain, held_out).position)
