@@ -71,8 +71,12 @@ REUSED = (
 
 def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict as a reader sees it first, and what to do next."""
-    unproven = found.reused and found.verdict == 'no verdict'
-    return REUSED if unproven else STANDINGS[found.verdict]
+    if found.reused and found.verdict == 'no verdict':
+        return REUSED
+    state, steps = STANDINGS[found.verdict]
+    if not found.by_program:  # nor whether the correction reaches the arm
+        state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
+    return state, steps
 
 
 def workspace_report(
@@ -99,7 +103,7 @@ def workspace_report(
             'accuracy',
             'Position errors [mm]',
             (f'At {len(found.joints):,} random poses of the joint range.', rest),
-            head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
+            head=('', 'RMS', 'mean', 'median', '95 % below', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
         identity=sections.identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
@@ -166,7 +170,8 @@ def plan_report(
         sections.coverage(chain, joints, 'How far each joint will move'),
         _listed(chain, joints),
     ]
-    verdict = Verdict('info', 'Test poses', (f'{len(joints)} poses.',))
+    what = 'Test poses' if found is None else 'Poses to measure'
+    verdict = Verdict('info', what, (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
         'Visit P1 to P5 in turn, 30 times, and measure each time.',
         'Then judge: calib_ros verify.',

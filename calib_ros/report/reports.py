@@ -92,7 +92,8 @@ def _verdict(
 ) -> Verdict:
     if not result.accepted:
         return _refused(reasons)
-    how = 'Before and after, on poses not used to compute it; 95 % interval in brackets.'
+    how = 'Before and after, each pose judged by a fit without it; 95 % interval in brackets.'
+    how += ' The whole interval decides on the tolerance.' * (tolerance is not None)
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
