@@ -175,24 +175,35 @@ def validate(
     judged too.
     """
     repeated = _repeated(problem)
-    if problem.judging and not repeated.all():
+    if not repeated.all():
         comparison = replace(compare(before, after, problem.judging), repeated=repeated)
-        if problem.loss != 'none':
-            distances = distances_of(after, names, problem.system(problem.judging))
-            judged = np.concatenate(distances) <= OUTLIER
-            judged |= np.False_ if explained is None else explained
-            comparison = replace(comparison, judged=judged)
-        text = f'{comparison.counting.sum()} held-out poses'
-        if comparison.outliers:
-            text += f', {of_them(comparison.outliers, "outlier")} not in the figures'
-        if count := repeated.sum():
-            text += f'; not counted because they repeat fitted poses: {count}'
-        return comparison, text
+        if distinct(comparison.after.configurations[~repeated]) > 1:
+            return _of_held_out(problem, comparison, after, names, explained)
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
-    note = ', because all held-out poses were fitted too' if len(repeated) else ''
+    note = ', because fewer than two held-out poses are new' if len(repeated) else ''
     return _cross_validate(problem, before, after, names, robust, note)
+
+
+def _of_held_out(
+    problem: Problem,
+    comparison: Comparison,
+    after: Chain,
+    names: Sequence[str],
+    explained: NDArray[np.bool_] | None,
+) -> tuple[Comparison, str]:
+    if problem.loss != 'none':
+        distances = distances_of(after, names, problem.system(problem.judging))
+        judged = np.concatenate(distances) <= OUTLIER
+        judged |= np.False_ if explained is None else explained
+        comparison = replace(comparison, judged=judged)
+    text = f'{comparison.counting.sum()} held-out poses'
+    if comparison.outliers:
+        text += f', {of_them(comparison.outliers, "outlier")} not in the figures'
+    if repeats := int((~comparison.counting).sum()):
+        text += f'; not counted because they repeat fitted poses: {repeats}'
+    return comparison, text
 
 
 def _cross_validate(

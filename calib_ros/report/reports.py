@@ -138,8 +138,8 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         return ()
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = interval_of(judged, 0)
-        if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
+        lower, upper = interval_of(judged, 0)
+        if upper < np.inf and 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             known = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
             good = GOOD_ARM if known else GOOD_HERE
             return (replace(good, refusal='; '.join(result.refusals)),)
