@@ -163,7 +163,7 @@ def coverage(
         lower, upper = min(lower, low), max(upper, high)
         counts[k] = np.histogram(joints[:, k], parts, (lower, upper))[0]
         ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}' + ' (no limits)' * free
-        labels.append(f'{label(joint.name)}: {ends}')
+        labels.append(f'{label(joint.name)}<br>{ends}')
         used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
         share = 100.0 * float(np.mean(counts[k] > 0))
         rows.append((joint.name, ends, used, f'{share:.0f} %'))

@@ -178,7 +178,7 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
 
 def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
     values = np.array(mesh['z'], dtype=float)
-    colours = {'RdBu': 'RdBu_r', 'Viridis': 'viridis_r'}[mesh['colorscale']]
+    colours = {'RdBu': 'RdBu', 'Viridis': 'viridis_r'}[mesh['colorscale']]  # plotly's, reversed
     x, y = (
         np.arange(len(each)) if isinstance(each[0], str) else np.array(each)
         for each in (mesh['x'], mesh['y'])
@@ -208,4 +208,7 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
 
 
 def _plain(names: Sequence[Any]) -> list[Any]:
-    return [html.unescape(x).replace('$', r'\$') if isinstance(x, str) else x for x in names]
+    return [
+        html.unescape(x.replace('<br>', '\n')).replace('$', r'\$') if isinstance(x, str) else x
+        for x in names
+    ]
