@@ -157,12 +157,12 @@ def main():
     parser.add_argument('--quick', action='store_true', help='fewer draws')
     parser.add_argument('--json', action='store_true')
     options = parser.parse_args()
-    table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 200)}
+    table = {'UR10e, simulated, ISO 9283': simulated(10 if options.quick else 60)}
     for kind in ('noise', 'compliance', 'eccentricity', 'places'):
         table[f'drawn, {kind}'] = drawn(kind, 600 if options.quick else 12_000)
     for name, session in SETS:
         if DATA.is_dir():
-            table[f'{name}/{session}'] = measured(name, session, 100 if options.quick else 2000)
+            table[f'{name}/{session}'] = measured(name, session, 100 if options.quick else 1000)
     if options.json:
         print(json.dumps(table, indent=2))
         return
