@@ -102,7 +102,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
             found = recalibrate(previous, problem, years, growth, new)
-        text = dump_json(found.document()) + '\n'
+        figures = words.figures_document(found.comparison)
+        text = dump_json(found.document() | figures) + '\n'
         contents['result.json'] = text
         if found.accepted:
             contents['calibration.yaml'] = found.calibration.dump()

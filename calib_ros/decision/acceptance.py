@@ -42,7 +42,7 @@ def refusals(
     if validation is None:
         text = 'too few poses to hold some out and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
-    share = validation.outliers / len(validation.judged)
+    share = validation.share_of_outliers
     if share > MOST_OUTLIERS:
         if result.step is not None and not result.step.harmful:
             failed.append(result.step.reason)
@@ -157,7 +157,7 @@ def percent(share: float) -> str:
 def _of_harm(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
     if helps and validation.outliers:
         first, second = validation.figures_of_all
-        gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
+        gain, limit = _gain(validation, 'position', validation.counting, CERTAIN)
         limit = max(limit, _loss_by_chance(validation), COUNTS)
         if second.mean_mm > first.mean_mm or gain < -limit:
             yield Reason(
@@ -186,8 +186,9 @@ def _loss_by_chance(validation: Comparison) -> float:
     A correction makes a much larger gross error bigger or smaller at random. Student's t of the
     differences of squares accounts for that, even with a single outlier.
     """
-    before, after = validation.before, validation.after
-    means = mean_squares(before.position, after.position, after.configurations)
+    which, groups = validation.counting, validation.after.configurations
+    before, after = (each.position[which] for each in (validation.before, validation.after))
+    means = mean_squares(before, after, groups[which])
     count = means.shape[1]
     if count < 2:
         return np.inf

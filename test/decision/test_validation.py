@@ -56,7 +56,11 @@ def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
     assert [each.max_mm for each in comparison.figures_of_all] == pytest.approx([18.0, 9.0])
     assert comparison.deciding.tolist() == which.tolist()
     repeated = np.array([False, True, False, False])
-    assert replace(comparison, repeated=repeated).deciding.tolist() == [True, False, True, False]
+    again = replace(comparison, repeated=repeated)
+    assert again.deciding.tolist() == [True, False, True, False]
+    assert (again.figures[0].count, again.figures_of_all[0].count) == (2, 3)
+    assert again.share_of_outliers == pytest.approx(1 / 3)
+    assert replace(comparison, repeated=~which).outliers == 0
 
 
 @pytest.mark.parametrize(
@@ -209,7 +213,7 @@ def test_held_out_pairs_at_fitted_configurations_are_repeated():
     judged, text = validation.validate(
         replace(problem, loss='none'), problem.model, problem.model, [], None
     )
-    said = '5 held-out poses; those that repeat fitted poses (2) do not count for acceptance'
+    said = '3 held-out poses; not counted because they repeat fitted poses: 2'
     assert text == said
     assert judged.deciding.tolist() == [True, False, True, False, True]
 

@@ -87,5 +87,5 @@ def test_the_other_commands_write_their_pages(solved, tmp_path):
     arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
     assert main(arguments) == 0
     page = Page((tmp_path / 'plan.report.html').read_text())
-    assert 'Test poses' in page.text
+    assert 'Poses to measure' in page.text
     assert main(arguments) == 1
