@@ -208,6 +208,25 @@ KINDS = {
 }  # fmt: skip
 
 
+def test_rows_of_several_kinds_are_sets_between_frames_of_their_own(tmp_path):
+    """Positions, a distance and a pose in a camera on the flange, and one pose held out."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(KINDS['mixed'])
+    table = read_table(path, 2)
+    points, wire, camera, judge = found = (*table.fitted, *table.held_out)
+    assert [(each.base, each.tool, each.joints[:, 0].tolist()) for each in found] == [
+        ('base', 'tool', [1, 5]),
+        ('base_distance', 'tool_a', [3]),
+        ('base_a', 'tool_cam', [4]),
+        ('base', 'tool_a', [2]),
+    ]
+    assert (points.positions[:, 0].tolist(), points.oriented.any()) == ([1, 5], False)
+    assert wire.distances.tolist() == [7.5]
+    assert (camera.positions[:, 0].tolist(), camera.inverse) == ([-4], True)
+    assert judge.oriented.all()
+    assert [each.distances for each in (points, camera, judge)] == [None] * 3
+
+
 @pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('eye_in_hand', [False, True])
 def test_a_table_with_quotes_is_the_same_table(tmp_path, kind, eye_in_hand):
