@@ -56,16 +56,6 @@ def test_positions_without_orientation(read):
     assert len(held_out) == 0
 
 
-def test_poses_and_columns_that_are_not_known(read):
-    fitted, _ = read(POSES)
-    np.testing.assert_array_equal(fitted.positions, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(fitted.rotations[0], np.eye(3))
-    np.testing.assert_allclose(
-        fitted.rotations[1], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-15
-    )
-    assert fitted.oriented.tolist() == [True, True]
-
-
 def test_columns_in_any_order_with_byte_order_mark_and_windows_lines(read):
     text = '\ufeffz,y,x,q2,q1\r\n3,2,1,0.2,0.1\r\n\r\n'
     fitted, _ = read(text)
