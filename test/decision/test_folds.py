@@ -140,11 +140,6 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(rng):
     )
 
 
-def test_values_that_nobody_rounded_are_not_called_so(rng):
-    seen = measure(arm(rng), poses('sweep', rng), rng, *NOISE)
-    assert identify(Problem(UR10E, seen, **SIGMAS)).remarks == ()
-
-
 def test_a_joint_that_moves_in_outliers_only_is_named(rng):
     """A coupling that the chain file forgot shows at two stops, which the robust fit drops."""
     q = UR10E.random_joints(60, rng)

@@ -11,7 +11,6 @@ from fits import SIGMAS, rms
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.suspicions import _common, _motion, scale_of
-from calib_ros.errors import ConfigError
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Chain, Frame, Joint
@@ -227,11 +226,6 @@ def test_a_scale_that_leaves_no_region_is_the_reason(scale):
     assert [each.rule for each in result.refusals] == [Rule.SCALE]
     assert not any('alike' in each for each in result.remarks)
     assert identify(replace(problem, sigma_scale=1e-4)).accepted
-
-
-def test_the_scale_of_a_device_is_a_number():
-    with pytest.raises(ConfigError, match=r'sigma_scale must be from 0 to 1, not -0\.1'):
-        Problem(FOUR, seen_of(arm()), sigma_scale=-0.1)
 
 
 POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])

@@ -245,22 +245,6 @@ def test_an_export_is_whole_or_absent(tmp_path):
     assert {path.name: path.read_text() for path in folder.iterdir()} == files
 
 
-def test_the_folder_is_made_at_the_start(tmp_path):
-    folder = tmp_path / 'not' / 'there'
-    archive = open_archive(folder)
-    assert folder.is_dir()
-    archive.add(sample(1))
-    assert not archive.error
-    assert not archive.trouble
-    assert stamps(folder) == [1]
-    shutil.rmtree(folder)  # by mistake, before a new journal begins
-    archive.start_new()
-    archive.add(sample(2))
-    archive.close()
-    assert not archive.error
-    assert stamps(folder) == [2]
-
-
 @pytest.mark.parametrize('folder', ['/proc/nope', '/dev/null/nope', '/dev/null'])
 def test_a_folder_in_which_nothing_can_be_written_is_refused(folder):
     with pytest.raises(InputError, match='set data_dir') as caught:

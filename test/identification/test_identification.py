@@ -115,14 +115,7 @@ def test_too_few_pairs_say_how_many_are_needed():
 
 
 def test_problems_that_make_no_sense_are_refused():
-    rng = np.random.default_rng(14)
-    seen = measure(UR10E, UR10E.random_joints(20, rng), rng)
-    with pytest.raises(UnknownNameError, match='elbow_joint'):
-        Problem(UR10E, seen, fixed=('elbow.a',))
-    with pytest.raises(ConfigError, match='fixed: true'):
-        Problem(UR10E, seen, fixed=('base.x',))
-    with pytest.raises(ConfigError, match='sigma_position'):
-        Problem(UR10E, seen, sigma_position=0.0)
+    *_, seen = measured_arm(1, 12)
     with pytest.raises(UnknownNameError, match=r'"hubert".*did you mean "huber"') as caught:
         Problem(UR10E, seen, loss='hubert')
     assert caught.value.alternatives == LOSSES
@@ -226,11 +219,13 @@ def test_the_model_is_complete_for_every_architecture(convention, joints):
         ('fixed', 'shoulder_pan_joint.a'),
         ('effects', 'gravity'),
         ('more', Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3)))),  # is no list
+        ('sigma_scale', -0.1),
+        *(('priors', {'elbow_joint.a': sigma}) for sigma in (0.0, -1.0, np.nan, np.inf)),
     ],
 )
-def test_settings_of_another_type_are_refused(setting, value):
-    _, _, seen = measured_arm(1, 12)
-    with pytest.raises(ConfigError, match=setting):
+def test_settings_of_another_type_or_out_of_range_are_refused(setting, value):
+    *_, seen = measured_arm(1, 12)
+    with pytest.raises(ConfigError, match=setting.removesuffix('s')):
         Problem(UR10E, seen, **{setting: value})
 
 

@@ -6,7 +6,6 @@ import io
 import json
 from contextlib import redirect_stdout
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -14,11 +13,9 @@ from robots import DATA, needs_data
 
 from calib_ros.cli.main import main
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.bags import replay
 from calib_ros.files.tables import read_table
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.session import CalibrationSession
 
 pytestmark = needs_data
 
@@ -34,8 +31,6 @@ REFERENCES = {
 }
 # Its first joint moves but once, slowly through the session, as a drift of the tracker would.
 DOUBTFUL = ('positioner_2axis_pose', 'all')
-LARGE = {('ur10_ipa_leica', 'A'), ('ur5_jacobi_lasertracker', 'grid')}
-SMALL = [key for key in REFERENCES if key not in LARGE]
 
 
 def run_json(*arguments):
@@ -47,7 +42,6 @@ def run_json(*arguments):
     return found
 
 
-@cache
 def by_table(name, session, *options):
     """Return what is identified from a table by the command line."""
     table, chain = (DATA / name / file for file in ('uniform.csv', 'chain.yaml'))
@@ -122,15 +116,6 @@ def assert_same_result(first, second):
             assert value == pytest.approx(second['validation'][when][figure], abs=1e-6)
 
 
-@pytest.mark.parametrize(('name', 'session'), SMALL)
-def test_table_and_bag_give_the_same_parameters(tmp_path, name, session):
-    folder, bag = DATA / name, tmp_path / 'bag'
-    chain = ('--chain', folder / 'chain.yaml')
-    written = ['csv2bag', folder / 'uniform.csv', bag, *chain, '--session', session]
-    assert main([str(argument) for argument in written]) == 0
-    assert_same_result(by_table(name, session), run_json('identify', bag, *chain))
-
-
 def test_the_real_recordings_replay_alike():
     bags = [DATA / 'ur10_ipa_leica' / 'bags' / f'ur10_b_{kind}' for kind in ('mcap', 'sqlite3')]
     first, second = (run_json('identify', bag, '--chain', 'ur10') for bag in bags)
@@ -144,21 +129,3 @@ def test_the_real_recordings_replay_alike():
             found['validation']['after']['rms_mm'] < 0.5 < found['validation']['before']['rms_mm']
         )
     assert_same_result(first, second)
-
-
-def test_the_real_recordings_hold_the_measured_values():
-    """The values of the 120 configurations are those of the table, found by their stamps."""
-    folder = DATA / 'ur10_ipa_leica'
-    session = CalibrationSession(load_chain('ur10'))
-    assert replay(folder / 'bags' / 'ur10_b_mcap', session).warnings == ()
-    observations = session.problem().observations
-    table = read_table(folder / 'uniform.csv', 6, ('B',))
-    (fitted,), (test,) = table.fitted, table.held_out
-    joints = np.concatenate([fitted.joints, test.joints])
-    positions = np.concatenate([fitted.positions, test.positions])
-    assert len(observations) == 120
-    for measured, where in zip(observations.joints, observations.positions, strict=True):
-        distance = np.abs(joints - measured).max(axis=1)
-        row = distance.argmin()
-        assert distance[row] < 1e-9
-        np.testing.assert_allclose(where, positions[row], rtol=0.0, atol=1e-9)
