@@ -29,7 +29,7 @@ from typing import Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.joint import (
     ANYWHERE,
@@ -329,6 +329,18 @@ class Chain(Shown):
     @cached_property
     def _effect_values(self) -> Mapping[str, float]:
         return dict(self.effects)
+
+
+def refuse_other_joints(
+    what: str, chain: Chain, whose: str, other: Chain, error: type[CalibrationError] = ConfigError
+) -> None:
+    """Refuse a chain with other joints than another one, each named by what it is."""
+    ours, theirs = (
+        ', '.join(f'{joint.name} ({joint.type})' for joint in each.joints)
+        for each in (chain, other)
+    )
+    if ours != theirs:
+        raise error(f'{what} has the joints {ours}; {whose} has {theirs}: are they of one robot?')
 
 
 @lru_cache(maxsize=64)

@@ -35,6 +35,7 @@ from calib_ros.kinematics.chain import (
     Joint,
     JointType,
     nearly_parallel,
+    refuse_other_joints,
 )
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
@@ -165,12 +166,7 @@ def corrected_urdf(
 
 
 def _refuse_others(arm: Chain, nominal: Chain) -> None:
-    kinds = [[f'{joint.name} ({joint.type})' for joint in c.joints] for c in (arm, nominal)]
-    if kinds[0] != kinds[1]:
-        raise ConfigError(
-            f'the chain has the joints {", ".join(kinds[0])}, but the URDF has '
-            f'{", ".join(kinds[1])} between these links'
-        )
+    refuse_other_joints('the chain', arm, 'the URDF, between these links,', nominal)
     effects = [name for name, value in arm.effects if value]
     if effects:
         raise ConfigError(

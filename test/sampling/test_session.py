@@ -269,7 +269,9 @@ def test_what_was_there_before_does_not_judge():
 def test_the_calibration_of_another_robot_is_refused():
     made = session(samples())
     panda = load_chain('franka_panda')
-    with pytest.raises(InputError, match='panda_joint7, the robot has shoulder_pan_joint, sh'):
+    with pytest.raises(
+        InputError, match=r'panda_joint7 \(revolute\); the robot has shoulder_pan_joint'
+    ):
         made.adopt(Calibration(panda, panda))
     assert made.calibration is None
 
