@@ -74,22 +74,6 @@ def test_an_arm_that_moves_in_a_plane_reaches_no_cube(rng):
 # The verdict
 
 
-def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
-    """Commands compensated by the calibration: what is wanted against what is reached."""
-    true, result, _ = cell
-    wanted = UR.random_joints(200, np.random.default_rng(4))
-    moved = compensate(Compensator(UR, result.chain), wanted).joints
-    moved = moved[~np.isnan(moved).any(axis=1)]
-    wanted = wanted[~np.isnan(compensate(Compensator(UR, result.chain), wanted).joints[:, 0])]
-    found = verify(arm, [measured(true, moved, 1, (0.0, 0.0))], 1e-3)
-    frames = {'base': result.chain.base, 'tool': result.chain.tool}
-    meant = replace(UR, **frames).forward(wanted)[:, :3, 3]
-    missed = np.linalg.norm(true.forward(moved)[:, :3, 3] - meant, axis=1)
-    assert found.rms == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-6)
-    before, after = found.comparison.figures
-    assert before.rms_mm > 10.0 * after.rms_mm
-
-
 @pytest.mark.parametrize('step', [5e-4, 2e-3, 5e-3])
 def test_points_closer_than_their_corrections_keep_their_own(cell, arm, step):
     """Every tenth point of a path: the corrected arm passes, the uncorrected one does not."""

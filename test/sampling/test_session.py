@@ -247,15 +247,6 @@ def test_samples_that_were_fitted_are_known_again():
     assert 'these are measurements to which the calibration was fitted' in words
 
 
-def test_a_bumped_robot_is_noticed():
-    made = session(samples())
-    made.identify()
-    bumped = TRUE.with_offsets({'elbow_joint.theta': 3e-3})
-    drive(made, 8, [tracker(bumped)])
-    now, _ = made.validate()
-    assert now.rms_mm > 0.5
-
-
 def test_what_was_there_before_does_not_judge():
     """Neither samples before the calibration, nor those of an earlier session."""
     made = session(samples(30))
