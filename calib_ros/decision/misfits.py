@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.decision.drift import chance
@@ -16,7 +15,7 @@ from calib_ros.estimation.levels import CERTAIN, FEW, SURE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, Robust
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
 
 LEAST_STOPS = SOME_POSES // 4
@@ -90,9 +89,7 @@ def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
     return found, float(special.gammainc(found, expected)) if found else 1.0
 
 
-def _with_a_joint(
-    problem: Problem, joints: FloatArray, outliers: NDArray[np.bool_]
-) -> tuple[str, float]:
+def _with_a_joint(problem: Problem, joints: FloatArray, outliers: Flags) -> tuple[str, float]:
     """Return the joint whose values (N, n) best explain outliers (N,), and the chance of that."""
     number = stops(joints)
     begins = np.flatnonzero(np.diff(number, prepend=-1))
