@@ -31,7 +31,7 @@ COUNTS = 0.005
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Figures of position errors over a set of poses, as in ISO 9283."""
+    """Figures of position errors over a set of poses."""
 
     count: int
     rms_mm: float
