@@ -368,7 +368,17 @@ def test_axes_called_like_accelerations_are_none(tmp_path):
             '--columns "q*=NAME*"; joint values in another file: --joints FILE',
         ),
         (['q1', 'a', 'x', 'y', 'z'], '--columns "q2=NAME"'),
-        (['0.1', '-2', '3', '4e-5', '5'], 'numbers, not names: --columns "q1=#1,q2=#2,..."'),
+        (
+            ['J1 [°]', 'J2 [°]', 'x [mm]', 'y [mm]', 'z [mm]'],
+            '--columns "q*={J* [°]},x={x [mm]},y={y [mm]},z={z [mm]}" --length mm --angle deg',
+        ),
+        (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
+        (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),
+        (
+            ['a', 'a', 'x', 'y', 'z'],
+            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+        ),
+        (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
     ],
 )
 def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
@@ -387,6 +397,7 @@ def test_workbooks(tmp_path):
     sheet = book.create_sheet('measured')
     sheet.append(['a title'])
     sheet.append(['q1', 'q2', 'x', 'y', 'z'])
+    sheet.append(['rad', 'rad', 'm', 'm', 'm'])
     for row in np.column_stack([JOINTS, PLACES]).tolist():
         sheet.append(row)
     path = tmp_path / 'cell.xlsx'
@@ -419,7 +430,7 @@ def test_columns_of_joints_are_those_of_their_log(tmp_path, capsys):
     files = [str(tmp_path / name) for name in ('table.csv', 'log.csv', 'out.csv')]
     given = ['import', files[0], '--joints', files[1], '--out', files[2]]
     assert main(given) == 1
-    told = f'{files[1]} has no column q1; it has J1, J2: give --columns "q*=NAME*"'
+    told = f'{files[1]} has no column q1; it has J1, J2: give --columns "q*=J*"'
     assert told in capsys.readouterr().err
     assert main([*given, '--columns', 'q*=J*']) == 0
     assert_same(read_table(tmp_path / 'out.csv', 2), None)
