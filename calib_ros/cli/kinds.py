@@ -22,6 +22,7 @@ SUFFIXES = {
     **dict.fromkeys(('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp'), 'image'),
     **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
     **dict.fromkeys(TABLES, 'table'),
+    **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
 WORDS = {
@@ -33,6 +34,7 @@ WORDS = {
     'result': ('the result of identify', 'use workspace, or give it as --calibration'),
     'image': ('an image', 'use images on its folder'),
     'images': ('a folder of images', 'use images'),
+    'workbook': ('a workbook of another kind', 'save it as .xlsx or CSV'),
     'report': ('a report', 'open it in a browser or PDF reader'),
 }
 
@@ -73,8 +75,8 @@ def proposal(path: Path) -> str | None:
 
 
 def refuse_others(path: Path, command: str, *wanted: str) -> str:
-    """Return which of the wanted kinds a file is, the last one if unknown."""
-    kind = kind_of(path) or wanted[-1]
+    """Return which of the wanted kinds a path is: the first of an unknown file, else the last."""
+    kind = kind_of(path) or wanted[0 if path.exists() and not path.is_dir() else -1]
     if kind not in wanted:
         what, where = WORDS[kind]
         takes = ' or '.join(WORDS[each][0] for each in wanted)

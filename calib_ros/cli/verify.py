@@ -101,7 +101,7 @@ def _sets(
     options: argparse.Namespace, nominal: Chain, arm: Calibration, screen: Screen
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
     settings = common.settings_of(options)
-    if refuse_others(options.measured, 'verify', 'bag', 'table') == 'table':
+    if refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)
         sets, owners = (*found.fitted, *found.held_out), found.owners
         return _between(arm, sets, owners), found.warnings, found.by_line

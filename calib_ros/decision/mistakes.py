@@ -22,6 +22,7 @@ from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.decision.lost_rows import lost
 from calib_ros.decision.reasons import Reason, Rule
@@ -29,7 +30,15 @@ from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import ORIENTATIONS, Sets, Suspect, dead, suspects
 from calib_ros.estimation.identifiability import excited
 from calib_ros.estimation.leastsquares import System, factor_of, minimise
-from calib_ros.estimation.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER, SEVERAL, TRIED
+from calib_ros.estimation.levels import (
+    ALIKE,
+    CLEARLY,
+    CONFIDENT,
+    MOST_OUTLIERS,
+    NEARER,
+    SEVERAL,
+    TRIED,
+)
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
@@ -123,8 +132,8 @@ def explained(problem: Problem) -> Explained | None:
     given = _polished(problem, given)
     found = (
         _of_a_dead_column(problem, chain, given)
-        or _named(problem, chain, sets, given)
         or _of_a_lost_row(problem, chain, sets, given)
+        or _named(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
@@ -188,10 +197,12 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) ->
         return _away(arm, each, flange(arm, each))
 
     found = lost(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
-    if found is None or found.error > NEARER * given.error:
+    if found is None:
         return None
     remedy = 'is a row missing or duplicated in one of two tables? Correct it'
-    return Explained((Suspect(found.what, remedy),), given.error, found.error)
+    # the typical error tells nothing if most rows are right
+    corrected = found.error if found.error < NEARER * given.error else np.nan
+    return Explained((Suspect(found.what, remedy),), given.error, corrected)
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
@@ -301,18 +312,31 @@ def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None
     for each in sets:
         alone = replace(each, base='base', tool='tool')
         arm = bare.poses(chain, alone)
-        starts = [_Trial(start, (alone,), (arm,)) for start in closed_forms(chain, alone, arm)]
-        starts = [start for start in starts if np.isfinite(start.error)]
-        if not starts:
+        best = _nearest(chain, alone, arm, np.ones(len(alone), dtype=bool))
+        if best is None:
             return None
-        best = min(starts, key=lambda start: start.error).chain
+        away = _away(best.chain, alone, arm)  # a gross error would hide a mistake
+        usual = away <= np.quantile(away, 1.0 - MOST_OUTLIERS)
+        if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
+            again = _nearest(chain, alone, arm, usual)
+            best = best if again is None or best.error <= again.error else again
         places = arm[:, :3, 3]
         seen = places if each.socket else each.positions  # sockets measure nothing
         spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
-        chain = chain.with_frame(each.base, best.frame('base'))
-        chain = chain.with_frame(each.tool, best.frame('tool'))
+        chain = chain.with_frame(each.base, best.chain.frame('base'))
+        chain = chain.with_frame(each.tool, best.chain.frame('tool'))
         arms.append(arm)
     return _Trial(chain, sets, tuple(arms), float(np.median(spreads)))
+
+
+def _nearest(
+    chain: Chain, each: Observations, arm: FloatArray, rows: NDArray[np.bool_]
+) -> _Trial | None:
+    """Return the best closed form of some rows (N,), judged by all of them; None if none is."""
+    starts = closed_forms(chain, each.select(rows), arm[rows])
+    found = [_Trial(start, (each,), (arm,)) for start in starts]
+    found = [one for one in found if np.isfinite(one.error)]
+    return min(found, key=lambda one: one.error, default=None)
 
 
 class _Bare:
@@ -332,7 +356,9 @@ class _Bare:
 def _polished(problem: Problem, trial: _Trial) -> _Trial:
     chain, sets = trial.chain, trial.sets
     sigmas = problem.sigma_position, problem.sigma_orientation
-    system = System(tuple(Samples(each, *sigmas) for each in sets))
+    pairs = zip(sets, trial.arms, strict=True)
+    usual = [e.select(_away(chain, e, arm) <= CLEARLY * trial.error) for e, arm in pairs]
+    system = System(tuple(Samples(each, *sigmas) for each in usual))
     sockets = {each.base for each in sets if each.socket}
     every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
     names = [name for name in every if name.is_length or name.owner not in sockets]

@@ -310,7 +310,7 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
 
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
-    """Yield lengths in mm, the other convention, and other arms with the same kinds of joints."""
+    """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
     small = [replace(j, a=SCALES['mm'] * j.a, d=SCALES['mm'] * j.d) for j in chain.joints]
     what = 'the lengths of the chain file are in mm, not metres'
     remedy = 'give a and d in metres there'
@@ -321,11 +321,21 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
     remedy = f'convention: {other} in the chain file'
     arm = replace(chain, convention=other, parallel=None)
     yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
+    held = [key for key in ('base', 'tool') if chain.frame(key).fixed]
+    for keys in dict.fromkeys(((*held,), (*held[:1],), (*held[1:],))):
+        if keys:
+            what = f'the chain file gives a wrong {" and ".join(keys)} (fixed: true)'
+            remedy = 'correct it, or leave out fixed: true there'
+            base, tool = (None if key in keys else getattr(chain, key) for key in ('base', 'tool'))
+            arm = replace(chain, base=base, tool=tool)
+            yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
     types = [joint.type for joint in chain.joints]
     for ours in shipped_chains():
         alike = [joint.type for joint in ours.joints] == types
         if alike and not np.allclose(ours.table, chain.table, atol=1e-6):
             what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'
+            if ours.name == chain.name:
+                what = f'the DH table is not that of a {ours.name}'
             published = f'set chain (--chain) to {ours.name}'
             arm = replace(ours, base=chain.base, tool=chain.tool)
             yield Suspect(what, remedy, rank=2, chain=arm, published=published)

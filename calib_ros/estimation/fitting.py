@@ -298,11 +298,12 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
         rows += count * kind.rows
         configurations += count
     if rows < len(names):
-        width = problem.kinds[0].rows
+        width, sets = problem.kinds[0].rows, len(problem.sets)
+        of = f', also of {sets} sessions, devices and targets' if sets > 1 else ''
         raise TooFewObservationsError(
             configurations,
             -(-len(names) // width),
-            f'{width} equations each for {len(names)} parameters',
+            f'{width} equations each for {len(names)} parameters{of}',
         )
 
 

@@ -21,6 +21,7 @@ from calib_ros.shown import some
 from calib_ros.texts import from_cell
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
+DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 Row = tuple[int, Sequence[str]]
 """Line number and cells."""
 Codes = tuple[Index, list[str]]
@@ -40,9 +41,11 @@ class Columns:
         return f'{self.path}, line {self.lines[row]}: {name}'
 
     def _no_number(self, row: int, name: str, text: str = '') -> InputError:
+        remedy = 'correct that row or leave it out'
+        if DECIMAL_COMMA.fullmatch(text):
+            remedy = 'write a point, or give --decimal comma'
         return InputError(
-            f'{self.where(row, name)} must be a finite number, not {text!r}: correct that row or '
-            'leave it out'
+            f'{self.where(row, name)} must be a finite number, not {text!r}: {remedy}'
         )
 
     def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:
@@ -128,6 +131,7 @@ class MadeColumns(Columns):
 
     values: Mapping[str, FloatArray]
     words: Mapping[str, Sequence[str]]
+    theirs: tuple[str, ...] = ()  # names in the file, if others
     header: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:

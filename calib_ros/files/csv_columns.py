@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -212,7 +213,7 @@ def _irregular(path: Path, text: str, progress: Notify, above: int) -> MadeColum
         rows.append((line, row[: len(header)]))
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
-        raise InputError(f'{path} has several columns {", ".join(twice)}: rename all but one')
+        raise ColumnsError(f'{path} has several columns {", ".join(twice)}: rename all but one')
     return of_cells(path, header, rows)
 
 
@@ -247,28 +248,36 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
 def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
     """Return --columns for the missing columns, with similar names of the header or NAME."""
     if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
-        return 'Its first line holds numbers, not names: --columns "q1=#1,q2=#2,..."'
+        numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
+        return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'
     found = {
         name: next((each for each in header if re.match(rf'{name}\b', each, re.I)), 'NAME')
         for name in missing
     }
     of_joints = [f'q{k}' for k in range(1, joints + 1)]
-    more = ''
-    if found.keys() >= {*of_joints}:
-        like = _like_joints(header, joints)
-        more = '' if like else '; joint values in another file: --joints FILE'
+    whole = found.keys() >= {*of_joints}
+    like = like_joints(header, joints) if found.keys() & {*of_joints} else {}
+    more = '; joint values in another file: --joints FILE' if whole and not like else ''
+    if whole or like:
         others = {name: found[name] for name in found if name not in of_joints}
-        found = {'q*': like or 'NAME*', **others}
+        found = {**(like or {'q*': 'NAME*'}), **others}
     plain = {name: re.fullmatch(r'[\w.*]+', each) for name, each in found.items()}
     given = (f'{name}={each if plain[name] else f"{{{each}}}"}' for name, each in found.items())
+    named = ' '.join(found.values())
+    units = ('length', 'mm'), ('length', 'cm'), ('angle', 'deg'), ('angle', '°')
+    for option, unit in reversed(units):
+        if re.search(rf'(?<!\w){unit}(?!\w)', named):
+            more = f' --{option} {unit.replace("°", "deg")}{more}'
     return f'Columns of other names: --columns "{",".join(given)}"{more}'
 
 
-def _like_joints(header: Sequence[str], joints: int) -> str:
-    """Return the names that count the joints in a header, with a star for the number."""
-    for name in header:
-        for one in re.finditer('1', name):
+def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
+    """Return the names in a header that count the joints, with a star for the number from 1."""
+    for name, first in product(header, (1, 0)):
+        for one in re.finditer(str(first), name):
             before, after = name[: one.start()], name[one.end() :]
-            if all(f'{before}{k}{after}' in header for k in range(1, joints + 1)):
-                return f'{before}*{after}'
-    return ''
+            like = [f'{before}{k}{after}' for k in range(first, joints + first)]
+            if set(like) <= set(header):
+                count = {f'q{k}': each for k, each in enumerate(like, 1)}
+                return {'q*': f'{before}*{after}'} if first else count
+    return {}

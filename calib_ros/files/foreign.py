@@ -12,6 +12,7 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import MadeColumns, lines_in_words
+from calib_ros.files.csv_columns import like_joints, named_by_option
 from calib_ros.files.layouts import (
     ANGLES,
     COVARIANCE,
@@ -61,8 +62,10 @@ class Foreign:
             log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
             joints = log.values()
             if 'q1' not in joints:
+                joined = 0 if self.chain is None else len(self.chain.joints)
+                like = like_joints(log.header, joined).get('q*', 'NAME*')
                 raise InputError(
-                    f'{self.log} has no column q1; {log.has}: give --columns "q*=NAME*" or '
+                    f'{self.log} has no column q1; {log.has}: give --columns "q*={like}" or '
                     '--joints-preset'
                 )
             values = joints | values
@@ -72,7 +75,7 @@ class Foreign:
                     'measurement needs the row of its joint values'
                 )
             notes += [*log.notes, f'row by row, {self.log} holds the joint values of {path}']
-        made = MadeColumns(path, lines, values, table.words())
+        made = MadeColumns(path, lines, values, table.words(), table.header)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         measured = [made.values[name] for name in MEASURED if name in made.values]
@@ -151,8 +154,8 @@ class _Table:
             names = joint_columns(len(self._chain.joints))
             if missing := [name for name in names if name not in kept]:
                 raise InputError(
-                    f'{self._path} has no column for {", ".join(missing)}: name it by --columns '
-                    f'{missing[0]}=NAME; {self.has}'
+                    f'{self._path} has no column for {", ".join(missing)}; {self.has}. '
+                    f'{named_by_option(self.header, missing, len(names))}'
                 )
         return kept
 
@@ -176,7 +179,12 @@ class _Table:
     @property
     def has(self) -> str:
         """Return in words which columns there are."""
-        return f'it has {", ".join(filter(None, self._sheet.header))}'
+        return f'it has {", ".join(self.header)}'
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """Return the names of its columns."""
+        return tuple(filter(None, self._sheet.header))
 
     def words(self) -> dict[str, list[str]]:
         """Return the text columns."""
@@ -192,7 +200,8 @@ class _Table:
         """Return our columns in m and rad."""
         names = list(dict.fromkeys(n for each in self._expressions.values() for n in each.names))
         numbers = [self._sheet.number(name) or '' for name in names]
-        read = self._sheet.columns.numbers(numbers, names)
+        called = [self._sheet.header[int(number[1:]) - 1] or number for number in numbers]
+        read = self._sheet.columns.numbers(numbers, called)
         columns = dict(zip(names, read.T, strict=True))
         units = self._units()
         found = {}

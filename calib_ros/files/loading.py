@@ -12,7 +12,7 @@ from typing import Any
 
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.result import Identification
-from calib_ros.errors import CalibrationError, ColumnsError, TooFewObservationsError
+from calib_ros.errors import ColumnsError, TooFewObservationsError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
@@ -98,18 +98,16 @@ def table(
 ) -> Table:
     """Return a table of measurements of a chain.
 
-    Without a given layout, a table with other columns is tried with the joints' names and another
+    Without a given layout, a table with other columns is read with the joints' names and another
     separator; guesses are among the warnings.
     """
     sigmas = (settings.sigma_position, settings.sigma_orientation)
     given = path, len(chain.joints), sessions, sigmas, eye_in_hand
-    try:
-        return read_table(*given, foreign, progress)
-    except ColumnsError:
-        if foreign is None:
-            with suppress(CalibrationError):  # keep the first error
-                return read_table(*given, Foreign(Layout(), chain), progress)
-        raise
+    if foreign is None:
+        with suppress(ColumnsError):
+            return read_table(*given, progress=progress)
+        foreign = Foreign(Layout(), chain)
+    return read_table(*given, foreign, progress)
 
 
 def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:

@@ -18,6 +18,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
+    MadeColumns,
     check_quaternions,
     distinct,
     lines_in_words,
@@ -280,12 +281,12 @@ def _check_header(columns: Columns, joints: int) -> None:
     missing = [name for name in dict.fromkeys(needed) if name not in header]
     if missing:
         refuse_separator(columns.path, columns.header)
+        found = (isinstance(columns, MadeColumns) and columns.theirs) or columns.header
         expected = ', '.join([*needed[:joints], *POSITION])
         raise ColumnsError(
             f'{columns.path} has no column {", ".join(missing)}; expected {expected} '
             '(or distance, plane, or location and socket); found '
-            f'{", ".join(columns.header) or "nothing"}. '
-            f'{named_by_option(columns.header, missing, joints)}'
+            f'{", ".join(found) or "nothing"}. {named_by_option(found, missing, joints)}'
         )
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import Columns, Row, lines_in_words, of_cells
+from calib_ros.files.columns import DECIMAL_COMMA, Columns, Row, lines_in_words, of_cells
 from calib_ros.files.csv_columns import csv_rows, regular
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.shown import some
@@ -27,7 +27,6 @@ HEAD_LINES = MOST_ENTRIES // 10
 LARGEST_SHEET = 3 * LARGEST_TABLE
 """Bytes of an unpacked workbook."""
 SHEETS = ('.xlsx', '.xlsm')
-DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +78,8 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     at, header = _header(path, rows, names, known)
     used = [header.index(n) for n in names if not n.startswith('#') and n in header]
     used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
+    low = {name.lower() for name in known}
+    used += [k for k, cell in enumerate(header) if cell.lower() in low]
     first = _first(path, rows, at, used, decimal, notes)
     width = len(rows[first][1])
     header = header or ('',) * width
@@ -250,7 +251,7 @@ def _first(
                 left = lines_in_words([line for line, _ in rows[at + 1 : k]])
                 notes.append(f'there are no numbers in {left}: left out')
             return k
-    raise InputError(f'{path} has no rows of numbers in the columns named')
+    raise InputError('; '.join([f'{path} has no rows of numbers in the columns named', *notes]))
 
 
 def _is_number(cell: str, decimal: str) -> bool:

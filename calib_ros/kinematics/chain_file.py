@@ -66,7 +66,21 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
                 'robot (or path of a chain file or URDF)', str(name_or_path), robots
             )
         path = robots[path.name]
-    return parse_chain(read_text(path), str(path))
+    chain = parse_chain(read_text(path), str(path))
+    _refuse_degrees(chain, str(path))
+    return chain
+
+
+def _refuse_degrees(chain: Chain, where: str) -> None:
+    """Refuse limits in degrees, between which joint values in degrees would pass for radians."""
+    for k, joint in enumerate(chain.joints, 1):
+        for key in ('lower', 'upper') if joint.type == 'revolute' else ():
+            limit = float(getattr(joint, key) or 0.0)
+            if abs(limit) > TWO_TURNS and limit.is_integer():
+                raise ConfigError(
+                    f'{where}: joint {k}: {key} must be in radians, not {limit:g}: write degrees '
+                    f'as {math.radians(limit):.9g}, or leave it out if there is no limit'
+                )
 
 
 def read_urdf(

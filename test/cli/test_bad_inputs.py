@@ -22,7 +22,7 @@ def bad_inputs():
         'cannot read jugs.csv: No such file or directory\n',
     )
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
-    yield 'empty table', (*csv_of, 'empty'), 'empty has no column q1'
+    yield 'empty table', (*csv_of, 'empty'), 'empty has no rows'
     yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'

@@ -14,7 +14,7 @@ from calib_ros.decision.suspects import QUARTERS, dead
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import load_chain
 
 UR = load_chain('ur10e')
@@ -74,6 +74,14 @@ SPOILT = {
         lambda e: replace(e, positions=1e3 * e.positions, joints=np.degrees(e.joints)),
         '--length mm --joint-angle deg',
     ),
+    'both, and a lost beam': (
+        lambda e: replace(
+            e,
+            positions=1e3 * e.positions * (np.arange(len(e)) != 9)[:, np.newaxis],
+            joints=np.degrees(e.joints),
+        ),
+        '--length mm --joint-angle deg',
+    ),
     'wxyz': (turned([3, 0, 1, 2]), '--quaternion wxyz'),
     'transposed': (
         lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)),
@@ -122,7 +130,7 @@ PUBLISHED = {
     'swapped': 'swap them in joint_names',
     'shift': 'check the stamps',
 }
-POSITIONS_TELL = ('mm', 'left-handed', 'sign', 'coupled')
+POSITIONS_TELL = ('mm', 'both, and a lost beam', 'left-handed', 'sign', 'coupled')
 
 
 @pytest.mark.parametrize(
@@ -138,6 +146,14 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     published = ' -- '.join(each.published for each in found.suspects)
     assert PUBLISHED.get(mistake, '') in published  # what is said of messages
     assert '--' not in published.replace(' -- ', '')
+
+
+@pytest.mark.parametrize('keys', [('base',), ('tool',), ('base', 'tool')])
+def test_frames_held_in_the_wrong_place_are_named(keys):
+    """The device or the robot was said to have moved, and sent for."""
+    shifted = se3.transform(np.eye(3), np.array([0.1, 0.2, 0.3]))
+    held = replace(UR, **dict.fromkeys(keys, Frame(shifted, fixed=True)))
+    assert f'wrong {" and ".join(keys)} (fixed' in identify(Problem(held, seen_of())).refusals[0]
 
 
 def test_a_wrong_order_of_angles_is_named_where_the_tool_hardly_turns():

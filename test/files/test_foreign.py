@@ -356,7 +356,17 @@ def test_axes_called_like_accelerations_are_none(run, tmp_path):
             '--columns "q*=NAME*"; joint values in another file: --joints FILE',
         ),
         (['q1', 'a', 'x', 'y', 'z'], '--columns "q2=NAME"'),
-        (['0.1', '-2', '3', '4e-5', '5'], 'numbers, not names: --columns "q1=#1,q2=#2,..."'),
+        (
+            ['J1 [°]', 'J2 [°]', 'x [mm]', 'y [mm]', 'z [mm]'],
+            '--columns "q*={J* [°]},x={x [mm]},y={y [mm]},z={z [mm]}" --length mm --angle deg',
+        ),
+        (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
+        (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),
+        (
+            ['a', 'a', 'x', 'y', 'z'],
+            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+        ),
+        (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
     ],
 )
 def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
@@ -373,7 +383,12 @@ def test_workbooks(tmp_path):
     book = openpyxl.Workbook()
     book.active.title = 'first'
     sheet = book.create_sheet('measured')
-    for row in (['a title'], NAMES, *np.column_stack([JOINTS, PLACES]).tolist()):
+    for row in (
+        ['a title'],
+        NAMES,
+        ['rad', 'rad', 'm', 'm', 'm'],
+        *np.column_stack([JOINTS, PLACES]).tolist(),
+    ):
         sheet.append(row)
     path = tmp_path / 'cell.xlsx'
     book.save(path)
@@ -405,6 +420,6 @@ def test_columns_of_joints_are_those_of_their_log(run, tmp_path):
     given = ('import', 'table.csv', '--joints', 'log.csv', '--out', 'out.csv')
     status, _, err = run(*given)
     assert status == 1
-    assert 'log.csv has no column q1; it has J1, J2: give --columns "q*=NAME*"' in err
+    assert 'log.csv has no column q1; it has J1, J2: give --columns "q*=J*"' in err
     assert run(*given, '--columns', 'q*=J*')[0] == 0
     assert_same(read_table(tmp_path / 'out.csv', 2), None)

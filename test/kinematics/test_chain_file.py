@@ -313,3 +313,12 @@ def test_the_hash_of_a_table_stays_what_older_files_hold():
     chain = Chain('arm', 'standard', joints)
     chain = chain.with_effect_values({'two.sin_2': 1e-4, 'one.ratio': -2e-4})
     assert table_hash(chain).startswith('a94e4899f2eac75b')
+
+
+def test_limits_in_degrees_are_refused(tmp_path):
+    """A program in degrees was between them, and corrected as if in radians."""
+    (tmp_path / 'cell.yaml').write_text(BASE.replace('sign: 1', 'lower: -360', 1))
+    with pytest.raises(
+        ConfigError, match=r'joint 1: lower must be in radians, not -360: .*-6.283'
+    ):
+        load_chain(tmp_path / 'cell.yaml')
