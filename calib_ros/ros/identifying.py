@@ -105,7 +105,7 @@ class Snapshot(NamedTuple):
     """The input of an identification, and its settings."""
 
     problem: Problem
-    model: str
+    settings: Settings
     samples: tuple[Sample, ...]
     numbers: dict[Sample, int]
     origin: dict[str, Any]
@@ -164,11 +164,11 @@ class Identifying:
             'journal': str(self._archive.journal or ''),
         }
         numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
-        model, settings = session.settings.model, self._configuration()
         texts = session.warnings, session.summary
         largest_loss = self._node.get_parameter('largest_loss').value
-        lost = too_much_lost(session.account(), largest_loss)
-        found = Snapshot(problem, model, samples, numbers, origin, settings, *texts, lost)
+        lost = too_much_lost(session.account(), largest_loss) if session.made else ()
+        known = numbers, origin, self._configuration()
+        found = Snapshot(problem, session.settings, samples, *known, *texts, lost)
         self.progress.begin()
         return found
 
@@ -176,7 +176,7 @@ class Identifying:
         """Identify; publish only an accepted result."""
         try:
             with self.progress.running():
-                result = identify_model(given.problem, given.model, self.progress)
+                result = identify_model(given.problem, given.settings.model, self.progress)
         except TooFewObservationsError as err:
             self._advice = next(iter(given.warnings), '')
             raise too_few(err, given.summary) from err
@@ -207,7 +207,7 @@ class Identifying:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
-        self.last += self._filer.identified(given.problem, result, self._session.settings)
+        self.last += self._filer.identified(given.problem, result, given.settings)
         return result.accepted, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:

@@ -123,10 +123,12 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
 
 def apart(ahead: float) -> Hint:
     """Report clocks too far apart: measurements are `ahead` of the joint states [s]."""
+    when, unless = ('after', 'both still arrive')
+    if ahead < 0.0:
+        when, unless = ('before', 'the device does not just send late (lateness)')
     words = (
-        f'measurements were stamped {abs(ahead):.1f} s {"after" if ahead > 0.0 else "before"} the '
-        'newest joint state: synchronise the clocks (NTP, PTP) if both still arrive, and repeat '
-        'the poses of that time'
+        f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state: synchronise '
+        f'the clocks (NTP, PTP) if {unless}, and repeat the poses of that time'
     )
     return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks', words)
 

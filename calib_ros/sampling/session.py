@@ -74,6 +74,7 @@ class CalibrationSession:
     def clear(self) -> None:
         """Forget all samples and counts, not the last good calibration."""
         settings = self.settings
+        self.made = 0  # samples, without restored ones
         self._road = Road(self.chain, settings, self._take)
         self._collector, self._clocks = self._road.collector, self._road.clocks
         self._frames = FrameNames()
@@ -364,6 +365,7 @@ class CalibrationSession:
             if each.device not in usual or not self._kept.is_strange(each)
         ]
         self._kept.samples += fresh
+        self.made += len(fresh)
         for sample in fresh:
             self.on_sample(sample)
         return len(self.samples)

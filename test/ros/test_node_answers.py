@@ -22,6 +22,7 @@ from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
 from calib_ros.ros.identifying import Snapshot, _page, _without_middle
+from calib_ros.settings import Settings
 
 
 def test_errors_are_answers(cell, recording):
@@ -114,7 +115,7 @@ def test_the_page_that_is_saved_has_the_warnings():
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
     problem = Problem(arm, measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4))
     origin = {'journal': '', 'robot_serial': ''}
-    given = Snapshot(problem, 'geometric', (), {}, origin, '', ('the clock jumped',))
+    given = Snapshot(problem, Settings(), (), {}, origin, '', ('the clock jumped',))
     assert 'the clock jumped' in _page(given, identify(problem))
 
 

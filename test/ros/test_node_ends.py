@@ -51,7 +51,10 @@ def cell_and_child(**parameters):
     }
     with (
         Cell() as cell,
-        Child(domain=cell.domain, chain='ur10e', **reliable, **parameters) as child,
+        # the probes below have no stamps
+        Child(
+            domain=cell.domain, chain='ur10e', largest_loss=1.0, **reliable, **parameters
+        ) as child,
     ):
         reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
         probes = [
