@@ -228,8 +228,8 @@ def placement(draws):
 
 def spread(problem, result, sigma_position):
     """Return the RMS of held-out position residuals over predicted sigma."""
-    left = result.validation.after.position[result.validation.judged]
-    joints = np.concatenate([each.joints for each in problem.judging])[result.validation.judged]
+    left = result.validation.after.position[result.validation.deciding]
+    joints = np.concatenate([each.joints for each in problem.judging])[result.validation.deciding]
     variance = np.diagonal(result.pose_covariance(joints), axis1=1, axis2=2)[:, :3]
     return float(np.sqrt(np.mean(left**2 / (variance + sigma_position**2))))
 
@@ -248,7 +248,7 @@ def outer(problem):
             result = identify(there)
             sigma = problem.sigma_position * result.noise.position
             scores.append(spread(there, result, sigma) ** 2)
-            left = result.validation.after.position[result.validation.judged]
+            left = result.validation.after.position[result.validation.deciding]
             by_noise.append(np.mean((left / sigma) ** 2))
     return float(np.sqrt(np.mean(scores))), float(np.sqrt(np.mean(by_noise)))
 

@@ -117,7 +117,8 @@ def transfer():
             known = replace(result.chain, base=None, tool=None)
             judged = problems[target]
             held = replace(judged, chain=known, fixed=tuple(arm), loss='none')  # every row counts
-            figures = identify(held).validation.figures[1]
+            left = identify(held).validation.after
+            figures = left.figures(np.ones(len(left.position), dtype=bool))
             yield f'{target} from {source}, {model}', figures.rms_mm, figures.max_mm
 
 
@@ -133,7 +134,8 @@ def tried(session):
     time_of = np.arange(len(rows)) / len(rows)
 
     def rms(errors):
-        return 1e3 * float(np.sqrt((errors**2).sum(axis=1).mean()))
+        squares = (errors[result.validation.counting] ** 2).sum(axis=1)
+        return 1e3 * float(np.sqrt(squares.mean()))
 
     yield 'auto', rms(test)
     scaled = (temperature - temperature.mean()) / temperature.std()

@@ -9,6 +9,7 @@ import numpy as np
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import to_quat
+from calib_ros.texts import csv_text, dump_yaml
 
 UR = load_chain('ur5e')
 CELL = simulation.Cell()
@@ -42,6 +43,25 @@ def write_csv(path, rows):
         writer.writeheader()
         writer.writerows(rows)
     return path
+
+
+def write_images(folder, seen, lens, square):
+    """Write tables of images of a board of 7 x 5 squares [m]: corners, places, board, camera."""
+    board = {'type': 'charuco', 'columns': 7, 'rows': 5, 'square': square, 'marker': 0.7 * square}
+    (folder / 'board.yaml').write_text(dump_yaml(board | {'dictionary': 'DICT_5X5_250'}))
+    fx, fy, cx, cy, *bent = lens.values.values()
+    matrix = {'k': [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], 'd': bent}
+    (folder / 'camera.yaml').write_text(dump_yaml(matrix))
+    pairs = zip(seen.images.tolist(), seen.pixels.tolist(), strict=True)
+    rows = [(f'{image}.png', n % 24, u, v) for n, (image, (u, v)) in enumerate(pairs)]
+    (folder / 'corners.csv').write_text(csv_text([('image', 'corner', 'u', 'v'), *rows]))
+    write_places(folder / 'places.csv', seen.joints[::24])
+
+
+def write_places(path, joints):
+    """Write the joint values (K, n) of the images."""
+    rows = [(f'{k}.png', *row) for k, row in enumerate(joints.tolist())]
+    path.write_text(csv_text([('image', *(f'q{k + 1}' for k in range(joints.shape[1]))), *rows]))
 
 
 def bent(places, size, rng):

@@ -137,12 +137,16 @@ TILTED = range(len(CORNERS) // 2)
 
 @dataclass(frozen=True, eq=False)
 class TestPoses:
-    """Joint values (5, n) [rad or m] of the test poses P1 to P5, and the edge [m] of the cube."""
+    """Joint values (5, n) [rad or m] of the test poses P1 to P5, and the edge [m] of the cube.
+
+    All have one orientation if `oriented`.
+    """
 
     __test__ = False  # no test class
 
     joints: FloatArray
     edge: float
+    oriented: bool = True
 
 
 class _Cubes(NamedTuple):
@@ -166,38 +170,45 @@ def iso_9283_poses(
     The arm reaches the cube and the device sees it, beside the z axis of the base; its edges are
     parallel to the base frame. All poses have one orientation: P1 is at the centre, P2 to P5 on a
     diagonal plane, each a tenth of the diagonal away from a corner. Cubes grow about 500 reachable
-    centres while inverse kinematics tracks their corners. An arm that cannot keep its orientation
-    in any, as with fewer than six joints, is refused.
+    centres while inverse kinematics tracks their corners. Where an arm can keep its orientation in
+    none, as with fewer than six joints, the orientation is any.
     """
-    edge = 0.02  # of the smallest cubes [m]
     middle = draw_candidates(design, 500, rng, visibility)
-    start = np.repeat(middle[:, np.newaxis], 8, axis=1)
-    cubes = _at(design, visibility, _Cubes(design.targets(middle), middle, start), edge)
-    for factor in 1.3**0.5 ** np.arange(5):  # increasingly fine
-        while len((grown := _at(design, visibility, cubes, edge * factor)).centres):
-            cubes, edge = grown, edge * factor
-    if not len(cubes.centres):
+    corners = np.repeat(middle[:, np.newaxis], 8, axis=1)
+    points = _Cubes(design.targets(middle), middle, corners)
+    for part in (slice(6), slice(3)):
+        edge = 0.02  # of the smallest cubes [m]
+        cubes = _at(design, visibility, points, edge, part)
+        for factor in 1.3**0.5 ** np.arange(5):  # increasingly fine
+            while len((grown := _at(design, visibility, cubes, edge * factor, part)).centres):
+                cubes, edge = grown, edge * factor
+        if len(cubes.centres):
+            break
+    else:
         raise InputError(
-            'in no cube of its workspace can the arm keep one orientation: choose test poses '
-            'yourself; any new ones will do'
+            'the arm reaches all corners of no cube: choose test poses yourself; any new ones '
+            'will do'
         )
     travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
     best = cubes.select(travel.argmin()[np.newaxis])
     wanted = _poses(design, best.centres, 0.8 * edge)[0, TILTED]
-    found = inverse.solve(design.chain, wanted, best.corners[0, TILTED], design.base, design.tool)
+    frames = design.base, design.tool
+    found = inverse.solve(design.chain, wanted, best.corners[0, TILTED], *frames, part)
     if not found.converged.all():
         raise InputError(
             'the arm does not reach the inside of the cube that it reaches: try --seed'
         )
-    return TestPoses(np.concatenate([best.middle, found.joints]), edge)
+    return TestPoses(np.concatenate([best.middle, found.joints]), edge, part == slice(6))
 
 
-def _at(design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float) -> _Cubes:
+def _at(
+    design: Design, visibility: Visibility | None, cubes: _Cubes, edge: float, part: slice
+) -> _Cubes:
     """Return the cubes that can have this edge [m]."""
     count, _, joints = cubes.corners.shape
     wanted = _poses(design, cubes.centres, edge).reshape(-1, 4, 4)
     start = cubes.corners.reshape(-1, joints)
-    found = inverse.solve(design.chain, wanted, start, design.base, design.tool)
+    found = inverse.solve(design.chain, wanted, start, design.base, design.tool, part)
     reached = found.converged
     if visibility is not None:
         reached &= visibility.sees(design, found.joints)

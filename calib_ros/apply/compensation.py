@@ -23,7 +23,7 @@ import numpy as np
 
 from calib_ros.decision.region import Region
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.kinematics.follower import Follower, Solution
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
@@ -58,16 +58,8 @@ class Compensator(Shown, Limits):
 
     def __post_init__(self) -> None:
         """Refuse chains of different robots and invalid limits."""
-        ours, theirs = (
-            ', '.join(f'{joint.name} ({joint.type})' for joint in chain.joints)
-            for chain in (self.nominal, self.calibrated)
-        )
-        if ours != theirs:
-            raise ConfigError(
-                'the nominal and the calibrated chain must have the same joints in the same '
-                'order, not '
-                f'{ours} and {theirs}'
-            )
+        known = 'the nominal chain', self.nominal
+        refuse_other_joints('the calibrated chain', self.calibrated, *known)
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():
             raise ConfigError(f'tool must be three finite numbers [m], not {self.tool}')
         for name in (item.name for item in fields(Limits)):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Confidence limits of an RMS error, and its growth from night to night (docs/verification.md).
+"""Confidence intervals of an RMS error, and its growth from night to night (docs/verification.md).
 
 The sum of squares over K configurations with errors e_k is approximated by theta / nu chi2(nu)
 (Satterthwaite 1946) with
@@ -33,25 +33,31 @@ from scipy import optimize, special
 
 from calib_ros.decision.validation import Comparison
 from calib_ros.errors import InputError
+from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 SAFETY = 4.0
-"""Limits of 95 % then hold in 95 % if places differ (benchmarks/verification.py)."""
+"""Intervals of 95 % then hold in 95 % if places differ (benchmarks/verification.py)."""
 
 
 def rms_limits(
     rms: float, freedom: FloatArray, confidence: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the one-sided limits (N,) of an RMS found with (N,) degrees of freedom."""
+    """Return the limits (N,) of the interval of an RMS with (N,) degrees of freedom.
+
+    Beyond each limit lies half of what the interval may miss.
+    """
     lower, upper = (
-        rms / np.sqrt(special.chdtri(freedom, 1.0 - level) / freedom)
-        for level in (confidence, 1.0 - confidence)
+        rms / np.sqrt(special.chdtri(freedom, miss) / freedom)
+        for miss in (0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence)
     )
     return lower, upper
 
 
-def rms_interval(errors: FloatArray, group: Index, confidence: float) -> tuple[float, float]:
-    """Return the one-sided limits [m] of the RMS of errors (N, 3) over poses like these.
+def rms_interval(
+    errors: FloatArray, group: Index, confidence: float = CONFIDENT
+) -> tuple[float, float]:
+    """Return the interval [m] of the RMS of errors (N, 3) over poses like these.
 
     `group` (N,) are the configurations, each counted once; with a single one they are (0, inf).
     """
@@ -66,11 +72,11 @@ def rms_interval(errors: FloatArray, group: Index, confidence: float) -> tuple[f
     return float(lower[0]), float(upper[0])
 
 
-def interval_of(which: Comparison, when: int, confidence: float) -> tuple[float, float]:
-    """Return the limits [m] of the RMS before (0) or after (1), without outliers."""
+def interval_of(which: Comparison, when: int) -> tuple[float, float]:
+    """Return the 95 % interval [m] of the RMS before (0) or after (1), without outliers."""
     residuals = (which.before, which.after)[when]
-    mask = which.judged & ~np.isnan(residuals.position).any(axis=1)
-    return rms_interval(residuals.position[mask], residuals.configurations[mask], confidence)
+    mask = which.deciding & ~np.isnan(residuals.position).any(axis=1)
+    return rms_interval(residuals.position[mask], residuals.configurations[mask])
 
 
 def freedom_of(moments: FloatArray) -> float:

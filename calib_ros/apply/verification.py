@@ -7,12 +7,12 @@ pose, so its error is measured - C(q); uncorrected it would be measured - N(q). 
 the joint values that the controller reports. If the uncorrected program is known, the wanted pose
 is N(q_commanded), and a missing correction shows as well.
 
-The figure is the RMS position error over poses like those measured, with its limits
+The figure is the RMS position error over poses like those measured, with its interval
 (`confidence.py`):
 
-    PASS        the upper limit is within the tolerance
-    FAIL        the lower limit is beyond it
-    UNDECIDED   neither: more poses are needed
+    PASS        the whole interval is within the tolerance
+    FAIL        the whole interval is beyond it
+    UNDECIDED   the tolerance lies in the interval: more poses are needed
 
 On request, frames of the new measurements are fitted to both arms: the base if the device was
 moved, the tool if the target was changed or remounted. The change of any other frame counts as an
@@ -86,16 +86,16 @@ class Verification(Shown):
     tolerance : float or None
         Wanted RMS position error [m].
     confidence : float
-        Of each limit.
+        Of the interval.
     group : (N,)
         Configuration of each measurement; `configurations` counts them.
     rms, lower, upper : float
-        RMS position error [m] over poses like these, and its limits.
+        RMS position error [m] over poses like these, and its interval.
     freedom : float
         Degrees of freedom of that error.
     verdict : str
         'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds', 'does not hold', or
-        'no verdict' if unknown.
+        'no verdict' if unknown. No verdict either if fitted measurements look good.
     needed : int or None
         Number of configurations that would decide with the same RMS error, if undecided; None if
         even DECIDING would not.
@@ -169,7 +169,7 @@ def verify(
         Largest acceptable RMS position error [m]; without it the verdict is whether the
         calibration holds.
     confidence : float
-        Of the verdict.
+        Of the interval.
     new_base, new_tool : bool
         The measuring device was moved; the target was replaced or remounted. Their frames are
         fitted, and absorb the errors of as many configurations, of three freedoms each, as they
@@ -183,8 +183,7 @@ def verify(
     Raises
     ------
     InputError
-        For too few poses, distances, a device or target unknown to the calibration, or
-        measurements far from all commands.
+        For too few poses, distances, unknown devices or targets, or poses far from all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm.chain, sets, tolerance, confidence, fitted)
@@ -199,13 +198,14 @@ def verify(
     numbers = np.unique(np.geomspace(count, max(count, DECIDING), 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    holds = arm.holds(rms)
-    decided = None if tolerance is None else _decided(tolerance, lower, upper, numbers)
-    verdict, common = decided or (HOLDS[holds], None), 1.0
+    holds, reused, common = arm.holds(rms), arm.reused(sets), 1.0
+    verdict = _decided(tolerance, lower, upper, numbers) if tolerance else (HOLDS[holds], None)
+    if reused and verdict[0] not in ('FAIL', 'does not hold'):
+        verdict = ('no verdict', None)
     if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, holds, arm.reused(sets), uncorrected)
+    known = (commanded is not None, fitted, holds, reused, uncorrected)
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 

@@ -187,7 +187,7 @@ intends
 {MOVED}
 how to judge
   --tolerance MM  wanted RMS position error; without it: does the calibration still hold?
-  --confidence SHARE=0.95  confidence of the verdict
+  --confidence SHARE=0.95  confidence of the interval of the RMS error
   --out FOLDER  folder for the report and the residuals
   --force  {FORCE}
   --history DIR  {HISTORY}

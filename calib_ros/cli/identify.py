@@ -102,7 +102,8 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
             found = recalibrate(previous, problem, years, growth, new)
-        text = dump_json(found.document()) + '\n'
+        figures = words.figures_document(found.comparison)
+        text = dump_json(found.document() | figures) + '\n'
         contents['result.json'] = text
         if found.accepted:
             contents['calibration.yaml'] = found.calibration.dump()
@@ -296,7 +297,8 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
 
 
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
-    before, after = (result.validation or result.fitted).figures
+    judged = result.validation or result.fitted
+    before, after = judged.figures
     proof = '' if result.validation else '; on the poses fitted, which proves nothing'
     measured = words.measured(result)
     if result.outliers:
@@ -318,10 +320,18 @@ def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
         ('fitted to', measured),
         ('position error', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm{proof}'),
         *_interval(result.validation),
+        *_with_outliers(judged),
         second,
         ('judged by', result.validated_by),
         *valid,
     )
+
+
+def _with_outliers(judged: Comparison) -> tuple[tuple[str, str], ...]:
+    if not judged.outliers:
+        return ()
+    before, after = judged.figures_of_all
+    return (('with outliers', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm'),)
 
 
 def _document(found: Identified) -> str:

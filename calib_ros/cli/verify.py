@@ -20,9 +20,9 @@ from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
-from calib_ros.report.applied import STANDINGS, verification_report
+from calib_ros.report.applied import standing, verification_report
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, in_words, remarks
+from calib_ros.report.verdicts import each_in_words, in_words, likely, remarks
 from calib_ros.sampling.sample import Frames, collect
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
@@ -55,7 +55,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     for warning in warnings:
         screen.warn(warning)
     show(found, screen)
-    passed = STANDINGS[found.verdict][0].state not in ('bad', 'open')
+    passed = standing(found)[0].state not in ('bad', 'open')
     status = 0 if passed else common.Status.NOT_ACCEPTED
     if options.out is None:
         return status
@@ -78,16 +78,14 @@ def show(found: Verification, screen: Screen) -> None:
         orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    likely = f'RMS {1e3 * found.rms:.4f} mm; with {100.0 * found.confidence:g} % confidence each '
-    likely += f'above {1e3 * found.lower:.4f} and below {1e3 * found.upper:.4f} mm'
-    state, steps = STANDINGS[found.verdict]
+    state, steps = standing(found)
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     rows = {
         'measured': f'{after.count} times at {found.configurations} poses',
         'position error': f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm',
         'largest': f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm',
         'orientation error': orientation,
-        'poses like these': likely,
+        'poses like these': f'RMS {likely(found)}',
         'tolerance': tolerance,
     }
     screen.table(tuple(rows.items()))

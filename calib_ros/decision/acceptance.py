@@ -29,19 +29,20 @@ def refusals(
     own_behaviour: str | None,
     may_be_rounding: bool,
     sized: bool,
+    scaled: float = 0.0,
 ) -> tuple[Reason, ...]:
     """Return the acceptance rules that fail.
 
     `own_behaviour` describes outliers that are the arm's own (`misfits.py`), `may_be_rounding` is
-    the verdict of `rounding.py`, and `sized` tells whether the measurements fix the size and
-    shape of the arm.
+    the verdict of `rounding.py`, `sized` tells whether the measurements fix the size and shape of
+    the arm, and `scaled` is the scale of the device, minus one, that alone leaves no region.
     """
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
     if validation is None:
         text = 'too few poses to hold some out and test the result on them'
         return (*failed, Reason(Rule.CONFIGURATIONS, text))
-    share = validation.outliers / len(validation.judged)
+    share = validation.share_of_outliers
     if share > MOST_OUTLIERS:
         if result.step is not None and not result.step.harmful:
             failed.append(result.step.reason)
@@ -50,8 +51,10 @@ def refusals(
             'predictions do not belong together'
         )
         return (*failed, Reason(Rule.OUTLIERS, text))
-    gained = _of_the_gain(problem, result, validation, sized)
-    return (*failed, *gained, *_of_harm(validation, may_be_rounding))
+    gained = tuple(_of_the_gain(problem, result, validation, sized, scaled))
+    before, after = validation.figures
+    helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
+    return (*failed, *gained, *_of_harm(validation, may_be_rounding, helps))
 
 
 def _of_the_fit(
@@ -89,17 +92,18 @@ def _gain(
 
 
 def _of_the_gain(
-    problem: Problem, result: Identification, validation: Comparison, sized: bool
+    problem: Problem, result: Identification, validation: Comparison, sized: bool, scaled: float
 ) -> Iterator[Reason]:
     before, after = validation.figures
-    if after.rms_mm > 1e3 * problem.largest_error:
+    judged = validation.deciding
+    gain, limit = _gain(validation, 'position', judged)
+    largest = 1e3 * problem.largest_error
+    if after.rms_mm > largest and (before.rms_mm > largest or gain > limit):
         yield Reason(
             Rule.LARGEST_ERROR,
             f'RMS {after.rms_mm:.1f} mm remains on held-out poses, more than '
-            f'{1e3 * problem.largest_error:g} mm (largest_error)',
+            f'{largest:g} mm (largest_error)',
         )
-    judged = validation.deciding
-    gain, limit = _gain(validation, 'position', judged)
     if not gain > limit:
         text = f'RMS {before.rms_mm:.3f} mm before, {after.rms_mm:.3f} mm after'
         if gain > 0.0:
@@ -115,6 +119,8 @@ def _of_the_gain(
             f'residuals are explained just as well in {100.0 * result.chance:.0f} % of cases '
             f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
+    elif scaled:
+        yield Reason(Rule.SCALE, out_of_scale(scaled))
     elif result.region is None:
         text = (
             'what the correction removes is not larger than its own uncertainty, even at the '
@@ -128,10 +134,30 @@ def _of_the_gain(
         yield Reason(Rule.REGION, text)
 
 
-def _of_harm(validation: Comparison, may_be_rounding: bool) -> Iterator[Reason]:
-    if validation.outliers:
+def out_of_scale(scale: float) -> str:
+    """Return that a scale of the device, given minus one, may make the calibrated arm worse."""
+    return (
+        f'{grown(scale)}, as by a measuring device that is out of scale; '
+        'then the correction would make the arm worse. If a known length shows the right scale, '
+        'set sigma_scale'
+    )
+
+
+def grown(scale: float) -> str:
+    """Return how the lengths of the arm change with the scale of the device, given minus one."""
+    way = 'grow' if scale > 0.0 else 'shrink'
+    return f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
+
+
+def percent(share: float) -> str:
+    """Return a small share in percent, with two digits."""
+    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
+
+
+def _of_harm(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
+    if helps and validation.outliers:
         first, second = validation.figures_of_all
-        gain, limit = _gain(validation, 'position', np.ones_like(validation.judged), CERTAIN)
+        gain, limit = _gain(validation, 'position', validation.counting, CERTAIN)
         limit = max(limit, _loss_by_chance(validation), COUNTS)
         if second.mean_mm > first.mean_mm or gain < -limit:
             yield Reason(
@@ -160,8 +186,9 @@ def _loss_by_chance(validation: Comparison) -> float:
     A correction makes a much larger gross error bigger or smaller at random. Student's t of the
     differences of squares accounts for that, even with a single outlier.
     """
-    before, after = validation.before, validation.after
-    means = mean_squares(before.position, after.position, after.configurations)
+    which, groups = validation.counting, validation.after.configurations
+    before, after = (each.position[which] for each in (validation.before, validation.after))
+    means = mean_squares(before, after, groups[which])
     count = means.shape[1]
     if count < 2:
         return np.inf

@@ -30,7 +30,7 @@ import numpy as np
 from scipy import linalg, special
 
 from calib_ros.estimation.identifiability import followed
-from calib_ros.estimation.levels import CERTAIN, CONFIDENT, INTERVAL, SCALE, chance_of
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
@@ -42,7 +42,7 @@ from calib_ros.shown import Shown
 FALSE = 0.5 * (1.0 - CERTAIN)
 """False-alarm probability for an unchanged arm: one side of CERTAIN
 (benchmarks/recalibration.py)."""
-LIKELY = float(special.ndtri(INTERVAL))
+LIKELY = float(special.ndtri(0.5 + 0.5 * CONFIDENT))
 """Half of a 95 % interval in standard deviations."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
 """Typical size [m, rad] of changes by a collision or a replaced motor; a factor of three either

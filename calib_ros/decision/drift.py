@@ -35,8 +35,7 @@ SHIFTS = 2 * SOME_POSES
 
 
 Columns: TypeAlias = tuple[FloatArray, FloatArray]
-"""X^T X (P, P) of detrended columns X plus the normal matrix of priors, and X^T r (P, S) by
-shift."""
+"""X^T X (P, P) of detrended columns X, and X^T r (P, S) by shift."""
 
 
 class Shifts:
@@ -68,11 +67,8 @@ class Shifts:
             energy = squares[length : 3 * length] - squares[: 2 * length]
             self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
 
-    def columns(self, columns: Iterable[Sequence[FloatArray]], inverse: FloatArray) -> Columns:
-        """Return the products of weighted columns, (P, c, N) for each set, in one or more lots.
-
-        `inverse` (P,) is 1 / sigma of the priors of all columns, zero without a prior.
-        """
+    def columns(self, columns: Iterable[Sequence[FloatArray]]) -> Columns:
+        """Return the products of weighted columns, (P, c, N) for each set, in one or more lots."""
         rows, products = [], []
         for lot in columns:
             parts = []
@@ -90,16 +86,21 @@ class Shifts:
                 parts.append(series.reshape(len(series), -1))
             rows.append(np.concatenate(parts, axis=1))
         every = np.concatenate(rows)
-        return every @ every.T + np.diag(inverse**2), np.concatenate(products)
+        return every @ every.T, np.concatenate(products)
 
     def shares(
-        self, columns: Columns, known: Sequence[int], groups: Sequence[Sequence[int]]
+        self,
+        columns: Columns,
+        inverse: FloatArray,
+        known: Sequence[int],
+        groups: Sequence[Sequence[int]],
     ) -> FloatArray:
         """Return the share (G, S), by shift, that each group (G, K) explains beside known columns.
 
-        Each group is taken alone.
+        Each group is taken alone. `inverse` (P,) is 1 / sigma of the priors of all columns, zero
+        without a prior.
         """
-        every, moved = columns
+        every, moved = columns[0] + np.diag(inverse**2), columns[1]
         matrix = every[np.ix_(known, known)]
         root = inverse_root(matrix, np.diag(matrix))
         removed = root.T @ moved[known]
@@ -203,6 +204,6 @@ def chance_of_gain(
     shifts = Shifts(system, [each[-1] for each in rows])
     prior = system.prior
     inverse = np.zeros(len(names)) if prior is None else prior.rows(chain, names)[0]
-    columns = shifts.columns([[each[:-1] for each in rows]], inverse)
-    numbers = range(len(names))
-    return chance(shifts.shares(columns, numbers[: len(before)], [numbers[len(before) :]])[0])
+    columns = shifts.columns([[each[:-1] for each in rows]])
+    known, new = np.split(np.arange(len(names)), [len(before)])
+    return chance(shifts.shares(columns, inverse, known.tolist(), [new.tolist()])[0])

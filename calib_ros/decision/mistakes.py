@@ -104,7 +104,7 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
         error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
         if error > problem.largest_error or angle > problem.largest_angle:
             return True
-    if judged.outliers > MOST_OUTLIERS * len(judged.judged):
+    if judged.share_of_outliers > MOST_OUTLIERS:
         return True
     limits = problem.largest_length, problem.largest_angle
     return any(each.beyond(*limits) for each in result.parameters)

@@ -295,7 +295,7 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
         column = f'-{column}'
     if degrees:
         parts.append((f'has its zero {degrees[1:]} degrees away', f'theta {degrees} degrees'))
-        column += f'{degrees[0]}{abs(angle):.16g}'
+        column += f'{degrees[0]}{abs(angle):.16g} ({degrees} if in degrees)'
     whats, in_file = zip(*parts, strict=True)
     own = np.eye(len(chain.joints))[k]
     remedy = f'{" and ".join(in_file)} in the chain file'

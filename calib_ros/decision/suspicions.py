@@ -29,6 +29,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.acceptance import grown, out_of_scale, percent
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
@@ -86,7 +87,10 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
     refusals = list(result.refusals)
     if certain:
+        refusals = [each for each in refusals if each.rule is not Rule.SCALE]
         refusals.append(Reason(Rule.SCALE, scale))
+    if any(each.rule is Rule.SCALE for each in refusals):
+        scale = ''
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))
         lens = ''
@@ -134,8 +138,9 @@ def _common(
 
 def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     """Return the suspicion of a common scale in words, and whether it refuses."""
-    if text := _out_of_scale(result):
-        return text, True
+    risk = result.region.by_scale if result.region is not None else 0.0
+    if not result.refusals and result.posterior.rival is not None and risk >= HARMFUL:
+        return out_of_scale(result.posterior.rival[1]), True
     scale, std, freedom = scale_of(problem, result)
     if freedom < 2.0 or abs(scale) < LEAST_SCALE:
         return '', False
@@ -143,30 +148,9 @@ def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
     if abs(scale) < limit:
         return '', False
     certain = abs(scale) - limit > LARGEST_SCALE and not problem.sigma_scale
-    text = f'{_grown(scale)} (sigma {_percent(std)} %): '
+    text = f'{grown(scale)} (sigma {percent(std)} %): '
     advice = 'check the scale of the measuring device, and the temperature'
     return text + ('no arm does' if certain else advice), certain
-
-
-def _out_of_scale(result: Identification) -> str:
-    """Return that the scale of the device may make the calibrated arm worse."""
-    region, rival = result.region, result.posterior.rival
-    if result.refusals or region is None or rival is None or region.by_scale < HARMFUL:
-        return ''
-    return (
-        f'{_grown(rival[1])}, as by a measuring device that is out of scale; '
-        'then the correction would make the arm worse. If a known length shows the right scale, '
-        'set sigma_scale'
-    )
-
-
-def _grown(scale: float) -> str:
-    way = 'grow' if scale > 0.0 else 'shrink'
-    return f'all lengths of the arm {way} alike, by {_percent(abs(scale))} %'
-
-
-def _percent(share: float) -> str:
-    return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
 
 
 def _sister(problem: Problem, result: Identification) -> str:
@@ -199,11 +183,11 @@ def _gravity(problem: Problem, result: Identification) -> str:
         return ''
     rest = [name for name in result.names if name not in bent]
     straight = result.chain.with_offsets({n: -result.chain.value(n) for n in bent})
-    given = _explained(problem, straight, rest, bent)
+    given = explained(problem, straight, rest, bent)
     best, words = 0.0, ''
     for axis, along in zip('xyz', np.linalg.norm(problem.chain.gravity) * np.eye(3), strict=True):
         x, y, z = along.tolist()  # coefficients have the sign
-        share = _explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
+        share = explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
         best, words = max((best, words), (share, axis))
     if not best - given > EXPLAINED * (1.0 - given):
         return ''
@@ -280,30 +264,31 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
         freedom = IN_A_FRAME * count - len(result.names)
         if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
             continue
-        left = 1.0 - _explained(problem, result.chain, result.names, names)
+        left = 1.0 - explained(problem, result.chain, result.names, names)
         rest = freedom - len(names)
         if chance_of((1.0 - left) / max(left, EXACT) * rest, len(names), rest) > 1.0 - SURE:
             continue
         fitted = replace(frame, lens=replace(frame.lens, fixed=False))
-        imitated = _imitated(problem, result, problem.chain.with_frame(camera, fitted))
+        freed = replace(problem, chain=problem.chain.with_frame(camera, fitted))
+        imitates = imitated(freed, result)
         share = 1.0 - left * freedom / rest
-        if imitated or share > EXPLAINED:
+        if imitates or share > EXPLAINED:
             lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
             text = f'other intrinsics of the camera than those given explain {100.0 * share:.0f} %'
             text += f' of what is left: {lens}, or calibrate the camera as it is used'
-            return text, imitated
+            return text, imitates
     return '', False
 
 
-def _imitated(problem: Problem, result: Identification, freed: Chain) -> bool:
-    """Tell whether a fit with a free lens finds another arm, within the region of this one."""
+def imitated(freed: Problem, result: Identification) -> bool:
+    """Tell whether a fit with more freedom finds another arm, within the region of this one."""
     try:
-        other = fit(replace(problem, chain=freed))[2].chain
+        other = fit(freed)[2].chain
     except (InputError, np.linalg.LinAlgError):
         return True
-    joints = [each.spread().joints for each in problem.sets]
+    joints = [each.spread().joints for each in freed.sets]
     if result.region is not None:
-        drawn = freed.random_joints(SHELL, np.random.default_rng(0))
+        drawn = freed.chain.random_joints(SHELL, np.random.default_rng(0))
         joints.append(drawn[result.region.covers(drawn)])
     before, after = (
         _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
@@ -335,7 +320,7 @@ def _board(problem: Problem, result: Identification) -> str:
         if abs(mean) > LARGEST_SCALE + special.stdtrit(len(count) - 1, SURE) * error:
             way = 'wider' if mean > 0.0 else 'narrower'
             return (
-                f'the board is {_percent(abs(mean))} % {way} for its height than stated: print it '
+                f'the board is {percent(abs(mean))} % {way} for its height than stated: print it '
                 'unstretched, else the arm becomes as wrong'
             )
     return ''
@@ -350,11 +335,11 @@ def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) 
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
     if not added or noise < SUSPICIOUS:  # nothing is left to explain
         return 0.0
-    share = _explained(problem, chain.with_effects([*known, *added]), names, added)
+    share = explained(problem, chain.with_effects([*known, *added]), names, added)
     return share if share >= EXPLAINED else 0.0
 
 
-def _explained(
+def explained(
     problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""

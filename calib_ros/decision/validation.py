@@ -80,7 +80,7 @@ class Comparison(Shown):
 
     Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
     `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
-    configurations, which count in the figures but not for acceptance.
+    configurations, which count nowhere.
     """
 
     before: Residuals
@@ -89,19 +89,34 @@ class Comparison(Shown):
     repeated: NDArray[np.bool_] | None = None
 
     @property
+    def counting(self) -> NDArray[np.bool_]:
+        """Return which pairs (N,) count, with outliers."""
+        return np.ones_like(self.judged) if self.repeated is None else ~self.repeated
+
+    @property
     def deciding(self) -> NDArray[np.bool_]:
-        """Return which pairs (N,) count for acceptance."""
-        return self.judged if self.repeated is None else self.judged & ~self.repeated
+        """Return which pairs (N,) are in the figures."""
+        return self.counting & self.judged
 
     @property
     def outliers(self) -> int:
         """Return the number of outliers, which are left out of the figures."""
-        return int((~self.judged).sum())
+        return int((self.counting & ~self.judged).sum())
+
+    @property
+    def share_of_outliers(self) -> float:
+        """Return their share of the pairs that count."""
+        return self.outliers / int(self.counting.sum())
+
+    @property
+    def omitted(self) -> str:
+        """Return in words which pairs are not in the figures."""
+        return f', {of_them(self.outliers, "outlier")} not in the figures' if self.outliers else ''
 
     @cached_property
     def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after, without outliers."""
-        return self.before.figures(self.judged), self.after.figures(self.judged)
+        return self.before.figures(self.deciding), self.after.figures(self.deciding)
 
     def to_frame(self) -> Any:
         """Return the position residuals [m] before and after as a pandas.DataFrame."""
@@ -110,7 +125,7 @@ class Comparison(Shown):
             for when, residuals in (('before', self.before), ('after', self.after))
             for k, axis in enumerate('xyz')
         }
-        groups = {'configuration': self.after.configurations, 'judged': self.judged}
+        groups = {'configuration': self.after.configurations, 'judged': self.deciding}
         return as_frame(columns | groups)
 
     @cached_property
@@ -118,8 +133,7 @@ class Comparison(Shown):
         """Return the figures before and after with outliers."""
         if not self.outliers:
             return self.figures
-        everything = np.ones_like(self.judged)
-        return self.before.figures(everything), self.after.figures(everything)
+        return self.before.figures(self.counting), self.after.figures(self.counting)
 
 
 def residuals(chain: Chain, observations: Observations) -> Residuals:
@@ -166,24 +180,33 @@ def validate(
     judged too.
     """
     repeated = _repeated(problem)
-    if problem.judging and not repeated.all():
+    if not repeated.all():
         comparison = replace(compare(before, after, problem.judging), repeated=repeated)
-        if problem.loss != 'none':
-            distances = distances_of(after, names, problem.system(problem.judging))
-            judged = np.concatenate(distances) <= OUTLIER
-            judged |= np.False_ if explained is None else explained
-            comparison = replace(comparison, judged=judged)
-        text = f'{len(comparison.judged)} held-out poses'
-        if comparison.outliers:
-            text += f', {of_them(comparison.outliers, "outlier")} not in the figures'
-        if count := repeated.sum():
-            text += f'; those that repeat fitted poses ({count}) do not count for acceptance'
-        return comparison, text
+        if distinct(comparison.after.configurations[~repeated]) > 1:
+            return _of_held_out(problem, comparison, after, names, explained)
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
         return _leave_one_place_out(problem, places, before, after, names, robust)
-    note = ', because all held-out poses were fitted too' if len(repeated) else ''
+    note = ', because fewer than two held-out poses are new' if len(repeated) else ''
     return _cross_validate(problem, before, after, names, robust, note)
+
+
+def _of_held_out(
+    problem: Problem,
+    comparison: Comparison,
+    after: Chain,
+    names: Sequence[str],
+    explained: NDArray[np.bool_] | None,
+) -> tuple[Comparison, str]:
+    if problem.loss != 'none':
+        distances = distances_of(after, names, problem.system(problem.judging))
+        judged = np.concatenate(distances) <= OUTLIER
+        judged |= np.False_ if explained is None else explained
+        comparison = replace(comparison, judged=judged)
+    text = f'{comparison.counting.sum()} held-out poses{comparison.omitted}'
+    if repeats := int((~comparison.counting).sum()):
+        text += f'; not counted because they repeat fitted poses: {repeats}'
+    return comparison, text
 
 
 def _cross_validate(
@@ -210,10 +233,9 @@ def _cross_validate(
         strict=True,
     )
     first, second = left_out(chains, problem.sets, groups, numbers)
-    return (
-        Comparison(first, second, ~robust.outliers),
-        f'{folds}-fold cross-validation over {count} different poses{note}',
-    )
+    judged = Comparison(first, second, ~robust.outliers)
+    over = f'{folds}-fold cross-validation over {count} different poses'
+    return judged, f'{over}{note}{judged.omitted}'
 
 
 def left_out(
@@ -334,10 +356,8 @@ def _leave_one_place_out(
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
     first = _joined([part.before for part in parts], groups)
     second = _joined([part.after for part in parts], groups)
-    return (
-        Comparison(first, second, ~robust.outliers),
-        f'leaving out one of {len(places)} places at a time',
-    )
+    judged = Comparison(first, second, ~robust.outliers)
+    return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'
 
 
 def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:

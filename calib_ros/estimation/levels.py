@@ -12,8 +12,6 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 CONFIDENT = 0.95
 """Confidence of intervals and gains: one in twenty may be chance. A convention, as all three
 are."""
-INTERVAL = 0.5 + 0.5 * CONFIDENT
-"""One-sided confidence of each limit of an interval."""
 CERTAIN = 0.99
 """Confidence of evidence against a result, and of several tests."""
 SURE = 0.999

@@ -3,9 +3,9 @@
 """The folder with the journals and calibrations of one robot.
 
 A journal receives every sample at once, as a table that `identify` reads. A row is written by one
-call, so a killed process leaves whole rows; a row cut off by a crash of the machine is ignored on
-reading. Rows that cannot be written, as on a full disk, wait in memory. A removed sample gets a
-second row marked `removed`; nothing is ever deleted.
+call, so a killed process leaves whole rows; rows cut off or damaged by a crash of the machine are
+left out on resuming. Rows that cannot be written, as on a full disk, wait in memory. A removed
+sample gets a second row marked `removed`; nothing is ever deleted.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from urllib.parse import quote
 
 from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError
-from calib_ros.files.tables import cells, columns, read_journal
+from calib_ros.files.tables import cells, columns, is_whole, read_journal
 from calib_ros.sampling.sample import Sample
 
 CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
@@ -99,8 +99,12 @@ class Journal:
         end, size = -1, os.fstat(self._file).st_size
         while end < 0:  # the header ends a line
             begin = max(size - 2**16, 0)
-            end, size = os.pread(self._file, size - begin, begin).rfind(b'\n'), begin
-        os.ftruncate(self._file, begin + end + 1)
+            tail = os.pread(self._file, size - begin, begin)
+            end, size = tail.rfind(b'\n'), begin
+        if is_whole(tail[end + 1 :], len(header)):
+            os.write(self._file, b'\n')
+        else:
+            os.ftruncate(self._file, begin + end + 1)
 
     def _write(self, row: Sequence[str]) -> None:
         text = io.StringIO()

@@ -16,17 +16,14 @@ from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.hints import LOST, Account, lost
+from calib_ros.sampling.hints import ALLOW, Account, allowing, too_much_lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.topics import Reading, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
-
-ALLOW = 'accept the rest with --largest-loss'
 
 
 @dataclass(frozen=True)
@@ -52,15 +49,9 @@ class Replayed:
             text = f'how much of the bag is lost is not known, {ALLOW} 1'
             return (Reason(Rule.UNKNOWN_LOSS, text),)
         share = max(0.0, 1.0 - self.read / self.recorded) if self.recorded else 0.0
-        shares = {'of the messages could not be read': (Rule.UNREADABLE, share)}
-        for name, count in ((JOINTS, account.joint_states), (POSES, account.poses)):
-            share, _ = lost(name, count, account.dropped)
-            shares[f'of the {name} {LOST}'] = (Rule.DROPPED, share)
-        return tuple(
-            Reason(rule, f'{share:.0%} {cause}, {ALLOW} {min(1.0, share + 0.01):.2f}')
-            for cause, (rule, share) in shares.items()
-            if share > largest_loss
-        )
+        text = f'{share:.0%} of the messages could not be read, {allowing(share)}'
+        unreadable = [Reason(Rule.UNREADABLE, text)] if share > largest_loss else []
+        return (*unreadable, *too_much_lost(account, largest_loss))
 
 
 def replay(path: Path | str, session: CalibrationSession, progress: Notify = quiet) -> Replayed:

@@ -31,10 +31,18 @@ from calib_ros.errors import CalibrationError
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint, JointType
+from calib_ros.kinematics.chain import (
+    PARALLEL_TOLERANCE,
+    Chain,
+    Convention,
+    Frame,
+    Joint,
+    JointType,
+)
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.urdf import with_common_normals
 from calib_ros.kinematics.urdf_tree import to_rpy
 from calib_ros.texts import csv_text, dump_yaml, from_cell, to_cell
 from calib_ros.values import SAME
@@ -276,10 +284,12 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
     if 'zero' in kinds:
         names = {joint.driven for joint in start.joints}
     else:
-        plain = tuple(replace(joint, beta=0.0) for joint in start.joints)
+        form = with_common_normals(start)
+        plain = tuple(replace(joint, beta=0.0) for joint in form.joints)
+        close = {each.name for each in plain if each.tilt < np.sin(PARALLEL_TOLERANCE)}
         start = replace(start, joints=plain)
         names = {name for name in start.parameter_names if Parameter(name).kind in kinds}
-        names -= {Parameter(joint, 'd') for joint in replace(start, parallel=None).parallel or ()}
+        names -= {Parameter(name, 'd') for name in close.intersection(form.parallel or ())}
     ordered = [name for name in start.parameter_names if name in names]
     joints = joints[:: max(1, len(joints) // SOME_POSES)]  # fitted on some, judged on all
     return fit_to_arm(start, ordered, chain, joints, 1e-3)[0]

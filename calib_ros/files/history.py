@@ -16,7 +16,7 @@ import json
 import secrets
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,6 @@ from calib_ros.atomic import write_file
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.estimation.levels import INTERVAL
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_document, parse_chain
@@ -173,7 +172,7 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
         result.chain,
         'accepted' if result.accepted else 'refused',
         which.figures,
-        interval_of(which, 1, INTERVAL),
+        interval_of(which, 1),
         reasons=tuple(map(str, result.refusals)),
         remarks=tuple(map(str, (*warnings, *result.remarks))),
         freedom=freedom if np.isfinite(freedom) else None,
@@ -192,7 +191,9 @@ def judged(
 
 def verified(chain: Chain, found: Verification, about: Filing) -> Row:
     """Return the row of a verification."""
-    figures, limits = found.comparison.figures, (found.lower, found.upper)
+    before, after = found.comparison.figures
+    figures = before, replace(after, rms_mm=1e3 * found.rms)
+    limits = found.lower, found.upper
     return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=found.freedom)
 
 

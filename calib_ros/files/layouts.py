@@ -211,8 +211,21 @@ def parse_columns(text: str) -> dict[str, str]:
     return found
 
 
+def _in_their_names(text: str, known: Mapping[str, str]) -> str:
+    """Return an expression with our columns that are `known` written in theirs."""
+
+    def written(match: re.Match[str]) -> str:
+        theirs = known.get(match[4] or '')
+        return match[0] if theirs is None else f'({theirs})'
+
+    return TOKEN.sub(written, text)
+
+
 def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> Layout:
-    """Return the layout of a preset, if any, with the given values on top."""
+    """Return the layout of a preset, if any, with the given values on top.
+
+    Later `columns` may use our names of earlier ones: `q*=J*`, then `q3=q3+q2`.
+    """
     layout = load_layout(preset) if preset else Layout()
     changes = {name: value for name, value in given.items() if value}
     for name in ('euler', 'quaternion', 'rotation_vector'):
@@ -220,5 +233,8 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
             layout = replace(layout, euler='', quaternion='', rotation_vector=False)
     merged = dict(layout.columns)
     for text in columns:
-        merged |= parse_columns(text)
+        merged |= {
+            ours: theirs if ours in WORDS else _in_their_names(theirs, merged)
+            for ours, theirs in parse_columns(text).items()
+        }
     return replace(layout, columns=merged, **changes)

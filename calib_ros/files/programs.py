@@ -57,29 +57,32 @@ def check_limits(values: FloatArray, chain: Chain, where: Callable[[int, int], s
 
 
 def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:
-    """Refuse joint values (N, n) that may be degrees, of revolute joints without limits.
+    """Refuse joint values (N, n) that may be degrees or millimetres, of joints without limits.
 
     `where` names a row and a joint.
     """
-    free = [j.type == 'revolute' and None in (j.lower, j.upper) for j in chain.joints]
+    free = [None in (joint.lower, joint.upper) for joint in chain.joints]
     for k, i in np.argwhere((np.abs(values) > TWO_TURNS) & free)[:1].tolist():
+        joint = chain.joints[i]
+        turns = joint.type == 'revolute'
+        what = f'two turns of {joint.name}' if turns else f'{TWO_TURNS:.1f} m for {joint.name}'
         raise InputError(
-            f'{where(k, i)}{values[k, i]:.6g} is more than two turns of {chain.joint_names[i]}, '
-            'which has no limits: joint values must be in radians; if they are, give the joint '
+            f'{where(k, i)}{values[k, i]:.6g} is more than {what}, which has no limits: joint '
+            f'values must be in {"radians" if turns else "metres"}; if they are, give the joint '
             'limits (lower, upper) in the chain file'
         )
 
 
 def _header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
-    names = joint_columns(len(joints))
-    if set(joints) <= set(found.header) and not set(names) <= set(found.header):
-        names = tuple(joints)
-    more = f'q{len(joints) + 1}'
-    if more in with_rows(found, names).header:
+    *names, more = joint_columns(len(joints) + 1)
+    for others in (list(joints), [name.upper() for name in names]):
+        if set(others) <= set(found.header) and not set(names) <= set(found.header):
+            names = others
+    if {more, more.upper()} & {*with_rows(found, names).header}:
         raise InputError(
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
-    return names
+    return tuple(names)
 
 
 def read_poses(path: Path) -> FloatArray:

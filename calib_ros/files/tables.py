@@ -11,6 +11,7 @@ corner, joined by semicolons.
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -22,7 +23,14 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError, unreadable
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import Codes, Columns, MadeColumns, distinct, joints_left_out
+from calib_ros.files.columns import (
+    Codes,
+    Columns,
+    MadeColumns,
+    distinct,
+    joints_left_out,
+    lines_in_words,
+)
 from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
@@ -182,22 +190,27 @@ def check_table(made: MadeColumns) -> None:
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
-    """Return the samples of a journal, possibly none, and warnings."""
-    found = _of_journal(path, joints)
+    """Return the samples of a journal, possibly none, and warnings; leave out damaged rows."""
+    damaged: list[int] = []
+    found = _of_journal(path, joints, damaged=damaged)
     if found is None:  # cut off, or a table
         data, warnings = _read(path, columns(joints))
         found = measurements(columns_of(path, data), joints), warnings
     made, warnings = found
+    if damaged:
+        words = f'{path}: {lines_in_words(damaged)} cannot be read: left out, but kept in the file'
+        warnings = (*warnings, words)
     return () if made is None else tuple(_samples(made.kept())), warnings
 
 
 def _of_journal(
-    path: Path, joints: int, progress: Notify = quiet
+    path: Path, joints: int, progress: Notify = quiet, damaged: list[int] | None = None
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
     """Return the rows of a journal, None if empty, and warnings; None for other files.
 
     A node's journal may have any length, since its samples were in memory: it is read in parts,
-    and other files are refused at the first part.
+    and other files are refused at the first part. The lines of damaged rows go into a list;
+    without one they are refused.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
     parts: list[Measurements] = []
@@ -209,10 +222,12 @@ def _of_journal(
             size = path.stat().st_size
             while data := file.read(LARGEST_TEXT):
                 whole, end, rest = (rest + data).rpartition(b'\n')
+                if file.tell() == size and is_whole(rest, len(columns(joints))):
+                    whole, end, rest = whole + end + rest, b'\n', b''
                 if end:
-                    found = columns_of(path, header + whole + end, above=lines - 1)
-                    parts.append(measurements(found, joints))
-                    lines += whole.count(b'\n') + 1
+                    some = [each + b'\n' for each in whole.split(b'\n')]
+                    parts += _rows(path, joints, some, lines - 1, damaged)
+                    lines += len(some)
                 if len(rest) > LARGEST_TEXT:
                     raise InputError(f'{path}, line {lines + 1} is incomplete: is it a journal?')
                 progress(min(file.tell() / size, 1.0))
@@ -220,6 +235,39 @@ def _of_journal(
         raise InputError(unreadable(path, err)) from err
     made = joined(parts) if parts else None
     return made, (_cut_off(path, lines + 1),) if rest else ()
+
+
+def _rows(
+    path: Path, joints: int, lines: Sequence[bytes], above: int, damaged: list[int] | None
+) -> Iterator[Measurements]:
+    """Yield the rows in lines of a journal, in halves if one is damaged, until it is alone."""
+    header = ','.join(columns(joints)).encode() + b'\n'
+    try:
+        found = columns_of(path, header + b''.join(lines), above=above)
+        made = measurements(found, joints)
+        if damaged is not None:
+            if found.blank('split').any():
+                raise InputError(f'{path} has incomplete rows')
+            for text in filter(None, made.view[1]):
+                _view_of(text, '')
+    except InputError:
+        if damaged is None:
+            raise
+        half = len(lines) // 2
+        if not half:
+            damaged.append(above + 2)
+            return
+        yield from _rows(path, joints, lines[:half], above, damaged)
+        yield from _rows(path, joints, lines[half:], above + half, damaged)
+    else:
+        yield made
+
+
+def is_whole(row: bytes, width: int) -> bool:
+    """Tell whether a row lacks only its line end; the numbers of a view may lack more."""
+    if not row.endswith(b',') or b'\0' in row:
+        return False
+    return len(next(csv.reader([row.decode(errors='replace')]))) == width
 
 
 def _samples(made: Measurements) -> Iterator[Sample]:
@@ -320,7 +368,9 @@ def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
     header = ','.join(journal).encode() + b'\n'
     if data and header.startswith(data):
         return header, ()
-    whole = data[: data.rfind(b'\n') + 1] if data.startswith(header) else data
+    begin = data.rfind(b'\n') + 1
+    cut = data.startswith(header) and not is_whole(data[begin:], len(journal))
+    whole = data[:begin] if cut else data
     warnings = (_cut_off(path, whole.count(b'\n') + 1),) if len(whole) < len(data) else ()
     return whole, warnings
 

@@ -33,7 +33,7 @@ from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
 from calib_ros.identification import records
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.kinematics.chain_file import (
     dump_chain,
     frames_document,
@@ -272,7 +272,7 @@ def parse_calibration(
     """
     chain = parse_chain(text, where)
     if nominal is not None:
-        records.check_joints(chain, nominal, where)
+        refuse_other_joints(where, chain, 'the nominal chain', nominal)
     record = records.Record.parse(text, where)
     nominal = nominal or record.nominal(chain)
     record.check(chain, nominal, settings)

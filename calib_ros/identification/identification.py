@@ -10,16 +10,16 @@ freedoms found and named, and a test on held-out poses.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.decision import mistakes, suspicions
+from calib_ros.decision import lag, mistakes, suspicions
 from calib_ros.decision.acceptance import refusals, remarks
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, outliers_of
-from calib_ros.decision.region import region_of
+from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.decision.steps import find_step
@@ -28,6 +28,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
+from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitting import (
     SOME,
     Fitted,
@@ -37,6 +38,7 @@ from calib_ros.estimation.fitting import (
     parameter_rows,
 )
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
+from calib_ros.estimation.levels import SCALE
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics.chain import Chain
@@ -90,7 +92,9 @@ def _identified(
     coarse = rounded(problem)
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
-    posterior = fitted.posterior(size, considered(chain, names, problem.fixed), doubts)
+    more = considered(chain, names, problem.fixed)
+    posterior = fitted.posterior(size, more, doubts)
+    region, scaled = _region(fitted, posterior, size, more, doubts)
     step = find_step(problem, names, robust)
     result = Identification(
         chain=chain,
@@ -113,7 +117,7 @@ def _identified(
         chance=_chance(problem, before.chain, names, robust),
         refusals=(),
         posterior=posterior,
-        region=region_of(posterior, problem.sets, fitted.uncertainty.overall),
+        region=region,
         weak=_weak(problem, parameters),
         step=step,
         remarks=remarks(problem, step, coarse),
@@ -122,10 +126,31 @@ def _identified(
     )
     own_behaviour = None if step else arms_own(problem, robust)
     rounding = may_be_rounding(problem, before.chain, names, coarse, robust.good)
-    refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None)
+    refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
-    return suspicions.remarked(problem, named, another=named is result)
+    found = suspicions.remarked(problem, named, another=named is result)
+    return lag.remarked(problem, found)
+
+
+def _region(
+    fitted: Fitted,
+    posterior: Posterior,
+    size: float,
+    more: Sequence[str],
+    doubts: Mapping[str, float],
+) -> tuple[Region | None, float]:
+    """Return the region, and the scale of the device, minus one, that alone leaves none, or 0.
+
+    The posterior is that with `more` effects, `doubts` and noise of a `size`.
+    """
+    sets, freedom = fitted.problem.sets, fitted.uncertainty.overall
+    region = region_of(posterior, sets, freedom)
+    if region is None and posterior.rival is not None:
+        checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
+        if region_of(checked.posterior(size, more, doubts), sets, freedom) is not None:
+            return None, posterior.rival[1]
+    return region, 0.0
 
 
 def _size(fitted: Fitted, explained: float) -> float:

@@ -138,6 +138,14 @@ class LinearModel:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
         return Verdict(what, found[0], found[1], bool(pays))
 
+    def quieten(self, verdict: Verdict) -> None:
+        """Take what is left with chosen effects for the noise that priors are weighed against."""
+        self._noise *= verdict.rms_mm_after / max(verdict.rms_mm_before, 1e-300)
+        prior = self._system.prior
+        if prior is not None:
+            self._system = replace(self._system, prior=replace(prior, noise=self._noise))
+        self._errors.clear()
+
     def judge_all_harmonics(self, chosen: Sequence[str]) -> Verdict:
         """Judge all harmonics together, of the usual size, then of a smaller one."""
         new = [name for name in self.harmonics if name not in chosen]
@@ -187,11 +195,12 @@ class LinearModel:
                     lots += [left] if left else []
             names = [name for lot in lots for name in lot]
             self._moved = {name: k for k, name in enumerate(names)}
-            self._seen = self._shifts.columns(self._lots(lots, progress), self._priors(names))
+            self._seen = self._shifts.columns(self._lots(lots, progress))
         assert self._seen is not None
         numbers = self._moved
         return self._shifts.shares(
             self._seen,
+            self._priors(list(numbers)),
             [numbers[name] for name in (*self._names, *chosen)],
             [[numbers[name] for name in group] for group in groups],
         )

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -58,36 +58,67 @@ def _chosen(
 ) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
     progress('effects')
     model = LinearModel(problem, geometric)
+    groups = model.useful({name: effects.members(problem.chain, name) for name in effects.GROUPS})
+    groups = {group: names for group, names in groups.items() if names}
     chosen: list[str] = []
     verdicts: dict[str, Verdict] = {}
-    groups = model.useful({name: effects.members(problem.chain, name) for name in effects.GROUPS})
     while True:
-        tried = []
-        for group, names in groups.items():
-            if names and not set(names) <= set(chosen):
-                progress(f'effects: {group}')
-                tried.append((model.judge(chosen, names, group), group))
-        if not tried:
-            break
-        for verdict, group in tried:
-            verdicts[group] = verdict
-        paying = [pair for pair in tried if pair[0].pays]
+        _choose_groups(model, groups, chosen, verdicts, progress)
+        if not _choose_harmonics(model, chosen, verdicts, progress):
+            return tuple(chosen), tuple(verdicts.values())
+
+
+def _choose_groups(
+    model: LinearModel,
+    groups: Mapping[str, Sequence[str]],
+    chosen: list[str],
+    verdicts: dict[str, Verdict],
+    progress: Notify,
+) -> None:
+    """Choose the best group as long as one pays; then what is left together, where that pays.
+
+    Alone, a group may vanish in the errors that the others leave.
+    """
+    left = [group for group, names in groups.items() if not set(names) <= set(chosen)]
+    while True:
+        for group in left:
+            progress(f'effects: {group}')
+            verdicts[group] = model.judge(chosen, groups[group], group)
+        paying = [group for group in left if verdicts[group].pays]
         if not paying:
             break
-        best, group = min(paying, key=lambda pair: pair[0].rms_mm_after)
-        verdicts[group] = best
-        chosen += groups[group]
-    return _with_harmonics(model, chosen, list(verdicts.values()), progress)
+        best = min(paying, key=lambda group: verdicts[group].rms_mm_after)
+        left.remove(best)
+        chosen += groups[best]
+        model.quieten(verdicts[best])
+    every = [name for group in left for name in groups[group]]
+    together = model.judge(chosen, every, 'all')
+    if not together.pays:
+        return
+    model.quieten(together)
+    for group in left:
+        others = [name for name in every if name not in groups[group]]
+        verdict = model.judge([*chosen, *others], groups[group], group)
+        if verdict.pays:
+            verdicts[group] = verdict
+        else:
+            every = others
+    chosen += every
 
 
-def _with_harmonics(
-    model: LinearModel, chosen: list[str], verdicts: list[Verdict], progress: Notify
-) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
+def _choose_harmonics(
+    model: LinearModel, chosen: list[str], verdicts: dict[str, Verdict], progress: Notify
+) -> bool:
+    """Choose the strongest harmonics, or all, as long as they pay; tell whether any did."""
+
     def added(verdict: Verdict, names: Sequence[str]) -> bool:
-        verdicts.append(verdict)
-        chosen.extend(name for name in names if verdict.pays and name not in chosen)
+        verdicts[verdict.what] = verdict
+        if verdict.pays:
+            chosen.extend(name for name in names if name not in chosen)
+            model.quieten(verdict)
         return verdict.pays
 
+    before = len(chosen)
     for count in itertools.count(1):
         pair, several = model.strongest_harmonic(chosen, progress)
         more = False
@@ -99,4 +130,4 @@ def _with_harmonics(
             more = not added(model.judge_all_harmonics(chosen), model.harmonics) and more
         if not more:
             break
-    return tuple(chosen), tuple(verdicts)
+    return len(chosen) > before

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from calib_ros.decision import changes
@@ -76,15 +76,13 @@ class Recalibration(Shown):
         return next((e for e in first if e.names == (changes.SCALE_OF_DEVICE,)), None)
 
     def document(self) -> dict[str, Any]:
-        """Return the result as plain values."""
+        """Return the result as plain values, without its figures."""
         return {
             'accepted': self.accepted,
             'refusal': ': '.join(filter(None, self.refusal())),
             'reused': self.reused,
             'changed': [changes.reasons_document(each) for each in self.changed],
             'unexplained': self.unexplained,
-            'before': asdict(self.before),
-            'after': asdict(self.after),
             'known_before_mm': 1e3 * self.known_before,
             'known_after_mm': 1e3 * self.known_after,
             'moved_mm': 1e3 * self.moved,

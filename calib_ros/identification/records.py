@@ -60,18 +60,6 @@ def owners_document(owners: Mapping[str, Owner]) -> dict[str, Any]:
     return {name: dict(zip(OWNER, owner, strict=True)) for name, owner in owners.items()}
 
 
-def check_joints(chain: Chain, nominal: Chain, where: str) -> None:
-    """Refuse a calibration with other joints than the nominal chain."""
-    ours, theirs = (
-        [f'{joint.name} ({joint.type})' for joint in each.joints] for each in (nominal, chain)
-    )
-    if ours != theirs:
-        raise ConfigError(
-            f'{where} has the joints {", ".join(theirs)}, the nominal chain has '
-            f'{", ".join(ours)}: is it the right nominal chain?'
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class Record:
     """The record of a calibration; `where` names it in errors."""

@@ -29,7 +29,7 @@ from typing import Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.joint import (
     ANYWHERE,
@@ -53,6 +53,17 @@ Convention: TypeAlias = Literal['standard', 'modified']
 
 PARALLEL_TOLERANCE = np.radians(5.0)
 """Axes closer than this are treated as parallel: their common normal is badly determined."""
+
+
+def nearly_parallel(tilt: float, apart: float) -> bool:
+    """Tell whether axes are better described by beta than by d.
+
+    From the sine of their angle f and how far apart [m] they are. Errors of the usual sizes (0.5
+    mm, 1 mrad, so 0.5 m) turn the common normal 1 / sin f times as much, and the line to where the
+    next axis pierces the plane across this one (0.5 m / apart) / cos f times.
+    """
+    across = min(2.0 * abs(apart), 1.0) * math.sqrt(max(1.0 - tilt**2, 0.0))
+    return tilt < max(math.sin(PARALLEL_TOLERANCE), across)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,8 +129,7 @@ class Chain(Shown):
         return tuple(
             row.name
             for row, *axes in zip(rows, self.joints, self.joints[1:], strict=False)
-            if any(joint.type == 'revolute' for joint in axes)
-            and np.hypot(np.sin(row.alpha), np.sin(row.beta)) < np.sin(PARALLEL_TOLERANCE)
+            if any(joint.type == 'revolute' for joint in axes) and nearly_parallel(row.tilt, row.a)
         )
 
     @cached_property
@@ -319,6 +329,18 @@ class Chain(Shown):
     @cached_property
     def _effect_values(self) -> Mapping[str, float]:
         return dict(self.effects)
+
+
+def refuse_other_joints(
+    what: str, chain: Chain, whose: str, other: Chain, error: type[CalibrationError] = ConfigError
+) -> None:
+    """Refuse a chain with other joints than another one, each named by what it is."""
+    ours, theirs = (
+        ', '.join(f'{joint.name} ({joint.type})' for joint in each.joints)
+        for each in (chain, other)
+    )
+    if ours != theirs:
+        raise error(f'{what} has the joints {ours}; {whose} has {theirs}: are they of one robot?')
 
 
 @lru_cache(maxsize=64)

@@ -78,6 +78,11 @@ class Joint:
         return Parameter(self.name, 'theta' if self.type == 'revolute' else 'd')
 
     @property
+    def tilt(self) -> float:
+        """Return the sine of the angle between the two axes that the row connects."""
+        return math.hypot(math.sin(self.alpha) * math.cos(self.beta), math.sin(self.beta))
+
+    @property
     def range(self) -> tuple[float, float]:
         """Return the limits [rad or m], by default +-180 degrees or +-0.5 m."""
         reach = np.pi if self.type == 'revolute' else 0.5

@@ -34,6 +34,8 @@ from calib_ros.kinematics.chain import (
     Frame,
     Joint,
     JointType,
+    nearly_parallel,
+    refuse_other_joints,
 )
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
@@ -164,12 +166,7 @@ def corrected_urdf(
 
 
 def _refuse_others(arm: Chain, nominal: Chain) -> None:
-    kinds = [[f'{joint.name} ({joint.type})' for joint in c.joints] for c in (arm, nominal)]
-    if kinds[0] != kinds[1]:
-        raise ConfigError(
-            f'the chain has the joints {", ".join(kinds[0])}, but the URDF has '
-            f'{", ".join(kinds[1])} between these links'
-        )
+    refuse_other_joints('the chain', arm, 'the URDF, between these links,', nominal)
     effects = [name for name, value in arm.effects if value]
     if effects:
         raise ConfigError(
@@ -203,7 +200,32 @@ def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:
     return se3.transform(np.column_stack([x, np.cross(axis, x), axis]), foot)
 
 
-def _towards(row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray) -> Joint:
+def with_common_normals(chain: Chain) -> Chain:
+    """Return the same arm without beta, except between axes closer than PARALLEL_TOLERANCE."""
+    rows = list(chain.joints)
+    for i in range(len(rows) - 1):
+        k = i if chain.convention == 'standard' else i + 1  # row of the bend
+        row = replace(rows[i], a=rows[k].a, alpha=rows[k].alpha, beta=rows[k].beta)
+        if not row.beta or row.tilt < np.sin(PARALLEL_TOLERANCE):
+            continue
+        end = _ends(Chain('row', 'standard', (row,)))[0]
+        plain = _towards(row, np.eye(4), end[:3, 2], end[:3, 3], common_normal=True)
+        rest = se3.invert(_ends(Chain('row', 'standard', (plain,)))[0]) @ end
+        rows[i] = replace(rows[i], theta=plain.theta, d=plain.d)
+        rows[k] = replace(rows[k], a=plain.a, alpha=plain.alpha, beta=0.0)
+        turn = float(np.arctan2(rest[1, 0], rest[0, 0]))
+        later = rows[i + 1]
+        rows[i + 1] = replace(later, theta=later.theta + turn, d=later.d + float(rest[2, 3]))
+    return replace(chain, joints=tuple(rows), parallel=None)
+
+
+def _towards(
+    row: Joint,
+    frame: FloatArray,
+    axis: FloatArray,
+    point: FloatArray,
+    common_normal: bool = False,
+) -> Joint:
     """Return a standard row that leads from a frame on its axis to the next axis.
 
     Of the two directions of its x the one within 90 degrees of the frame's is chosen.
@@ -211,9 +233,9 @@ def _towards(row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray)
     z = frame[:3, :3].T @ axis
     p = frame[:3, :3].T @ (point - frame[:3, 3])
     tilt = float(np.hypot(z[0], z[1]))
-    parallel = tilt < np.sin(PARALLEL_TOLERANCE)
+    x, y = p[:2] - p[2] / (z[2] or 1.0) * z[:2]
+    parallel = not common_normal and nearly_parallel(tilt, float(np.hypot(x, y)))
     if parallel:
-        x, y = p[:2] - p[2] / z[2] * z[:2]
         d, a = 0.0, float(np.hypot(x, y))
         theta = float(np.arctan2(y, x)) if _clean(a) else 0.0
     else:

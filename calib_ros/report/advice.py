@@ -81,6 +81,7 @@ WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
 BRINGS = dict.fromkeys(WRONG_ARM, WRONG) | {
     rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
 }
+BRINGS[Rule.LAG] = {*WRONG, Rule.OUTLIERS}
 BRINGS[Rule.MISTAKE] = {*WRONG, Rule.ENCODER, Rule.MOVED}
 BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}
 """Consequences of each cause; the first cause present counts."""
@@ -101,11 +102,12 @@ LEFT = (
 
 @dataclass(frozen=True)
 class Situation:
-    """Different poses, residual over stated noise, and that noise [m]."""
+    """Different poses, residual over stated noise, that noise [m], and whether model is auto."""
 
     poses: int = ENOUGH
     left: float = 1.0
     sigma: float | None = None
+    auto: bool = False
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
@@ -134,6 +136,9 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
             following.setdefault(cause, []).extend(texts)
             continue
         refusal = replace(rules()[rule], refusal='; '.join(texts))
+        if situation.auto:
+            steps = tuple(each for each in refusal.steps if 'model to auto' not in each)
+            refusal = replace(refusal, steps=steps)
         advised.append(situation.said_of(refusal) if rule in {Rule.GAIN, Rule.REGION} else refusal)
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'

@@ -21,11 +21,16 @@ from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses, explorer, numbers, unit_of
 from calib_ros.report.verdicts import hints, limits
+from calib_ros.report.words import interval_mm
 from calib_ros.shown import rounded
 
 SOMETHING_MOVED = (
     'Check that measuring device, target and robot have not moved since the calibration; if one '
     'has, use --new-base or --new-tool.'
+)
+COMPUTED = (
+    '"Before" is not measured but computed: the nominal arm in its best frames, at the same '
+    'joint values.'
 )
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
 STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
@@ -58,6 +63,20 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     ),
     'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
+REUSED = (
+    Verdict('open', 'No verdict: the calibration was computed from these measurements'),
+    (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
+)
+
+
+def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict as a reader sees it first, and what to do next."""
+    if found.reused and found.verdict == 'no verdict':
+        return REUSED
+    state, steps = STANDINGS[found.verdict]
+    if not found.by_program:  # nor whether the correction reaches the arm
+        state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
+    return state, steps
 
 
 def workspace_report(
@@ -84,7 +103,7 @@ def workspace_report(
             'accuracy',
             'Position errors [mm]',
             (f'At {len(found.joints):,} random poses of the joint range.', rest),
-            head=('', 'RMS', 'mean', 'median', '95 %', 'max'),
+            head=('', 'RMS', 'mean', 'median', '95 % below', 'max'),
             rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
         ),
         identity=sections.identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
@@ -151,7 +170,8 @@ def plan_report(
         sections.coverage(chain, joints, 'How far each joint will move'),
         _listed(chain, joints),
     ]
-    verdict = Verdict('info', 'Test poses', (f'{len(joints)} poses.',))
+    what = 'Test poses' if found is None else 'Poses to measure'
+    verdict = Verdict('info', what, (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
         'Visit P1 to P5 in turn, 30 times, and measure each time.',
         'Then judge: calib_ros verify.',
@@ -219,21 +239,25 @@ def verification_report(
     chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
 ) -> Report:
     """Return the report of a verification of a calibrated chain."""
-    share = f'{100.0 * found.confidence:g} %'
-    rms, lower, upper = (rounded(1e3 * x) for x in (found.rms, found.lower, found.upper))
+    between = interval_mm(1e3 * found.lower, 1e3 * found.upper)
     text = [
-        f'The RMS position error over poses like these, each counted once, is {rms} mm, between '
-        f'{lower} mm and {upper} mm; each limit holds with {share} confidence.'
+        'The RMS position error over poses like these, each counted once, is '
+        f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} % interval: {between} mm).'
     ]
     if found.fitted:
         text.append('This allows for what the refitted frames absorb.')
     if found.tolerance is not None:
-        text.append(f'Tolerance: {1e3 * found.tolerance:g} mm.')
+        text.append(
+            f'Tolerance: {1e3 * found.tolerance:g} mm. PASS: the whole interval is within it; '
+            'FAIL: the whole interval is beyond it.'
+        )
     text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))
-    state, steps = STANDINGS[found.verdict]
+    state, steps = standing(found)
     gain = sections.gain(found.comparison, intervals=False)
     title = 'Accuracy before and after the correction'
-    accuracy = sections.accuracy_section(title, found.comparison, poses.things, intervals=False)
+    accuracy = sections.accuracy_section(
+        title, found.comparison, poses.things, COMPUTED, intervals=False
+    )
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
@@ -257,7 +281,10 @@ def verification_report(
 def _by_configuration(found: Verification) -> Section:
     """Return the figures of the standard, or of errors at the joint values that were reported."""
     title, names = 'Pose by pose (ISO 9283)', ('AP before [mm]', 'AP after [mm]', 'RP [mm]')
-    text = 'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma.'
+    text = (
+        'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma. '
+        'The standard asks for 30 cycles.'
+    )
     if not found.by_program:
         title, names = 'Pose by pose', ('before [mm]', 'after [mm]', 'scatter [mm]')
         text = (

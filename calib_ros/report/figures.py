@@ -157,12 +157,13 @@ def coverage(
         factor, unit, digits = unit_of(joint)
         lower, upper = joint.range
         low, high = float(joints[:, k].min()), float(joints[:, k].max())
+        free = joint.lower is None and joint.upper is None
+        if free and not (lower <= low and high <= upper):  # a turn from the lowest value
+            lower, upper = low, low + upper - lower
         lower, upper = min(lower, low), max(upper, high)
         counts[k] = np.histogram(joints[:, k], parts, (lower, upper))[0]
-        ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}'
-        if joint.lower is None and joint.upper is None:
-            ends = 'no limits'
-        labels.append(f'{label(joint.name)}: {ends}')
+        ends = f'{factor * lower:.0f} to {factor * upper:.0f} {unit}' + ' (no limits)' * free
+        labels.append(f'{label(joint.name)}<br>{ends}')
         used = f'{factor * low:.{digits}f} to {factor * high:.{digits}f} {unit}'
         share = 100.0 * float(np.mean(counts[k] > 0))
         rows.append((joint.name, ends, used, f'{share:.0f} %'))

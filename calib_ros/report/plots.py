@@ -29,7 +29,7 @@ def before_after_png(result: Identification) -> bytes:
     """Return the figure of held-out position errors before and after."""
     comparison = result.validation or result.fitted
     before, after = (
-        1e3 * np.linalg.norm(residuals.position[comparison.judged], axis=1)
+        1e3 * np.linalg.norm(residuals.position[comparison.deciding], axis=1)
         for residuals in (comparison.before, comparison.after)
     )
     figure = _figure(10.0, 3.8)
@@ -178,7 +178,7 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
 
 def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
     values = np.array(mesh['z'], dtype=float)
-    colours = {'RdBu': 'RdBu_r', 'Viridis': 'viridis_r'}[mesh['colorscale']]
+    colours = {'RdBu': 'RdBu', 'Viridis': 'viridis_r'}[mesh['colorscale']]  # plotly's, reversed
     x, y = (
         np.arange(len(each)) if isinstance(each[0], str) else np.array(each)
         for each in (mesh['x'], mesh['y'])
@@ -208,4 +208,7 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
 
 
 def _plain(names: Sequence[Any]) -> list[Any]:
-    return [html.unescape(x).replace('$', r'\$') if isinstance(x, str) else x for x in names]
+    return [
+        html.unescape(x.replace('<br>', '\n')).replace('$', r'\$') if isinstance(x, str) else x
+        for x in names
+    ]

@@ -35,7 +35,7 @@ from calib_ros.settings import Settings
 from calib_ros.texts import one_line
 
 FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
-"""Roles: fitted; left out to judge; left out at a fitted configuration."""
+"""Roles: fitted; left out to judge; left out at a fitted configuration, not judged."""
 SINGLE = MANY
 """Poses shown one by one; of more, this many evenly spread ones give the quantiles."""
 WORST = 2 * SOME_POSES
@@ -45,7 +45,7 @@ BANDS = 60
 CELLS = round(SINGLE ** (1 / 3))
 """Cells along the longest edge of the workspace: in total no more than single poses."""
 SHARES = (1.0 - CONFIDENT, 0.5, CONFIDENT)
-ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'judged, pose fitted too'}
+ROLES = {FITTED: 'fitted', JUDGED: 'judged', REPEATED: 'not judged: pose fitted too'}
 WHEN = ('before', 'after')
 NAMELESS: Mapping[int, str] = {}
 
@@ -82,7 +82,7 @@ class Poses:
     @property
     def judged(self) -> NDArray[np.bool_]:
         """Return the poses (N,) that judge, all if none was held out, without outliers."""
-        chosen = self.role != FITTED
+        chosen = self.role == JUDGED
         return np.asarray((chosen | ~chosen.any()) & ~self.outlier)
 
     @property

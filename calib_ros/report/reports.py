@@ -15,7 +15,6 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import Comparison
 from calib_ros.estimation.configurations import distinct
-from calib_ros.estimation.levels import INTERVAL
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
@@ -58,7 +57,7 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
-    limits = interval_of(judged, 1, INTERVAL)
+    limits = interval_of(judged, 1)
     corrected = table_hash(result.chain) if result.accepted else 'none: not accepted'
     return Report(
         kind='Kinematic calibration',
@@ -93,9 +92,8 @@ def _verdict(
 ) -> Verdict:
     if not result.accepted:
         return _refused(reasons)
-    how = 'Before and after, on poses not used to compute it; 95 % interval in brackets.'
-    if again := _again(result):
-        how += f' {again} of them repeat poses that were used.'
+    how = 'Before and after, each pose judged by a fit without it; 95 % interval in brackets.'
+    how += ' The whole interval decides on the tolerance.' * (tolerance is not None)
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
@@ -103,14 +101,6 @@ def _verdict(
     heading = f'Accepted{somewhere(result)}' + (f', {within}' if within else '')
     open_yet = 'not' in within or bool(result.remarks)
     return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
-
-
-def _again(result: Identification) -> int:
-    """Return how many of the poses in the figures are held out at fitted joint values."""
-    judged = result.validation
-    if judged is None or judged.repeated is None:
-        return 0
-    return int((judged.judged & judged.repeated).sum())
 
 
 def somewhere(result: Identification) -> str:
@@ -130,7 +120,7 @@ def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
-    lower, upper = interval_of(judged, 1, INTERVAL)
+    lower, upper = interval_of(judged, 1)
     if upper <= tolerance:
         return f'and {wanted}'
     if lower > tolerance:
@@ -148,17 +138,16 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
         return ()
     judged, noise = result.validation, result.noise.position
     if judged is not None and {each.rule for each in result.refusals} == {Rule.GAIN}:
-        lower, _ = interval_of(judged, 0, INTERVAL)
-        if 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
+        lower, upper = interval_of(judged, 0)
+        if upper < np.inf and 1e3 * lower * noise <= result.fitted.figures[1].rms_mm:
             known = words.sigma_over_range(result)['median'] < judged.figures[0].rms_mm
             good = GOOD_ARM if known else GOOD_HERE
             return (replace(good, refusal='; '.join(result.refusals)),)
     held_out = () if judged is None or judged.repeated is None else (judged,)
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
     poses = sum(map(distinct, numbers))
-    return advice(
-        result.refusals, Situation(poses, noise, result.noise.given.get('sigma_position'))
-    )
+    sigma = result.noise.given.get('sigma_position')
+    return advice(result.refusals, Situation(poses, noise, sigma, bool(result.verdicts)))
 
 
 def _refused(reasons: Sequence[Advice]) -> Verdict:
@@ -341,7 +330,11 @@ def _determined(result: Identification) -> Section:
         'What the poses determine',
         'Expected error of positions predicted over the whole joint range: '
         f'{sigma["median"]:.3f} mm (median), {sigma["max"]:.3f} mm (largest).',
-        f'Observability: {words.observability_in_words(result)}.',
+        f'Observability indices: {words.observability_in_words(result)}; the larger, the better. '
+        'Of the singular values of the Jacobian, in stated sigmas per metre or radian, O1 is the '
+        'geometric mean over the square root of the number of poses, O2 the smallest over the '
+        'largest, O3 the smallest, O4 its square over the largest, O5 one over the sum of the '
+        'inverses.',
         weak and f'Weakly determined (std above {1e3 * words.WEAK:g} mm or mrad): {weak}.',
         head=('kept nominal', 'cannot be told apart from') if result.gauges else (),
         rows=tuple(

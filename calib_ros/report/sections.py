@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import platform
+import time
 from datetime import datetime, timezone
 
 import numpy as np
@@ -85,7 +86,7 @@ def identity_of(
         ('Joints', ', '.join(chain.joint_names)),
         ('Measuring device', origin.device),
         ('Operator', origin.operator),
-        ('Measured', _measured(poses)),
+        ('Measured, by the stamps', _measured(poses)),
         *(((poses.things.capitalize(), f'{len(poses):,}'),) if poses else ()),
         judged,
         ('Report made', datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC')),
@@ -102,7 +103,8 @@ def _measured(poses: Poses | None) -> str:
         datetime.fromtimestamp(int(stamp) // 10**9, timezone.utc).strftime('%Y-%m-%d %H:%M')
         for stamp in (poses.stamps_ns[0], poses.stamps_ns[-1])
     )
-    return f'{first} to {last} UTC'
+    ahead = int(poses.stamps_ns[-1]) > time.time_ns()
+    return f'{first} to {last} UTC' + ' (in the future: a clock is wrong)' * ahead
 
 
 def distribution(poses: Poses) -> Section:

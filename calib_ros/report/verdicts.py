@@ -13,7 +13,6 @@ from calib_ros.settings import Settings
 def in_words(found: Verification) -> str:
     """Return the verdict and its basis."""
     before, after = found.comparison.figures
-    share = 100.0 * found.confidence
     lines = [
         f'position error [mm] of {after.count} measurements at {found.configurations} poses',
         '              RMS     mean      max   mean + 3 sigma',
@@ -27,12 +26,14 @@ def in_words(found: Verification) -> str:
     lines += each_in_words(found)
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
     wanted = '' if found.tolerance is None else f'; wanted: {1e3 * found.tolerance:g} mm'
-    lines.append(
-        f'{verdict}the RMS error over poses like these is {1e3 * found.rms:.4f} mm; below '
-        f'{1e3 * found.upper:.4f} mm with {share:g} % confidence, and above '
-        f'{1e3 * found.lower:.4f} mm{wanted}'
-    )
+    lines.append(f'{verdict}the RMS error over poses like these is {likely(found)}{wanted}')
     return '\n'.join([*lines, *remarks(found)])
+
+
+def likely(found: Verification) -> str:
+    """Return the RMS error over poses like these, with its interval."""
+    rms, lower, upper = (f'{1e3 * x:.4f}' for x in (found.rms, found.lower, found.upper))
+    return f'{rms} mm ({100.0 * found.confidence:g} %: {lower} to {upper} mm)'
 
 
 def each_in_words(found: Verification) -> list[str]:

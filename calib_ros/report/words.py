@@ -19,7 +19,6 @@ from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import Comparison, ErrorFigures
 from calib_ros.estimation.fitting import ParameterRow
-from calib_ros.estimation.levels import INTERVAL
 from calib_ros.estimation.noise import Noise
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
@@ -75,15 +74,18 @@ def summary(
 def between(judged: Comparison | None, when: int) -> str:
     """Return the 95 % interval [mm] of the RMS before (0) or after (1), empty if unknown."""
     limits = limits_mm(judged, when)
-    if limits is None:
-        return ''
-    upper = rounded(limits[1])
-    return f'{limits[0]:.{len(upper.partition(".")[2])}f} to {upper}'
+    return '' if limits is None else interval_mm(*limits)
+
+
+def interval_mm(lower: float, upper: float) -> str:
+    """Return an interval [mm] with as many decimals at both ends."""
+    end = rounded(upper)
+    return f'{lower:.{len(end.partition(".")[2])}f} to {end}'
 
 
 def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:
     """Return that interval, or None if unknown; that of a fit would prove nothing."""
-    limits = [1e3 * x for x in interval_of(judged, when, INTERVAL)] if judged else [np.inf]
+    limits = [1e3 * x for x in interval_of(judged, when)] if judged else [np.inf]
     return limits if np.isfinite(limits).all() else None
 
 
@@ -198,16 +200,20 @@ def _lost(calibration: Calibration, text: str) -> str:
     )
 
 
+def figures_document(which: Comparison, intervals: bool = True) -> dict[str, Any]:
+    """Return the figures before and after, with the intervals of the RMS if wanted."""
+    found = dict(zip(('before', 'after'), map(asdict, which.figures), strict=True))
+    for when, rms in enumerate(found.values() if intervals else ()):
+        rms['rms_lower_mm'], rms['rms_upper_mm'] = limits_mm(which, when) or (None, None)
+    return found
+
+
 def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
     """Return the result as a JSON document; `samples` is the account of the input."""
 
     def comparison(which: Comparison) -> dict[str, Any]:
-        before, after = map(asdict, which.figures)
-        for when, rms in enumerate((before, after) if which is judged else ()):
-            rms['rms_lower_mm'], rms['rms_upper_mm'] = limits_mm(which, when) or (None, None)
-        with_outliers = asdict(which.figures_of_all[1])
-        found = {'before': before, 'after': after, 'outliers': which.outliers}
-        return found | {'after_with_outliers': with_outliers}
+        found = figures_document(which, which is judged) | {'outliers': which.outliers}
+        return found | {'after_with_outliers': asdict(which.figures_of_all[1])}
 
     def parameter(p: ParameterRow) -> dict[str, Any]:
         found = {'value': p.value, 'offset': p.offset, 'std': p.std}

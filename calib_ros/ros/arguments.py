@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.settings import STARTUP, Settings
+from calib_ros.settings import EXCEPTION, STARTUP, Settings
 from calib_ros.values import parse_like
 
 NODE = 'calibration_node'
@@ -76,6 +76,13 @@ BESIDE_SETTINGS = (
         'LOCATION/SOCKET, such as A/1, that holds the ball when ~/capture is called; default: '
         'none, a measurement is taken',
         False,
+    ),
+    Parameter(
+        'largest_loss',
+        EXCEPTION,
+        'share of joint states or measurements that may be dropped for stamps or full buffers',
+        False,
+        0.0,
     ),
     Parameter('marker_scale', 200.0, 'enlargement of the residual vectors', False, 0.0),
     Parameter(

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros.decision.misfits import Outlier
+from calib_ros.decision.reasons import Reason
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import (
@@ -45,6 +47,7 @@ from calib_ros.report.reports import reasons_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
 from calib_ros.ros.outputs import Published
+from calib_ros.sampling.hints import too_much_lost
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
@@ -109,6 +112,7 @@ class Snapshot(NamedTuple):
     configuration: str
     warnings: tuple[str, ...]
     summary: str = ''
+    lost: Sequence[Reason] = ()
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the operator's numbers of outlier samples."""
@@ -162,7 +166,9 @@ class Identifying:
         numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
         model, settings = session.settings.model, self._configuration()
         texts = session.warnings, session.summary
-        found = Snapshot(problem, model, samples, numbers, origin, settings, *texts)
+        largest_loss = self._node.get_parameter('largest_loss').value
+        lost = too_much_lost(session.account(), largest_loss)
+        found = Snapshot(problem, model, samples, numbers, origin, settings, *texts, lost)
         self.progress.begin()
         return found
 
@@ -174,6 +180,7 @@ class Identifying:
         except TooFewObservationsError as err:
             self._advice = next(iter(given.warnings), '')
             raise too_few(err, given.summary) from err
+        result = replace(result, refusals=(*result.refusals, *given.lost))
         steps = (step for reason in reasons_of(result) for step in reason.steps)
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)

@@ -24,7 +24,6 @@ from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
     POSES,
-    TOO_LATE,
     Piece,
     Rows,
     Series,
@@ -146,6 +145,8 @@ class Collector:
         """Take messages up to one that gives something to do; return the stamps of its rounds."""
         joints = given.where(JOINTS)
         rounds: list[int] = []
+        last = np.maximum.accumulate(np.where(given.joints, np.arange(len(given)), -1))
+        before = np.where(last < 0, self._newest_ns, given.times[last])
         if len(joints):
             stamps = given.times[joints]
             newest = int(stamps[-1])
@@ -158,9 +159,11 @@ class Collector:
             self._backwards = 0
             self._newest_ns = newest
             rounds = stamps[self._rounds(stamps, (0, newest))].tolist()
-        for key, _, stamps, numbers in given.pieces:
+        for key, places, stamps, numbers in given.pieces:
             if isinstance(key, StreamKey):
-                self.waiting.extend(key, stamps, numbers, self._settled_ns + self.delay_ns)
+                after, at = self._settled_ns + self.delay_ns, before[places - given.begin]
+                if self.waiting.extend(key, stamps, numbers, after):
+                    self.waiting.apart[key].note(stamps - self.delay_ns, at, self._lateness_ns)
             else:
                 self.track.extend(key, stamps, numbers)
         return rounds
@@ -178,22 +181,12 @@ class Collector:
         found = [] if needed is None else [restless(needed, self.settings.still)]
         return found + sparse(between, measurements, self.settings.max_gap)
 
-    def astray(self, measurements: int) -> list[Hint]:
-        """Report a stream whose clock differs from the joints' by more than can be estimated.
-
-        Its measurements wait for joint states, or found none since the last match, or most of all
-        measurements did not.
-        """
-        causes = (TOO_LATE, *(f'measurements: {cause}' for cause in CAUSES[1:3]))
-        most = max(measurements // 2, NO_ACCIDENT) < sum(self.dropped[each] for each in causes)
-        found = []
-        for key, last_ns in self.waiting.last_ns.items() if self._newest_ns else ():
-            ahead = last_ns - self.delay_ns - self._newest_ns
-            waiting = self.waiting[key].count if ahead > 0 else 0
-            unmatched = max(waiting, self.waiting.unmatched[key])
-            if abs(ahead) > self._lateness_ns and (most or unmatched >= NO_ACCIDENT):
-                found.append(1e-9 * ahead)
-        return [apart(max(found, key=abs))] if found else []
+    def astray(self) -> list[Hint]:
+        """Report that the clock of a stream differs or differed from the joints' by too much."""
+        now = self._newest_ns, self._lateness_ns
+        found = [each.seconds(*now) for each in self.waiting.apart.values()]
+        seconds = max(found, key=abs, default=0.0)
+        return [apart(seconds)] if seconds else []
 
     def flush(self) -> None:
         """Make samples of everything that has arrived, as if nothing were late."""
@@ -334,8 +327,6 @@ class Collector:
             cause = self.track.causes(stamps)
             self._count_causes(cause)
             known, inside = cause == 0, wanted[numbers]
-            before = self.waiting.unmatched[key]
-            self.waiting.unmatched[key] = 0 if known.any() else before + due
             for k, count in Counter(numbers[known & ~inside].tolist()).items():
                 self.unused[f'measurements: {plan.why[k]}'] += count
             early = known & inside & (stamps < calm[numbers])

@@ -69,8 +69,9 @@ def find_delay(
         return None
     start = joint_stamps[0]
     joint_times, times = (joint_stamps - start) * 1e-9, (stamps - start) * 1e-9
-    begin = max(joint_times[0], times[0] - Settings.lateness)
-    end = min(joint_times[-1], times[-1] + Settings.lateness)
+    farthest = Settings.lateness + Settings.max_gap  # beyond it, stamps show a moved clock
+    begin = max(joint_times[0], times[0] - farthest)
+    end = min(joint_times[-1], times[-1] + farthest)
     if end - begin < LEAST_MOTION:
         return None
     begin = max(begin, end - MOST_TIME)
@@ -90,7 +91,7 @@ def find_delay(
     if moving.sum() * STEP < LEAST_MOTION:
         return None
     second = _speed(times, positions, rotations)
-    most = round(Settings.lateness / STEP)
+    most = round(farthest / STEP)
     lags = STEP * np.arange(-most, most + 1)
     wide = begin + STEP * np.arange(-most, len(grid) + most)
     known = int(np.sum(wide < second[0][0])), int(np.sum(wide <= second[0][-1]))
@@ -323,8 +324,6 @@ class Clocks:
         """Return what looks wrong with the clocks."""
         found = []
         delay, known = self.delay, self.settings.delay
-        if self._deaf:
-            found.append(stuck(1e-9 * WATCH_NS * self._deaf, self._stuck))
         if self._moves:
             found.append(moved(self._moves))
         elif delay is not None and not self._continuous and self._spoils(delay.seconds):
@@ -335,6 +334,10 @@ class Clocks:
             if self._continuous or all(map(self._spoils, delays)):
                 found.append(ambiguous(delays))
         return found
+
+    def stuck(self) -> list[Hint]:
+        """Report that a target moved while no joint did."""
+        return [stuck(1e-9 * WATCH_NS * self._deaf, self._stuck)] if self._deaf else []
 
     def _spoils(self, delay: float) -> bool:
         return not -EARLY <= delay - self.settings.delay <= self.settings.settle

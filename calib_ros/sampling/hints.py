@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import SCATTER, configurations, distinct
 from calib_ros.estimation.levels import NEARER
 from calib_ros.kinematics.chain import Chain
@@ -21,6 +22,7 @@ from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
 from calib_ros.settings import EXCEPTION, Settings
 
 LOST = 'were dropped (stamps or full buffers)'
+ALLOW = 'accept the rest with largest_loss (--largest-loss)'
 _LOSS = re.compile(r'stamp|lateness|buffer full|memory')
 _TWICE = re.compile(r'same stamp twice|already exists')
 
@@ -66,10 +68,14 @@ class Account:
 
 
 class Hint(NamedTuple):
-    """One thing that looks wrong, in a few words for the status and in a sentence."""
+    """One thing that looks wrong, in a few words for the status and in a sentence.
+
+    It may explain losses and stops that seem not to be at rest.
+    """
 
     status: str
     text: str
+    explains: bool = True
 
 
 def unheard(received: Mapping[str, int]) -> list[Hint]:
@@ -116,13 +122,13 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
 
 
 def apart(ahead: float) -> Hint:
-    """Report clocks too far apart: the last measurement is `ahead` of the joint states [s]."""
+    """Report clocks too far apart: measurements are `ahead` of the joint states [s]."""
     words = (
-        f'the newest measurement is stamped {abs(ahead):.0f} s '
-        f'{"after" if ahead > 0.0 else "before"} the newest joint state: synchronise the clocks '
-        '(NTP, PTP), if both still arrive'
+        f'measurements were stamped {abs(ahead):.1f} s {"after" if ahead > 0.0 else "before"} the '
+        'newest joint state: synchronise the clocks (NTP, PTP) if both still arrive, and repeat '
+        'the poses of that time'
     )
-    return Hint(f'stamps disagree by {abs(ahead):.0f} s: synchronise the clocks', words)
+    return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks', words)
 
 
 def unsettled(refused: int, stops: int) -> list[Hint]:
@@ -150,6 +156,22 @@ def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]
     }
     most = max(causes, key=causes.__getitem__, default='')
     return sum(causes.values()) / total if total else 0.0, most.removeprefix(f'{kind}: ')
+
+
+def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
+    """Return why a result must not be accepted: more than `largest_loss` of a kind was lost."""
+    counts = ((JOINTS, account.joint_states), (POSES, account.poses))
+    shares = {name: lost(name, count, account.dropped)[0] for name, count in counts}
+    return [
+        Reason(Rule.DROPPED, f'{share:.0%} of the {name} {LOST}, {allowing(share)}')
+        for name, share in shares.items()
+        if share > largest_loss
+    ]
+
+
+def allowing(share: float) -> str:
+    """Return how to accept the loss of a share."""
+    return f'{ALLOW} {min(1.0, share + 0.01):.2f}'
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:
@@ -201,24 +223,38 @@ def stuck(seconds: float, still: bool) -> Hint:
         'the target moves but no joint does: are joint states frozen?' if still else '',
         f'the target moved for {seconds:.0f} s or more while the joint states stood still: does '
         'the driver of the robot send live data? Restart it, and repeat the poses of that time',
+        explains=still,
     )
 
 
 def frozen(samples: Sequence[Sample]) -> Hint | None:
-    """Report a device that repeats one position, to the nanometre, wherever the arm is."""
-    places: dict[tuple[object, ...], list[FloatArray]] = {}
-    for each in samples:
-        if each.position is not None and not each.socket:
-            key = (each.session, each.device, each.target, *each.position.round(9).tolist())
-            places.setdefault(key, []).append(each.joints)
-    place, joints = max(places.items(), key=lambda item: len(item[1]), default=((), []))
-    if len(joints) < START or distinct(configurations(np.array(joints))) < START:
+    """Report a device that repeats positions, to the nanometre, wherever the arm is.
+
+    A device that repeats its last position without a target shows no scatter at these stops.
+    """
+    measured = [each for each in samples if each.position is not None and not each.socket]
+    places: dict[tuple[object, ...], list[Sample]] = {}
+    for each in measured:
+        assert each.position is not None
+        key = (each.session, each.device, each.target, *each.position.round(9).tolist())
+        places.setdefault(key, []).append(each)
+    repeated = {
+        id(each)
+        for some in places.values()
+        if some[1:] and distinct(configurations(np.array([each.joints for each in some]))) > 1
+        for each in some
+    }
+    still = {id(each) for each in measured if each.count > 1 and not round(each.spread, 12)}
+    if START <= len(still) <= len(measured) - START:  # else a simulation
+        repeated |= still
+    if len(repeated) < START:
         return None
-    where = ', '.join(f'{value:g}' for value in place[3:])
+    where = ', '.join(f'{value:g}' for value in max(places, key=lambda key: len(places[key]))[3:])
     return Hint(
-        f'{len(joints)} poses are identical: is the device frozen?',
-        f'{len(joints)} poses are at {where} m, though the arm was elsewhere each time: does the '
+        f'{len(repeated)} poses are repeated: is the device frozen?',
+        f'{len(repeated)} poses repeat a position to the last digit, such as {where} m: does the '
         'device see the target, and does its driver send live data? Clear and measure again',
+        explains=False,
     )
 
 

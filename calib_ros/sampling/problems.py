@@ -123,13 +123,3 @@ def problem_since(
     known = {name: calibration.chain.frame(name).lens for name in cameras}
     seen = {name: lens for name, lens in known.items() if lens}
     return Measured(sets, lenses=seen).problem(chain, **settings.for_problem())
-
-
-def refuse_other_joints(calibration: Calibration, chain: Chain) -> None:
-    """Refuse a calibration of other joints with an InputError."""
-    theirs = calibration.chain.joint_names
-    if theirs != chain.joint_names:
-        raise InputError(
-            f'the calibration has the joints {", ".join(theirs)}, the robot has '
-            f'{", ".join(chain.joint_names)}'
-        )

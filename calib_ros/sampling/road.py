@@ -177,8 +177,8 @@ class Road:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, given the number of measurements."""
-        found = self.collector.astray(measurements) + self.clocks.hints()
-        return found + self.collector.hints(measurements)
+        found = self.collector.astray() or self.clocks.hints()
+        return found + self.clocks.stuck() + self.collector.hints(measurements)
 
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""

@@ -18,7 +18,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.model_choice import identify_model
-from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
 from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
@@ -30,7 +30,6 @@ from calib_ros.sampling.problems import (
     in_frames_of,
     problem_of,
     problem_since,
-    refuse_other_joints,
 )
 from calib_ros.sampling.road import Road
 from calib_ros.sampling.sample import Sample, named, socket_place
@@ -237,11 +236,13 @@ class CalibrationSession:
         in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
         found = [] if self.samples or in_sockets else unheard(self.received)
         if words := self._kept.different:
-            found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}'))
+            found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
         found += self._road.hints(self.received[POSES])
-        return found or losses(self.received, self._dropped) or self._road.unsettled()
+        if any(hint.explains for hint in found):
+            return found
+        return found + (losses(self.received, self._dropped) or self._road.unsettled())
 
     @property
     def delay(self) -> Delay | None:
@@ -313,7 +314,8 @@ class CalibrationSession:
 
         `samples` (default: all) must not be used to judge it.
         """
-        refuse_other_joints(calibration, self.chain)
+        theirs = 'the calibration', calibration.chain
+        refuse_other_joints(*theirs, 'the robot', self.chain, InputError)
         self._known = frozenset(self.samples if samples is None else samples)
         self.calibration = calibration
 

@@ -146,7 +146,7 @@ class Piece(NamedTuple):
 class Slice:
     """Messages in order of arrival; places count from the first one of a batch."""
 
-    pieces: tuple[Piece, ...]  # by stream, the first to come first
+    pieces: tuple[Piece, ...]  # by stream
     begin: int  # the place of the first message here
     joints: Flags  # (N,) which are joint states
     times: Stamps  # (N,) stamps on the joints' clock [ns]
@@ -160,29 +160,55 @@ class Slice:
         times = np.concatenate([each.stamps for each in pieces]) - np.where(joints, 0, delay_ns)
         ranks = np.split(np.argsort(order), np.cumsum(lengths)[:-1])
         ranked = [each._replace(places=own) for each, own in zip(pieces, ranks, strict=True)]
-        return cls(_by_arrival(ranked), 0, joints[order], times[order])
+        return cls(tuple(ranked), 0, joints[order], times[order])
 
     def __len__(self) -> int:
         return len(self.times)
 
     def between(self, begin: int, end: int) -> Slice:
         """Return the messages from index `begin` to before `end`."""
-        pieces = [each.cut(self.begin + begin, self.begin + end) for each in self.pieces]
-        part = slice(begin, end)
-        return Slice(_by_arrival(pieces), self.begin + begin, self.joints[part], self.times[part])
+        cut = (each.cut(self.begin + begin, self.begin + end) for each in self.pieces)
+        pieces, part = tuple(each for each in cut if len(each.places)), slice(begin, end)
+        return Slice(pieces, self.begin + begin, self.joints[part], self.times[part])
 
     def where(self, kind: str) -> Index:
         """Return the indices (K,) of the messages of a kind."""
         return np.flatnonzero(self.joints if kind == JOINTS else ~self.joints)
 
 
-def _by_arrival(pieces: Sequence[Piece]) -> tuple[Piece, ...]:
-    present = [each for each in pieces if len(each.places)]
-    return tuple(sorted(present, key=lambda each: int(each.places[0])))
-
-
 TOO_LATE = 'measurements: later than lateness allows'
 TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
+
+
+class Apart:
+    """How far the stamps of a stream are from those of the joint states that come with them."""
+
+    def __init__(self) -> None:
+        self._newest_ns = 0  # the joint state before the last measurement
+        self._row = self._live = 0  # far ones in a row, and those with new joint states between
+        self._last_ns = self._moved_ns = 0  # the last one, and most ahead while joint states came
+
+    def note(self, stamps: Stamps, newest: Stamps, far_ns: int) -> None:
+        """Note measurements (M,), some further than `far_ns` from the `newest` joint states."""
+        ahead = stamps - newest
+        far = (np.abs(ahead) > far_ns) & (newest != 0)
+        if far.any():
+            live = np.cumsum(far & (np.diff(newest, prepend=self._newest_ns) != 0))
+            live = live + self._live - np.maximum.accumulate(np.where(far, 0, live + self._live))
+            near = np.flatnonzero(~far)
+            self._row = len(far) - 1 - int(near[-1]) if len(near) else self._row + len(far)
+            self._live = int(live[-1])
+            if live.max() >= NO_ACCIDENT:
+                self._moved_ns = max(self._moved_ns, int(ahead[live.argmax()]), key=abs)
+        else:
+            self._row = self._live = 0
+        self._newest_ns, self._last_ns = int(newest[-1]), int(stamps[-1])
+
+    def seconds(self, newest_ns: int, far_ns: int) -> float:
+        """Return by how much the clocks differed, or how long ago joint states ended [s]."""
+        ahead = self._last_ns - newest_ns
+        ended = self._row >= NO_ACCIDENT and abs(ahead) > far_ns
+        return 1e-9 * (self._moved_ns or (ahead if ended else 0))
 
 
 class Waiting(dict[StreamKey, Rows]):
@@ -198,10 +224,7 @@ class Waiting(dict[StreamKey, Rows]):
         super().__init__()
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
-        self.last_ns: dict[StreamKey, int] = {}
-        """Stamps of the last measurements, by stream."""
-        self.unmatched: Counter[StreamKey] = Counter()
-        """Measurements without joint states since the last match, by stream."""
+        self.apart: dict[StreamKey, Apart] = {}
 
     @property
     def count(self) -> int:
@@ -214,27 +237,29 @@ class Waiting(dict[StreamKey, Rows]):
         found = [rows.values[:, 0] for key, rows in self.items() if key.images]
         return {int(number) for numbers in found for number in numbers.tolist()}
 
-    def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray, after_ns: int) -> None:
-        """Take measurements: numbers (M, w) at stamps (M,), those after `after_ns`."""
+    def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray, after_ns: int) -> bool:
+        """Take measurements: numbers (M, w) at stamps (M,), those after `after_ns`.
+
+        Returns False if the stream is one too many.
+        """
         if key not in self and len(self) >= MOST_NAMES:  # forget those without any use
             for each in [each for each, rows in self.items() if not rows.count]:
                 if not self._kept(each):
-                    del self[each], self.last_ns[each], self.unmatched[each]
+                    del self[each], self.apart[each]
         if key not in self:
             if len(self) >= MOST_NAMES:
                 self._dropped[TOO_MANY] += len(stamps)
-                return
-            self[key] = Rows(self._width, self._capacity)
+                return False
+            self[key], self.apart[key] = Rows(self._width, self._capacity), Apart()
         rows = self[key]
         due = np.flatnonzero(stamps > after_ns)
         taken = due[: rows.capacity - rows.count]
-        self.last_ns[key] = int(stamps[-1])
         if len(due) < len(stamps):
             self._dropped[TOO_LATE] += len(stamps) - len(due)
-            self.unmatched[key] += len(stamps) - len(due)
         if len(taken) < len(due):
             self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
+        return True
 
     def room(self, given: Slice) -> int | None:
         """Return up to where messages fit; None if room must be made."""

@@ -191,8 +191,13 @@ class Track:
 
     def _around(self, stamps: Stamps) -> Iterator[tuple[list[int], Rows, Brackets]]:
         """Yield joints, samples and brackets of stamps (N,) by part, the last one overriding."""
-        for columns, rows in sorted(self._parts.items(), key=lambda item: len(item[0])):
+        for columns in self._by_size():
+            rows = self._parts[columns]
             yield list(columns), rows, self._brackets(rows.stamps, stamps)
+
+    def _by_size(self) -> list[tuple[int, ...]]:
+        """Return the joints of each part, the main one last, whichever came first."""
+        return sorted(self._parts, key=lambda columns: (len(columns), columns))
 
     def _brackets(self, known: Stamps, stamps: Stamps) -> Brackets:
         nowhere = np.zeros(len(stamps), dtype=np.intp)
@@ -291,6 +296,6 @@ class Track:
         """Return stamps (M,) and joint values (M, n) of the main publisher."""
         if self.missing:
             return np.zeros(0, dtype=np.int64), np.zeros((0, len(self._revolute)))
-        main = max(self._parts.items(), key=lambda item: len(item[0]))[1]
+        main = self._parts[self._by_size()[-1]]
         stamps = main.stamps[self.causes(main.stamps) == 0]
         return stamps, self.at(stamps).joints

@@ -14,12 +14,13 @@ from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
 from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
+from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.programs import joints_csv, read_program
+from calib_ros.files.programs import joints_csv, program_of, read_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.chain_file import dump_chain
 
 TABLE = """label,q6,q5,q4,q3,q2,q1,speed
@@ -69,6 +70,13 @@ def test_degrees_are_refused_also_of_joints_without_limits(run, tmp_path, suffix
     assert status == 1
     assert 'must be in radians; if they are, give the joint limits' in err
     assert not (tmp_path / f'out{suffix}').exists()
+
+
+def test_millimetres_of_a_rail_without_limits_are_refused(tmp_path):
+    rail = Chain('rail', 'standard', (Joint('rail', 'prismatic'),))
+    (tmp_path / 'program.csv').write_text('q1\n0.3\n300\n')
+    with pytest.raises(InputError, match='line 3: 300 is more than'):
+        program_of(tmp_path / 'program.csv', rail)
 
 
 @pytest.mark.parametrize('oriented', [True, False])
@@ -127,12 +135,13 @@ def test_cells_separated_otherwise_are_named(run, mark, name):
     assert f'are separated by {name}s: save it with commas' in err
 
 
-def test_columns_may_have_the_names_of_the_joints(run, tmp_path):
+@pytest.mark.parametrize('names', [UR.joint_names, [f'Q{k}' for k in range(1, 7)]])
+def test_columns_may_have_the_names_of_the_joints(run, tmp_path, names):
     """In any order, as drivers write them."""
     assert run(TABLE)[0] == 0
     expected = (tmp_path / 'out.csv').read_text().splitlines()[1:]
     named = TABLE
-    for k, name in enumerate(UR.joint_names):
+    for k, name in enumerate(names):
         named = named.replace(f'q{k + 1}', name)
     assert run(named, '--force')[0] == 0
     head, *found = (tmp_path / 'out.csv').read_text().splitlines()
@@ -257,7 +266,7 @@ WRONG = [
     ('.csv', 'q1,q2,q3,q4,q5\n1,2,3,4,5\n', 'has no column q6'),
     ('.csv', 'q1,q2,q3,q4,q5,q6,q7\n1,0,0,1,0,1,0\n', 'q7, but the arm has 6 joints only'),
     ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'several columns q1'),
-    ('.csv', 'Q1,Q2,Q3,Q4,Q5,Q6\n1,2,3,4,5,6\n', 'Q6: name the columns in the first line'),
+    ('.csv', 'J1,J2,J3,J4,J5,J6\n1,2,3,4,5,6\n', 'J6: name the columns in the first line'),
     ('.csv', '# picks\nq1,q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', 'header; remove other lines above'),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a finite number, not ''"),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a finite number, not 'x'"),

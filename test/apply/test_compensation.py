@@ -338,7 +338,7 @@ def test_settings_out_of_range_are_refused(setting, complaint):
 
 
 def test_chains_of_other_joints_are_refused():
-    with pytest.raises(ConfigError, match='same joints in the same order'):
+    with pytest.raises(ConfigError, match='are they of one robot'):
         Compensator(UR, ROBOTS['puma560'])
 
 

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the target is seen, and `calib_ros plan`."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from designs import arm, design_of, some
 from calib_ros.apply import simulation
 from calib_ros.apply.candidates import Visibility, draw_candidates
 from calib_ros.apply.planning import choose
+from calib_ros.cli.screen import Work
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.programs import joints_csv, read_joints
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
@@ -112,6 +114,14 @@ def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
     _, out, _ = run('plan', '--chain', 'ur10e', '--accuracy', 0.1, '--poses', 10, '--draw', 200)
     assert f'{count} poses reach 0.1 mm' in out
     assert out.splitlines()[-4].split()[0] == '10'
+
+
+def test_plan_tells_how_many_poses_are_tried_and_exchanged(monkeypatch, run):
+    told = []
+    monkeypatch.setattr(Work, '__call__', lambda self, at: told.append(at))
+    assert run('plan', '--chain', 'ur5e', '--accuracy', 0.1, '--draw', 100)[0] == 0
+    assert re.fullmatch(r'\d+ poses', told[0])
+    assert any(re.fullmatch(r'\d+ poses, exchange 2', each) for each in told)
 
 
 def test_plan_with_too_few_poses_says_so(run, tmp_path):

@@ -15,7 +15,7 @@ from calib_ros.apply.confidence import rms_interval, rms_limits
 from calib_ros.apply.verification import Attained, verify
 from calib_ros.decision.validation import Residuals
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.identification.calibration import Calibration
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
 from calib_ros.report.applied import _by_configuration
@@ -56,28 +56,22 @@ def test_the_test_poses_are_those_of_the_standard(name, rng):
     assert ((limits[:, 0] <= found.joints) & (found.joints <= limits[:, 1])).all()
 
 
-def test_an_arm_that_keeps_no_orientation_is_told_so(rng):
-    with pytest.raises(InputError, match='in no cube of its workspace'):
-        iso_9283_poses(design_of(load_chain('kuka_youbot')), rng)
+def test_an_arm_that_cannot_keep_its_orientation_reaches_the_places(rng):
+    design = design_of(load_chain('kuka_youbot'))
+    found = iso_9283_poses(design, rng)
+    places = design.targets(found.joints)[:, :3, 3]
+    assert not found.oriented
+    assert found.edge > 0.1
+    np.testing.assert_allclose(np.abs(places[1:] - places[0]), 0.4 * found.edge, atol=1e-6)
+
+
+def test_an_arm_that_moves_in_a_plane_reaches_no_cube(rng):
+    rows = tuple(Joint(f'j{k}', a=0.3) for k in range(3))
+    with pytest.raises(InputError, match='no cube'):
+        iso_9283_poses(design_of(Chain('planar', 'standard', rows)), rng)
 
 
 # The verdict
-
-
-def test_the_figure_is_that_of_the_corrected_arm(cell, arm):
-    """Commands compensated by the calibration: what is wanted against what is reached."""
-    true, result, _ = cell
-    wanted = UR.random_joints(200, np.random.default_rng(4))
-    moved = compensate(Compensator(UR, result.chain), wanted).joints
-    moved = moved[~np.isnan(moved).any(axis=1)]
-    wanted = wanted[~np.isnan(compensate(Compensator(UR, result.chain), wanted).joints[:, 0])]
-    found = verify(arm, [measured(true, moved, 1, (0.0, 0.0))], 1e-3)
-    frames = {'base': result.chain.base, 'tool': result.chain.tool}
-    meant = replace(UR, **frames).forward(wanted)[:, :3, 3]
-    missed = np.linalg.norm(true.forward(moved)[:, :3, 3] - meant, axis=1)
-    assert found.rms == pytest.approx(np.sqrt(np.mean(missed**2)), rel=1e-6)
-    before, after = found.comparison.figures
-    assert before.rms_mm > 10.0 * after.rms_mm
 
 
 @pytest.mark.parametrize('step', [5e-4, 2e-3, 5e-3])
@@ -159,8 +153,8 @@ def test_the_limits_hold_as_often_as_they_say(shape, count):
     errors = rng.normal(size=(2000, count, 3)) * shape
     lower, upper = np.transpose([rms_interval(each, np.arange(count), 0.95) for each in errors])
     held = np.array([lower <= truth, truth <= upper])
-    assert (held.mean(axis=1) > stats.binom.ppf(1e-3, 2000, 0.94) / 2000).all()
-    assert held.mean() < 0.995  # wide enough, and no wider
+    assert (held.mean(axis=1) > stats.binom.ppf(1e-3, 2000, 0.97) / 2000).all()
+    assert held.mean() < 0.999  # wide enough, and no wider
 
 
 def test_the_limits_of_a_verdict_are_those(arm, monkeypatch):
@@ -175,8 +169,8 @@ def test_limits_are_those_of_the_chi_squared_distribution():
     rng = np.random.default_rng(0)
     lower, upper = rms_limits(1.0, np.array([15.0]), 0.9)
     squares = rng.chisquare(15.0, 100_000) / 15.0
-    assert np.mean(squares < 1.0 / upper[0] ** 2) == pytest.approx(0.1, abs=0.005)
-    assert np.mean(squares > 1.0 / lower[0] ** 2) == pytest.approx(0.1, abs=0.005)
+    assert np.mean(squares < 1.0 / upper[0] ** 2) == pytest.approx(0.05, abs=0.005)
+    assert np.mean(squares > 1.0 / lower[0] ** 2) == pytest.approx(0.05, abs=0.005)
 
 
 def test_repeatability_is_that_of_the_standard():
@@ -285,29 +279,13 @@ def test_a_target_that_was_mounted_anew(cell, arm, oriented):
         verify(arm, [seen[0].select(np.arange(7))], 3e-4, new_base=True, new_tool=True)
 
 
-def test_the_better_calibration_wins_on_a_session_of_its_own(cell, arm):
-    """With a tool of an earlier session, the worse one may look better."""
-    true, result, _ = cell
-    tool = result.chain.frame('tool').matrix.copy()
-    tool[:3, 3] += [2e-3, -1e-3, 1e-3]
-    moved = replace(true, tool=replace(true.tool, matrix=tool))
-    seen = [measured(moved, UR.random_joints(40, np.random.default_rng(3)))]
-    half = result.chain.with_offsets({'elbow_joint.theta': 5e-4, 'wrist_1_joint.a': 5e-4})
-    shifted = half.with_frame('tool', replace(half.frame('tool'), matrix=tool))
-    worse = Calibration(shifted, arm.before)
-    wrong = [verify(each, seen, None, new_base=True).rms for each in (arm, worse)]
-    right = [verify(each, seen, None, new_base=True, new_tool=True).rms for each in (arm, worse)]
-    assert wrong[0] > wrong[1]
-    assert right[0] < 0.5 * right[1]
-
-
 def test_limits_hold_where_some_places_are_worse_than_others():
     """As compliance leaves them: squares that scatter more than those of Gaussian noise."""
     rng = np.random.default_rng(0)
     errors = np.abs(rng.normal(size=(2000, 20, 1))) * rng.normal(size=(2000, 20, 3))
     lower, upper = np.transpose([rms_interval(each, np.arange(20), 0.95) for each in errors])
     held = np.array([lower <= np.sqrt(3.0), np.sqrt(3.0) <= upper])
-    assert (held.mean(axis=1) > stats.binom.ppf(1e-3, 2000, 0.945) / 2000).all()
+    assert held.all(axis=0).mean() > stats.binom.ppf(1e-3, 2000, 0.95) / 2000
 
 
 def test_a_session_is_judged_without_a_tolerance(arm, cell):

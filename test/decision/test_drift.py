@@ -143,9 +143,9 @@ def test_shares_are_those_of_fits_to_residuals_that_were_moved(lengths):
         each[2] *= 1e-9  # of another unit
     inverse = np.array([0.0, 0.5, 0.0, 3.0, 0.0])
     shifts = Shifts(SimpleNamespace(sets=sets), residuals)
-    found = shifts.shares(shifts.columns([columns], inverse), [0, 1], [[2, 3], [3, 4]])
+    found = shifts.shares(shifts.columns([columns]), inverse, [0, 1], [[2, 3], [3, 4]])
     lots = [[each[:3] for each in columns], [each[3:] for each in columns]]
-    again = shifts.shares(shifts.columns(lots, inverse), [0, 1], [[2, 3], [3, 4]])
+    again = shifts.shares(shifts.columns(lots), inverse, [0, 1], [[2, 3], [3, 4]])
     np.testing.assert_allclose(again, found, rtol=1e-9, atol=1e-12)
     count = min(400, 2 * max(lengths))
     assert found.shape == (2, count)

@@ -125,23 +125,6 @@ def test_what_follows_the_joints_is_no_step(design, count):
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
 
 
-@pytest.mark.parametrize('kind', ['walk', 'swing', 'ramp'])
-def test_a_drift_is_no_step(kind):
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        _, seen = session(seed, 'path', bool(seed), count=96)
-        share = np.arange(96)[:, np.newaxis] / 96
-        drift = {
-            'walk': np.cumsum(rng.normal(size=(96, 3)), axis=0) / np.sqrt(96),
-            'swing': np.sin(2.0 * np.pi * share + rng.uniform(0.0, 6.0, 3)),
-            'ramp': 2.0 * share * rng.normal(size=3),
-        }[kind]
-        seen = replace(seen, positions=seen.positions + 3e-4 * drift)
-        result = identify(Problem(UR10E, seen, **SIGMAS))
-        assert result.step is None
-        assert result.accepted
-
-
 def test_half_of_the_session_called_outliers_hides_no_step():
     true, seen = session(1, oriented=True)
     result = identify(Problem(UR10E, moved(seen, true, 'joint', 0.02, at=40), **SIGMAS))

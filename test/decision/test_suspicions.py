@@ -6,12 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import rms
+from fits import SIGMAS, rms
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.suspicions import _common, _motion, scale_of
-from calib_ros.errors import ConfigError
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Chain, Frame, Joint
@@ -215,9 +214,18 @@ def test_a_scale_that_few_lengths_imitate_is_refused_where_it_does_harm(seed):
     assert not any('sigma_scale' in each for each in checked.remarks)
 
 
-def test_the_scale_of_a_device_is_a_number():
-    with pytest.raises(ConfigError, match=r'sigma_scale must be from 0 to 1, not -0\.1'):
-        Problem(FOUR, seen_of(arm()), sigma_scale=-0.1)
+@pytest.mark.parametrize('scale', [5e-4, 2e-3])
+def test_a_scale_that_leaves_no_region_is_the_reason(scale):
+    """Where the device is checked to 100 ppm the arm itself is of another size."""
+    rng = np.random.default_rng(0)
+    true = faulty(UR, Cell(length_error=1e-4, angle_error=2e-4), rng)
+    lengths = [n for n in UR.parameter_names if n.is_length and not UR.owns_frame(n)]
+    true = true.with_offsets({n: scale * UR.value(n) for n in lengths})
+    problem = Problem(UR, measure(true, UR.random_joints(60, rng), rng, 5e-5, 2e-4), **SIGMAS)
+    result = identify(problem)
+    assert [each.rule for each in result.refusals] == [Rule.SCALE]
+    assert not any('alike' in each for each in result.remarks)
+    assert identify(replace(problem, sigma_scale=1e-4)).accepted
 
 
 POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
@@ -290,3 +298,32 @@ def test_few_samples_show_no_errors_of_time(count, named):
         result = SimpleNamespace(distances=[sizes], noise=SimpleNamespace(position=1.1))
         found += 'speed' in _motion(SimpleNamespace(sets=[seen]), result)
     assert found == named
+
+
+@pytest.mark.parametrize(('share', 'refused'), [(0.0, False), (1e-4, False), (1e-3, True)])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_harms(
+    share, refused, oriented
+):
+    """A device that smoothed over 0.8 s made an arm worse, 2.2 mm -> 3.3 mm, and was accepted."""
+    rng = np.random.default_rng(1)
+    joints = UR.random_joints(40, rng)
+    behind = joints - share * np.diff(joints, axis=0, prepend=joints[:1])
+    seen = replace(measure(arm(), behind, rng, 5e-5, 2e-4, oriented), joints=joints)
+    result = identify(Problem(UR, seen))
+    assert result.accepted == (not refused)
+    assert (Rule.LAG in [each.rule for each in result.refusals]) == refused
+    assert any('towards the stop before' in each for each in result.remarks) == (share == 1e-4)
+
+
+@pytest.mark.parametrize('size', [3e-4, 1e-3])
+def test_backlash_is_not_taken_for_a_lag_that_harms(size):
+    true = arm().with_effects([f'{joint.name}.backlash' for joint in UR.joints])
+    true = true.with_offsets({name: -size for name, _ in true.effects})
+    rng = np.random.default_rng(1)
+    joints = true.random_joints(60, rng)
+    approach = np.sign(np.diff(joints, axis=0, prepend=joints[:1]))
+    seen = measure(true, joints, rng, 5e-5, 2e-4)
+    poses = true.forward(joints, approach)
+    seen = replace(seen, positions=poses[:, :3, 3], rotations=poses[:, :3, :3])
+    assert identify(Problem(UR, seen)).accepted

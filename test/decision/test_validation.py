@@ -11,6 +11,8 @@ from fits import UR10E, measured_arm
 from scipy import stats
 
 from calib_ros.decision import validation
+from calib_ros.decision.acceptance import refusals
+from calib_ros.decision.reasons import Rule
 from calib_ros.decision.validation import (
     Comparison,
     Residuals,
@@ -54,7 +56,42 @@ def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
     assert [each.max_mm for each in comparison.figures_of_all] == pytest.approx([18.0, 9.0])
     assert comparison.deciding.tolist() == which.tolist()
     repeated = np.array([False, True, False, False])
-    assert replace(comparison, repeated=repeated).deciding.tolist() == [True, False, True, False]
+    again = replace(comparison, repeated=repeated)
+    assert again.deciding.tolist() == [True, False, True, False]
+    assert (again.figures[0].count, again.figures_of_all[0].count) == (2, 3)
+    assert again.share_of_outliers == pytest.approx(1 / 3)
+    assert replace(comparison, repeated=~which).outliers == 0
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'rules'),
+    [
+        (3e-4, 0.4, {Rule.GAIN}),  # folds that diverge
+        (0.3, 0.4, {Rule.GAIN, Rule.LARGEST_ERROR}),
+        (0.4, 0.3, {Rule.LARGEST_ERROR, Rule.GAIN_WITH_OUTLIERS}),
+    ],
+)
+def test_an_arm_that_fits_is_not_called_wrong_for_a_bad_correction(rng, before, after, rules):
+    away = rng.normal(size=(40, 3))
+    worse = np.where(np.arange(40)[:, np.newaxis] < 2, 100.0, 1.0)
+    numbers, pixels = np.arange(40), np.full((40, 2), np.nan)
+    parts = [
+        Residuals(x, np.full((40, 3), np.nan), numbers, pixels)
+        for x in (before * away, after * worse * away)
+    ]
+    comparison = Comparison(*parts, worse[:, 0] == 1.0)
+    problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0)
+    result = SimpleNamespace(
+        step=None,
+        converged=True,
+        not_excited=(),
+        parameters=(),
+        chance=None,
+        region=1,
+        validation=comparison,
+    )
+    problem.sets = ()
+    assert {each.rule for each in refusals(problem, result, None, False, True)} == rules
 
 
 def row(name, offset, std, freedom=np.inf):
@@ -176,7 +213,7 @@ def test_held_out_pairs_at_fitted_configurations_are_repeated():
     judged, text = validation.validate(
         replace(problem, loss='none'), problem.model, problem.model, [], None
     )
-    said = '5 held-out poses; those that repeat fitted poses (2) do not count for acceptance'
+    said = '3 held-out poses; not counted because they repeat fitted poses: 2'
     assert text == said
     assert judged.deciding.tolist() == [True, False, True, False, True]
 

@@ -200,14 +200,6 @@ def test_held_out_poses_that_do_not_belong_there_are_not_accepted(unsearched):
     assert not fit(seen, held_out=held_out).accepted
 
 
-@pytest.mark.parametrize('seed', [10, 11, 17])
-def test_few_clean_poses_of_understated_noise_name_no_outliers(seed):
-    _, _, seen = measured_arm(seed, 12)
-    sigmas = {'sigma_position': 0.5 * NOISE[0], 'sigma_orientation': 0.5 * NOISE[1]}
-    result = identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2)), **sigmas))
-    assert not result.outliers
-
-
 def test_what_a_simpler_model_explains_is_no_gross_error_for_a_richer_one():
     """Displaced samples keep their weight where the simpler model explains them."""
     *_, seen = measured_arm(21, 60, (5e-5, 2e-4))

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from measured import write_csv
 from scipy import special
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.cli.main import main
 from calib_ros.decision.suspicions import _apart
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
@@ -237,15 +237,21 @@ def test_a_fixed_tool_and_one_plane_are_enough_for_a_part():
     assert not any(name.startswith('tool') for name in result.names)
 
 
+def rows_of(sets, **more):
+    """Return rows of a table with a label a plane."""
+    return [
+        {f'q{k + 1}': x for k, x in enumerate(row)} | {'plane': name} | more
+        for name, each in zip('ABC', sets, strict=False)
+        for row in each.joints.tolist()
+    ]
+
+
 def test_touches_in_a_table_are_as_given(tmp_path):
-    """A label a plane; another row of the table is a position."""
+    """Another row of the table is a position."""
     _, sets = cell(5, count=6, planes=2)
-    lines = ['q1,q2,q3,q4,q5,q6,x,y,z,plane,target']
-    lines.append('0,0,0,0,0,0,0.1,0.2,0.3,,ball')
-    for name, each in zip('AB', sets, strict=True):
-        lines += [f'{",".join(map(repr, row))},,,,{name},tip' for row in each.joints.tolist()]
-    path = tmp_path / 'touched.csv'
-    path.write_text('\n'.join(lines) + '\n')
+    point = dict.fromkeys(('q1', 'q2', 'q3', 'q4', 'q5', 'q6'), 0.0)
+    point |= {'x': 0.1, 'y': 0.2, 'z': 0.3, 'target': 'ball'}
+    path = write_csv(tmp_path / 'touched.csv', [point, *rows_of(sets, target='tip')])
     table = read_table(path, 6)
     assert [(each.base, each.tool) for each in table.fitted] == [
         ('base', 'tool'),
@@ -258,17 +264,12 @@ def test_touches_in_a_table_are_as_given(tmp_path):
         np.testing.assert_array_equal(each.distances, given.distances)
 
 
-def test_the_command_line_takes_touches(tmp_path, capsys):
-    sets = cell(6)[1]
-    lines = ['q1,q2,q3,q4,q5,q6,plane']
-    for name, each in zip('ABC', sets, strict=True):
-        lines += [f'{",".join(map(repr, row))},{name}' for row in each.joints.tolist()]
-    path = tmp_path / 'touched.csv'
-    path.write_text('\n'.join(lines) + '\n')
-    args = ['identify', '--csv', str(path), '--chain', 'ur10e', '--sigma-touch', str(SIGMA)]
-    assert main([*args, '--model', 'geometric', '--json']) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document['accepted']
+def test_the_command_line_takes_touches(run, tmp_path):
+    write_csv(tmp_path / 'touched.csv', rows_of(cell(6)[1]))
+    given = ('identify', 'touched.csv', '--chain', 'ur10e', '--sigma-touch', SIGMA)
+    status, out, _ = run(*given, '--model', 'geometric', '--json')
+    document = json.loads(out)
+    assert (status, document['accepted']) == (0, True)
     assert {'base_A.z', 'base_B.rx', 'base_C.ry'} <= {
         name for name, each in document['parameters'].items() if each['status'] == 'fitted'
     }

@@ -13,6 +13,7 @@ import pytest
 
 from calib_ros.errors import InputError
 from calib_ros.files.archive import Archive
+from calib_ros.files.tables import read_table
 from calib_ros.sampling.sample import Sample
 
 
@@ -112,16 +113,23 @@ def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
     assert len(list(tmp_path.glob('*.csv'))) == len(list(tmp_path.glob('*.settings.yaml'))) == 2
 
 
-def test_a_damaged_journal_stays_and_how_to_go_on_is_told(tmp_path):
-    archive = open_archive(tmp_path)
-    archive.add(sample(1))
-    archive.close()
+@pytest.mark.parametrize('damage', [b'no number', b'1,2', b'"', b'\0' * 40, b'\xff'])
+def test_a_damaged_row_is_left_out_and_stays(tmp_path, damage):
+    written(tmp_path, *range(1, 9))
     (journal,) = tmp_path.glob('*.csv')
-    damaged = journal.read_text() + 'no number' + journal.read_text().splitlines()[1] + '\n'
-    journal.write_text(damaged)
-    with pytest.raises(InputError, match=r'line 3.*start without resume'):
-        open_archive(tmp_path).resume()
-    assert journal.read_text() == damaged
+    lines = journal.read_bytes().splitlines(keepends=True)
+    lines[3] = damage + b'\n' if damage == b'1,2' else damage + lines[3]
+    lines[6] = lines[6][:-20] + b'\n'
+    journal.write_bytes(b''.join(lines)[:-1])  # by an editor, perhaps
+    archive = open_archive(tmp_path)
+    samples, (warning,) = archive.resume()
+    assert [each.stamp_ns for each in samples] == [1, 2, 4, 5, 7, 8]
+    assert 'lines 4, 7 cannot be read: left out' in warning
+    archive.add(sample(9))
+    assert stamps(tmp_path) == [1, 2, 4, 5, 7, 8, 9]
+    assert journal.read_bytes().startswith(b''.join(lines))
+    with pytest.raises(InputError):
+        read_table(journal, 2)
 
 
 def test_nothing_to_resume(tmp_path):
@@ -235,22 +243,6 @@ def test_an_export_is_whole_or_absent(tmp_path):
     folder = archive.export(files)
     assert list((tmp_path / 'data').iterdir()) == [folder]
     assert {path.name: path.read_text() for path in folder.iterdir()} == files
-
-
-def test_the_folder_is_made_at_the_start(tmp_path):
-    folder = tmp_path / 'not' / 'there'
-    archive = open_archive(folder)
-    assert folder.is_dir()
-    archive.add(sample(1))
-    assert not archive.error
-    assert not archive.trouble
-    assert stamps(folder) == [1]
-    shutil.rmtree(folder)  # by mistake, before a new journal begins
-    archive.start_new()
-    archive.add(sample(2))
-    archive.close()
-    assert not archive.error
-    assert stamps(folder) == [2]
 
 
 @pytest.mark.parametrize('folder', ['/proc/nope', '/dev/null/nope', '/dev/null'])

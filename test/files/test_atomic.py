@@ -107,12 +107,29 @@ def test_only_one_process_writes_a_folder(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ['out']
 
 
-@pytest.mark.parametrize('locks', [True, False])
-@pytest.mark.parametrize('overwrite', [True, False])
-def test_of_several_processes_one_wins(tmp_path, monkeypatch, overwrite, locks):
-    """Also on a file system without locks."""
-    if not locks:
+def unsupported(*arguments, **more):
+    raise OSError(errno.EOPNOTSUPP, 'not supported')
+
+
+@pytest.fixture(params=[True, False])
+def locks(request, monkeypatch):
+    """Return whether the file system has locks."""
+    if not request.param:
         monkeypatch.setattr(fcntl, 'flock', unsupported)
+    return request.param
+
+
+@pytest.fixture(params=[True, False])
+def links(request, monkeypatch):
+    """Return whether the file system has hard links."""
+    if not request.param:
+        monkeypatch.setattr(os, 'link', unsupported)
+    return request.param
+
+
+@pytest.mark.usefixtures('locks')
+@pytest.mark.parametrize('overwrite', [True, False])
+def test_of_several_processes_one_wins(tmp_path, overwrite):
     for number in range(2):
         path = tmp_path / f'out{number}'
         hear, tell = os.pipe()
@@ -131,10 +148,6 @@ def test_of_several_processes_one_wins(tmp_path, monkeypatch, overwrite, locks):
         assert len(winners) == 1 or (overwrite and winners)
         assert tree(path) in [expected(str(k)) for k in winners]
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def unsupported(*arguments, **more):
-    raise OSError(errno.EOPNOTSUPP, 'not supported')
 
 
 def test_without_locks_leftovers_are_left_to_the_user(tmp_path, monkeypatch):
@@ -173,6 +186,7 @@ def test_what_is_no_folder_of_ours_is_not_followed(tmp_path):
     assert (elsewhere / 'out' / 'precious').read_text() == 'mine'
 
 
+@pytest.mark.usefixtures('links')
 def test_names_in_the_way_are_kept_unless_overwritten(tmp_path):
     path = tmp_path / 'out'
     make(path, 'A', overwrite=False)
@@ -190,15 +204,6 @@ def test_names_in_the_way_are_kept_unless_overwritten(tmp_path):
     assert tree(path) == expected('B') | NOTES | nested
     assert os.readlink(path / 'link') == 'nowhere'
     assert path.stat().st_mode & 0o777 == 0o750
-
-
-def test_other_files_go_along_without_hard_links(tmp_path, monkeypatch):
-    path = tmp_path / 'out'
-    make(path, 'A')
-    add_notes(path)
-    monkeypatch.setattr(os, 'link', unsupported)
-    make(path, 'B')
-    assert tree(path) == expected('B') | NOTES
 
 
 def test_a_link_to_a_folder_stays_one(tmp_path):
@@ -231,15 +236,11 @@ def test_a_full_disk_changes_nothing(tmp_path, monkeypatch):
     assert tree(tmp_path) == {f'out/{name}': text for name, text in expected('A').items()}
 
 
-@pytest.mark.parametrize('links', [True, False])
+@pytest.mark.usefixtures('links')
 @pytest.mark.parametrize('fails_again', [False, True])
-def test_of_files_that_belong_together_none_is_replaced_alone(
-    tmp_path, monkeypatch, links, fails_again
-):
+def test_of_files_that_belong_together_none_is_replaced_alone(tmp_path, monkeypatch, fails_again):
     names = [tmp_path / name for name in 'abc']
     names[0].write_text('a of A')
-    if not links:
-        monkeypatch.setattr(os, 'link', unsupported)
     replace = os.replace
 
     def not_c(first, second):
@@ -279,11 +280,8 @@ def test_a_process_killed_meanwhile_leaves_no_files_of_two_sets(tmp_path):
     assert len(list(tmp_path.iterdir())) == 3
 
 
-@pytest.mark.parametrize('locks', [True, False])
-def test_what_killed_processes_leave_does_not_pile_up(tmp_path, monkeypatch, locks):
+def test_what_killed_processes_leave_does_not_pile_up(tmp_path, locks):
     """Without locks it cannot be told from the work of others, which goes on."""
-    if not locks:
-        monkeypatch.setattr(fcntl, 'flock', unsupported)
     path, number = tmp_path / 'file', 1
     while killed_at(number, tmp_path, lambda: write_file(path, 'A', overwrite=True)):
         number += 1
@@ -293,11 +291,7 @@ def test_what_killed_processes_leave_does_not_pile_up(tmp_path, monkeypatch, loc
     assert len(list(tmp_path.iterdir())) == (1 if locks else 2)
 
 
-@pytest.mark.parametrize('locks', [True, False])
-def test_processes_that_write_one_file_wait_for_each_other(tmp_path, monkeypatch, locks):
-    if not locks:
-        monkeypatch.setattr(fcntl, 'flock', unsupported)
-
+def test_processes_that_write_one_file_wait_for_each_other(tmp_path, locks):
     def work(label):
         for _ in range(30):
             write_together({tmp_path / name: label for name in 'ab'}, overwrite=True)
@@ -334,12 +328,10 @@ def test_a_name_may_be_as_long_as_the_disk_takes(tmp_path):
     assert (tmp_path / os.fsdecode(b'\xff')).read_text() == 'B'
 
 
-@pytest.mark.parametrize(('links', 'seen'), [(True, True), (False, True), (True, False)])
+@pytest.mark.parametrize('seen', [True, False])
 def test_a_file_is_written_once(tmp_path, monkeypatch, links, seen):
     """Also where another process has looked before this one was there."""
-    if not links:
-        monkeypatch.setattr(os, 'link', unsupported)
-    if not seen:
+    if links and not seen:  # without links nobody else is noticed
         monkeypatch.setattr(Path, 'exists', lambda self: False)
     path = tmp_path / 'file'
     write_file(path, 'first')

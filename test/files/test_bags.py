@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from recorded import (
+    ARM,
     MS,
     account_of,
     assert_equal,
@@ -27,8 +28,11 @@ from recorded import (
 from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
+from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag
+from calib_ros.sampling import intake
 from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.session import CalibrationSession
 
 
 @storages
@@ -123,18 +127,6 @@ def test_a_covariance_of_the_message_is_kept(tmp_path):
     path = record(tmp_path / 'bag', standing([pose_with_covariance(105 * MS, covariance)]))
     observations = observations_of(path)
     np.testing.assert_array_equal(observations.covariance, [covariance])
-
-
-@pytest.mark.parametrize('behind', [0, 8])  # what rclpy leaves behind empty lists
-def test_joints_are_taken_by_name(tmp_path, behind):
-    events = [
-        ('/joint_states', joint_state(10 * MS, (3.0, 9.0, 1.0, 2.0), ('c', 'gripper', 'a', 'b'))),
-        ('/joint_states', joint_state(20 * MS, (1.0, 2.0, 3.0), ('a', 'b', 'c'))),
-        ('/joint_states', joint_state(30 * MS, (2.0, 1.0, 3.0), ('b', 'a', 'c'))),
-        *(('/pose', pose_stamped(ms * MS)) for ms in (10, 15, 20, 25, 30)),
-    ]
-    path = record(tmp_path / 'bag', events, behind=behind * b'x')
-    np.testing.assert_array_equal(observations_of(path).joints, [[1.0, 2.0, 3.0]] * 5)
 
 
 def test_joints_by_other_names(tmp_path):
@@ -302,3 +294,13 @@ def test_a_nan_of_a_foreign_joint_does_not_matter(tmp_path):
     ]
     account = account_of(record(tmp_path / 'bag', [*events, ('/pose', pose_stamped(15 * MS))]))
     assert (account.samples, account.dropped) == (1, {})
+
+
+def test_a_bag_tells_how_much_of_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(intake, 'BATCH', 100)
+    told = []
+    path = record_in_chunks(tmp_path / 'bag', 'mcap')
+    replay(path, CalibrationSession(ARM), told.append)
+    assert told == sorted(told)
+    assert len(told) > 2
+    assert told[-1] == 1.0

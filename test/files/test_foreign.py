@@ -10,11 +10,10 @@ import pytest
 from robots import DATA, needs_data
 from scipy.spatial.transform import Rotation
 
-from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Expression, Layout, load_layout, parse_columns, presets
+from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout, presets
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
@@ -35,10 +34,14 @@ def read(tmp_path):
     return read
 
 
-def text_of(*columns, names, separator=',', above=''):
+def text_of(*columns, names, separator=','):
     rows = np.column_stack(columns).tolist()
     lines = [separator.join(names), *(separator.join(map(repr, row)) for row in rows)]
-    return above + '\n'.join(lines) + '\n'
+    return '\n'.join(lines) + '\n'
+
+
+NAMES = ['q1', 'q2', 'x', 'y', 'z']
+PLAIN = text_of(JOINTS, PLACES, names=NAMES)
 
 
 def assert_same(table, rotations=TURNED):
@@ -57,12 +60,14 @@ def both_rows(table):
 
 
 @needs_data
-def test_poses_of_a_leica_as_published(tmp_path):
+def test_poses_of_a_leica_as_published(run, tmp_path):
     raw = DATA / 'ur10_ipa_leica/raw/measurements_joint_configurations.csv'
-    out = tmp_path / 'out.csv'
-    given = ['import', str(raw), '--preset', 'ipa_leica', '--chain', 'ur10', '--out', str(out)]
-    assert main(given) == 0
-    table, known = read_table(out, 6), read_table(raw.parents[1] / 'uniform.csv', 6, ('B',))
+    given = ('import', raw, '--preset', 'ipa_leica', '--chain', 'ur10', '--out', 'out.csv')
+    assert run(*given)[0] == 0
+    table, known = (
+        read_table(tmp_path / 'out.csv', 6),
+        read_table(raw.parents[1] / 'uniform.csv', 6, ('B',)),
+    )
     for found, expected in zip(both_rows(table), both_rows(known), strict=True):
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
     covariance = table.fitted[0].covariance
@@ -76,15 +81,14 @@ def test_poses_of_a_leica_as_published(tmp_path):
     np.testing.assert_array_equal(direct.fitted[0].covariance, covariance)
 
 
-@needs_data
-def test_targets_and_differences_of_a_tracker_as_published(tmp_path):
-    raw = DATA / 'ur5_jacobi_lasertracker/raw/3D_UR5_uncalibrated_grid_cleaned.csv'
-    columns = 'q*=joint_*,x=x_t+x_dif,y=y_t+y_dif,z=z_t+z_dif'
-    layout = Layout(columns=parse_columns(columns), length='mm', angle='deg')
-    table = read_table(raw, 6, foreign=Foreign(layout, load_chain('ur5e')))
-    known = read_table(raw.parents[1] / 'uniform.csv', 6)
-    for found, expected in zip(both_rows(table), both_rows(known), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+def test_later_columns_may_use_our_names_of_earlier_ones():
+    """As messages about a wrong setting name them."""
+    given = ['q*=J*', 'q1=q2,q2=q1', 'q2=q2-{q1},target=q1']
+    columns = layout_of('', given, {}).columns
+    assert (columns['q1'], columns['q2']) == ('(J2)', '((J1))-{q1}')
+    assert columns['target'] == 'q1'
+    coupled = layout_of('fanuc', ['q3=q3-q2'], {}).columns['q3']
+    assert coupled == '(J3 + J2)-(J2)'
 
 
 EULER = [a + b + c for a in 'XYZ' for b in 'XYZ' for c in 'XYZ' if a != b and b != c]
@@ -93,20 +97,16 @@ EULER = [a + b + c for a in 'XYZ' for b in 'XYZ' for c in 'XYZ' if a != b and b 
 @pytest.mark.parametrize('letters', [*EULER, *(each.lower() for each in EULER)])
 def test_euler_angles_of_any_order(read, letters):
     angles = TURNED.as_euler(letters, degrees=True)
-    text = text_of(
-        JOINTS, 1e3 * PLACES, angles, names=['q1', 'q2', 'x', 'y', 'z', 'r1', 'r2', 'r3']
-    )
+    text = text_of(JOINTS, 1e3 * PLACES, angles, names=[*NAMES, 'r1', 'r2', 'r3'])
     assert_same(read(text, euler=letters, angle='deg', joint_angle='rad', length='mm'))
     if len(set(letters.upper())) == 3:
-        names = ['q1', 'q2', 'x', 'y', 'z', *(f'r{each.lower()}' for each in letters)]
+        names = [*NAMES, *(f'r{each.lower()}' for each in letters)]
         assert_same(read(text_of(JOINTS, PLACES, np.radians(angles), names=names), euler=letters))
 
 
 @pytest.mark.parametrize('layout', [{'euler': 'XYZ'}, {'rotation_vector': True}])
 def test_angles_of_many_turns_are_taken_for_degrees(read, layout):
-    text = text_of(
-        JOINTS, PLACES, 60.0 * TURNED.as_rotvec(), names=['q1', 'q2', *'xyz', 'rx', 'ry', 'rz']
-    )
+    text = text_of(JOINTS, PLACES, 60.0 * TURNED.as_rotvec(), names=[*NAMES, 'rx', 'ry', 'rz'])
     with pytest.raises(InputError, match=r'line [0-9]+: rx, ry, rz .* in degrees, .*--angle deg'):
         read(text, **layout)
     read(text, angle='deg', **layout)
@@ -116,7 +116,7 @@ def test_angles_of_many_turns_are_taken_for_degrees(read, layout):
 def test_standard_deviations_of_euler_angles(read, letters):
     sigmas = np.array([1e-4, 2e-4, 3e-4])
     angles = TURNED.as_euler(letters)
-    names = ['q1', 'q2', 'x', 'y', 'z', 'r1', 'r2', 'r3']
+    names = [*NAMES, 'r1', 'r2', 'r3']
     columns = {'sx': '0.1e-3', 'sy': '0.1e-3', 'sz': '0.2e-3'}
     columns |= {'srx': '1e-4', 'sry': '2e-4', 'srz': '3e-4'}
     table = read(text_of(JOINTS, PLACES, angles, names=names), euler=letters, columns=columns)
@@ -130,11 +130,10 @@ def test_standard_deviations_of_euler_angles(read, letters):
 
 
 def test_rotation_vectors_and_quaternions(read):
-    names = ['q1', 'q2', 'x', 'y', 'z', 'rx', 'ry', 'rz']
-    text = text_of(JOINTS, PLACES, TURNED.as_rotvec(), names=names)
+    text = text_of(JOINTS, PLACES, TURNED.as_rotvec(), names=[*NAMES, 'rx', 'ry', 'rz'])
     assert_same(read(text, rotation_vector=True))
     quat = TURNED.as_quat()[:, [3, 0, 1, 2]]
-    names = ['q1', 'q2', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw']
+    names = [*NAMES, 'qx', 'qy', 'qz', 'qw']
     assert_same(read(text_of(JOINTS, PLACES, quat, names=names), quaternion='wxyz'))
     inverse = TURNED.inv()
     text = text_of(JOINTS, -inverse.apply(PLACES), inverse.as_quat(), names=names)
@@ -145,7 +144,7 @@ def test_rotation_vectors_and_quaternions(read):
     ('separator', 'decimal'), [(';', ','), (';', '.'), ('\t', ','), (' ', '.')]
 )
 def test_separators_and_decimal_commas_are_guessed_and_said(read, separator, decimal):
-    text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'], separator=separator)
+    text = text_of(JOINTS, PLACES, names=NAMES, separator=separator)
     table = read(text.replace('.', decimal))
     assert_same(table, None)
     said = ' '.join(table.warnings)
@@ -156,11 +155,10 @@ def test_separators_and_decimal_commas_are_guessed_and_said(read, separator, dec
 
 
 def test_cells_in_quotes_windows_text_and_a_byte_order(read):
-    text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'])
-    assert_same(read(text.replace('0.25', '"0.25"').replace('\n', '\r\n')), None)
-    assert_same(read(text.replace('z', 'z,frame_id', 1).replace('0.25', '"0.25"')), None)
-    assert_same(read(text.encode('utf-16')), None)
-    named = text.replace('q1', 'Gel\u00e4nk 1')
+    assert_same(read(PLAIN.replace('0.25', '"0.25"').replace('\n', '\r\n')), None)
+    assert_same(read(PLAIN.replace('z', 'z,frame_id', 1).replace('0.25', '"0.25"')), None)
+    assert_same(read(PLAIN.encode('utf-16')), None)
+    named = PLAIN.replace('q1', 'Gel\u00e4nk 1')
     table = read(named.encode('cp1252'), columns={'q1': '{Gel\u00e4nk 1}'})
     assert_same(table, None)
     assert 'Windows-1252' in ' '.join(table.warnings)
@@ -226,16 +224,15 @@ def exports():
 
 
 @pytest.mark.parametrize('preset', exports())
-def test_exports_of_others(tmp_path, preset):
+def test_exports_of_others(run, tmp_path, preset):
     text, log = exports()[preset]
     (tmp_path / 'table.csv').write_text(text)
-    given = ['import', str(tmp_path / 'table.csv'), '--preset', preset]
+    given = ['import', 'table.csv', '--preset', preset, '--out', 'out.csv']
     if log is not None:
         (tmp_path / 'log.csv').write_text(log)
-        given += ['--joints', str(tmp_path / 'log.csv'), '--joints-preset', 'kuka']
-    out = tmp_path / 'out.csv'
-    assert main([*given, '--out', str(out)]) == 0
-    table = read_table(out, 3 if preset == 'fanuc_wpr' else 2)
+        given += ['--joints', 'log.csv', '--joints-preset', 'kuka']
+    assert run(*given)[0] == 0
+    table = read_table(tmp_path / 'out.csv', 3 if preset == 'fanuc_wpr' else 2)
     (found,) = table.fitted
     np.testing.assert_allclose(found.joints[:, :2], JOINTS, atol=1e-12)
     np.testing.assert_allclose(found.positions, PLACES, atol=1e-12)
@@ -255,8 +252,7 @@ def test_a_log_of_universal_robots(tmp_path):
     (tmp_path / 'log.csv').write_text(text_of(JOINTS, names=names, separator=' '))
     text = text_of(PLACES, names=['x', 'y', 'z'])
     (tmp_path / 'table.csv').write_text(text)
-    layout = Layout(length='m')
-    foreign = Foreign(layout, None, tmp_path / 'log.csv', load_layout('ur_rtde'))
+    foreign = Foreign(Layout(length='m'), None, tmp_path / 'log.csv', load_layout('ur_rtde'))
     assert_same(read_table(tmp_path / 'table.csv', 2, foreign=foreign), None)
     (tmp_path / 'table.csv').write_text(text + '1,2,3\n')
     with pytest.raises(InputError, match=r'has 3 rows, .* has 4'):
@@ -302,8 +298,7 @@ def test_what_is_no_expression(text):
 
 
 def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
-    text = text_of(JOINTS, PLACES, names=['q1', 'q2', 'x', 'y', 'z'])
-    table = read(text + '0,0,,,\n', length='m', angle='rad')
+    table = read(PLAIN + '0,0,,,\n', length='m', angle='rad')
     assert_same(table, None)
     assert 'line 5: skipped' in ' '.join(table.warnings)
 
@@ -311,8 +306,7 @@ def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
 def test_joint_values_that_stand_a_row_below(read):
     joints = np.vstack([[[9.0, 9.0]], JOINTS])
     places = np.vstack([PLACES, [[9.0, 9.0, 9.0]]])
-    text = text_of(joints, places, names=['q1', 'q2', 'x', 'y', 'z'])
-    assert_same(read(text, shift=1), None)
+    assert_same(read(text_of(joints, places, names=NAMES), shift=1), None)
 
 
 @pytest.mark.parametrize(
@@ -321,11 +315,7 @@ def test_joint_values_that_stand_a_row_below(read):
         ('q1;q2;x;y;z\n1;2;3;4;five\n', {}, 'line 2: .* must be a finite number, not .five'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
-        (
-            'a,b,a,y,z\n1,2,3,4,5\n',
-            {'columns': {'q1': 'a'}},
-            'comes 2 times: name it by its number',
-        ),
+        ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),
         ('q1,q2,x,y,z,rx,ry,rz\n1,2,3,4,5,6,7,8\n', {}, 'say which, --euler'),
         ('q1,q2,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,0,0,0,2\n', {}, 'line 2: quaternion'),
         ('q1,q2,x,y,z\n', {}, 'no rows'),
@@ -340,19 +330,17 @@ def test_faults_are_named(read, text, layout, said):
         read(text, **layout)
 
 
-def test_a_table_without_joint_values_is_refused(tmp_path, capsys):
+def test_a_table_without_joint_values_is_refused(run, tmp_path):
     (tmp_path / 'cell.csv').write_text('x,y,z\n1,2,3\n')
-    given = ['import', str(tmp_path / 'cell.csv'), '--out', str(tmp_path / 'out.csv')]
-    assert main(given) == 1
-    assert 'cell.csv has no joint values: name their columns' in capsys.readouterr().err
+    status, _, err = run('import', 'cell.csv', '--out', 'out.csv')
+    assert status == 1
+    assert 'cell.csv has no joint values: name their columns' in err
 
 
-def test_axes_called_like_accelerations_are_none(tmp_path):
-    text = text_of(JOINTS, PLACES, names=['A1', 'A2', 'x', 'y', 'z'])
-    path, out = tmp_path / 'cell.csv', tmp_path / 'out.csv'
-    path.write_text(text)
-    assert main(['import', str(path), '--columns', 'q*=A*', '--out', str(out)]) == 0
-    assert out.read_text().splitlines()[0] == 'q1,q2,x,y,z'
+def test_axes_called_like_accelerations_are_none(run, tmp_path):
+    (tmp_path / 'cell.csv').write_text(PLAIN.replace('q', 'A'))
+    assert run('import', 'cell.csv', '--columns', 'q*=A*', '--out', 'out.csv')[0] == 0
+    assert (tmp_path / 'out.csv').read_text().splitlines()[0] == 'q1,q2,x,y,z'
 
 
 @pytest.mark.parametrize(
@@ -393,12 +381,9 @@ def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, name
 def test_workbooks(tmp_path):
     openpyxl = pytest.importorskip('openpyxl')
     book = openpyxl.Workbook()
-    book.active.title = 'first'
+    book.active.title, units = 'first', ['rad', 'rad', 'm', 'm', 'm']
     sheet = book.create_sheet('measured')
-    sheet.append(['a title'])
-    sheet.append(['q1', 'q2', 'x', 'y', 'z'])
-    sheet.append(['rad', 'rad', 'm', 'm', 'm'])
-    for row in np.column_stack([JOINTS, PLACES]).tolist():
+    for row in (['a title'], NAMES, units, *np.column_stack([JOINTS, PLACES]).tolist()):
         sheet.append(row)
     path = tmp_path / 'cell.xlsx'
     book.save(path)
@@ -406,7 +391,7 @@ def test_workbooks(tmp_path):
     with pytest.raises(InputError, match='no sheet "other"; it has first, measured'):
         read_table(path, 2, foreign=Foreign(Layout(sheet='other')))
     other = book.create_sheet('later')
-    other.append(['q1', 'q2', 'x', 'y', 'z'])
+    other.append(NAMES)
     book['first'].sheet_state = 'hidden'
     book.save(path)
     found = read_table(path, 2, foreign=Foreign(Layout()))
@@ -423,14 +408,13 @@ def test_workbooks(tmp_path):
         read_table(path, 2, foreign=Foreign(Layout()))
 
 
-def test_columns_of_joints_are_those_of_their_log(tmp_path, capsys):
+def test_columns_of_joints_are_those_of_their_log(run, tmp_path):
     """They were ignored, and the other table was blamed."""
     (tmp_path / 'log.csv').write_text(text_of(JOINTS, names=['J1', 'J2']))
     (tmp_path / 'table.csv').write_text(text_of(PLACES, names=['x', 'y', 'z']))
-    files = [str(tmp_path / name) for name in ('table.csv', 'log.csv', 'out.csv')]
-    given = ['import', files[0], '--joints', files[1], '--out', files[2]]
-    assert main(given) == 1
-    told = f'{files[1]} has no column q1; it has J1, J2: give --columns "q*=J*"'
-    assert told in capsys.readouterr().err
-    assert main([*given, '--columns', 'q*=J*']) == 0
+    given = ('import', 'table.csv', '--joints', 'log.csv', '--out', 'out.csv')
+    status, _, err = run(*given)
+    assert status == 1
+    assert 'log.csv has no column q1; it has J1, J2: give --columns "q*=J*"' in err
+    assert run(*given, '--columns', 'q*=J*')[0] == 0
     assert_same(read_table(tmp_path / 'out.csv', 2), None)

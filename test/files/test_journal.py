@@ -127,21 +127,6 @@ def test_a_row_written_twice_is_refused(tmp_path):
         read_journal(tmp_path / 'cell.csv', JOINTS)
 
 
-def test_what_was_taken_back_is_left_out_and_can_be_taken_again(tmp_path):
-    journal = Journal(tmp_path / 'cell.csv', JOINTS)
-    for number in (1, 2, 3):
-        journal.add(plain(number))
-    journal.add(plain(3), removed=True)
-    journal.add(plain(2), removed=True)
-    journal.add(plain(2, count=7))
-    journal.close()
-    found, _ = read_journal(tmp_path / 'cell.csv', JOINTS)
-    assert [(each.stamp_ns, each.count) for each in found] == [(1, 1), (2, 7)]
-    table = read_table(tmp_path / 'cell.csv', JOINTS)
-    assert table.fitted[0].stamps_ns.tolist() == [1, 2]
-    assert len((tmp_path / 'cell.csv').read_text().splitlines()) == 7
-
-
 @pytest.mark.parametrize('device', ['ball', 'a,b'])
 def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
     """By parts, which are not seen: what is taken back, repeated, damaged or cut off is found."""
@@ -164,11 +149,10 @@ def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
     written(path, [many[0]])
     with pytest.raises(InputError, match='line 33: stamp_ns 1 already exists'):
         read_journal(path, JOINTS)
-    for damage, said in ((b'x,' * 40, 'line 34'), (bytes(2000), 'line 34 is incomplete')):
-        copy = tmp_path / 'copy.csv'
-        copy.write_bytes(path.read_bytes() + damage + b'\n' * (damage[:1] == b'x'))
-        with pytest.raises(InputError, match=said):
-            read_journal(copy, JOINTS)
+    with path.open('ab') as file:
+        file.write(bytes(2000))
+    with pytest.raises(InputError, match='line 34 is incomplete'):
+        read_journal(path, JOINTS)
 
 
 @pytest.mark.parametrize('sessions', [('b', 'a'), ('a',)])
@@ -268,25 +252,3 @@ def test_each_row_is_written_by_one_call_and_at_once(tmp_path, monkeypatch):
     assert b''.join(calls) == (tmp_path / 'cell.csv').read_bytes()
     assert [data.count(b'\n') for data in calls] == [1, 1, 1]  # the header's, too
     assert all(data.endswith(b'\n') for data in calls)
-
-
-@pytest.mark.parametrize('room', [0, 1, 50])
-def test_a_full_disk_leaves_no_half_row(tmp_path, monkeypatch, room):
-    journal = Journal(tmp_path / 'cell.csv', JOINTS)
-    journal.add(plain(1))
-    write = os.write
-
-    def part(file, data):
-        if room == 0:
-            raise OSError(28, 'No space left on device')
-        return write(file, data[:room])
-
-    monkeypatch.setattr(os, 'write', part)
-    with pytest.raises(OSError, match=r'disk is full|No space left'):
-        journal.add(plain(2))
-    monkeypatch.setattr(os, 'write', write)
-    journal.add(plain(3))
-    journal.close()
-    found, warnings = read_journal(tmp_path / 'cell.csv', JOINTS)
-    assert [each.stamp_ns for each in found] == [1, 3]
-    assert warnings == ()

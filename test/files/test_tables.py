@@ -56,16 +56,6 @@ def test_positions_without_orientation(read):
     assert len(held_out) == 0
 
 
-def test_poses_and_columns_that_are_not_known(read):
-    fitted, _ = read(POSES)
-    np.testing.assert_array_equal(fitted.positions, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_array_equal(fitted.rotations[0], np.eye(3))
-    np.testing.assert_allclose(
-        fitted.rotations[1], [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-15
-    )
-    assert fitted.oriented.tolist() == [True, True]
-
-
 def test_columns_in_any_order_with_byte_order_mark_and_windows_lines(read):
     text = '\ufeffz,y,x,q2,q1\r\n3,2,1,0.2,0.1\r\n\r\n'
     fitted, _ = read(text)
@@ -206,6 +196,25 @@ KINDS = {
     + '\n1,2,3,4,5,,,,,2,0,0,0,0,0,2,0,0,0,0,2,0,0,0,0,0,0,0,0,0'
     + '\n1,2,3,4,5,,,,' + ',0' * 21 + '\n',
 }  # fmt: skip
+
+
+def test_rows_of_several_kinds_are_sets_between_frames_of_their_own(tmp_path):
+    """Positions, a distance and a pose in a camera on the flange, and one pose held out."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(KINDS['mixed'])
+    table = read_table(path, 2)
+    points, wire, camera, judge = found = (*table.fitted, *table.held_out)
+    assert [(each.base, each.tool, each.joints[:, 0].tolist()) for each in found] == [
+        ('base', 'tool', [1, 5]),
+        ('base_distance', 'tool_a', [3]),
+        ('base_a', 'tool_cam', [4]),
+        ('base', 'tool_a', [2]),
+    ]
+    assert (points.positions[:, 0].tolist(), points.oriented.any()) == ([1, 5], False)
+    assert wire.distances.tolist() == [7.5]
+    assert (camera.positions[:, 0].tolist(), camera.inverse) == ([-4], True)
+    assert judge.oriented.all()
+    assert [each.distances for each in (points, camera, judge)] == [None] * 3
 
 
 @pytest.mark.parametrize('kind', KINDS)

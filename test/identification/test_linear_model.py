@@ -16,6 +16,7 @@ from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.identification import linear_model
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.kinematics import effects
+from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import quiet
 
 NAMES = (
@@ -76,14 +77,14 @@ def groups_of(sets):
     return number, (number % 5, np.array([block[k] for k in number.tolist()]))
 
 
-def left_out(told, sets, dealing, names, sizes):
+def left_out(told, sets, dealing, names, sizes, noise=NOISE):
     """Return position errors (N, 3) [m] of fits to the samples of the other folds."""
     system = told.system(sets)
     chain = told.model.with_effects([n for n in names if n not in NAMES])
     rows = system.rows_of(chain, names)
     whole, owner = stacked(rows), owners(rows)
     fold = groups_of(sets)[1][dealing][owner]
-    prior = np.diag([NOISE / sizes[n] if n in sizes else 0.0 for n in names])
+    prior = np.diag([noise / sizes[n] if n in sizes else 0.0 for n in names])
     left = np.zeros(len(whole))
     for k in range(5):
         used = np.vstack([whole[fold != k, :-1], prior])
@@ -114,6 +115,16 @@ def test_what_is_left_out_is_predicted_by_fits_to_the_rest(model):
             expected = left_out(told, sets, dealing, [*NAMES, *chosen, *new], sizes)
             found = linear._left_out(dealing, chosen, new, size)
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def test_what_is_left_with_chosen_effects_is_the_noise_from_then_on(model):
+    """Priors of the arm and of effects are weighed against it."""
+    told, sets, linear = model
+    linear._left_out(0, FIRST)
+    linear.quieten(Verdict('', 1.0, 0.25, True))
+    sizes = {'elbow_joint.a': 3e-5, **dict.fromkeys(FIRST, 5e-4)}
+    expected = left_out(told, sets, 0, [*NAMES, *FIRST], sizes, NOISE / 4.0)
+    np.testing.assert_allclose(linear._left_out(0, FIRST), expected, rtol=0, atol=1e-9)
 
 
 def test_verdicts_are_of_the_errors_left_out(model, monkeypatch):
@@ -172,10 +183,10 @@ def test_residuals_moved_in_time_are_explained_as_by_columns_made_at_once(model)
         usual = {'elbow_joint.a': 3e-5, **dict.fromkeys((*FIRST, *SECOND), 5e-4)}
         usual |= dict.fromkeys((*waves, 'elbow_joint.ratio'), 5e-4)
         inverse = np.array([NOISE / usual[n] if n in usual else 0.0 for n in names])
-        columns = shifts.columns([[each[:-1] for each in rows]], inverse)
+        columns = shifts.columns([[each[:-1] for each in rows]])
         count = len(NAMES) + len(chosen)
         expected = shifts.shares(
-            columns, range(count), [[count, count + 1], [count + 2, count + 3]]
+            columns, inverse, range(count), [[count, count + 1], [count + 2, count + 3]]
         )
         found = linear._shares(chosen, groups, steps.append)
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-9)

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, rms
+from measured import rows_of, write_csv
 from robots import DATA, needs_data
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.cli.main import main
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Explanation
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
@@ -245,21 +245,16 @@ def test_what_is_needed_is_asked_for(earlier):
     assert years_since({'created': '2020-01-01T00:00:00+00:00'}) > 5.0
 
 
-def test_the_command_writes_the_calibration_brought_up_to_date(earlier, tmp_path, capsys):
-    from calib_ros.kinematics.se3 import to_quat
-
+def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp_path):
     true, previous = earlier
     (tmp_path / 'earlier.yaml').write_text(previous.dump())
     seen = problem(true.with_offsets({'elbow_joint.theta': 5e-4}), 8, 1).observations
-    rows = np.column_stack([seen.joints, seen.positions, to_quat(seen.rotations)])
-    heads = [*(f'q{k + 1}' for k in range(6)), *'xyz', 'qx', 'qy', 'qz', 'qw']
-    text = '\n'.join([','.join(heads), *(','.join(map(repr, row)) for row in rows.tolist())])
-    (tmp_path / 'few.csv').write_text(text + '\n')
-    given = ['identify', str(tmp_path / 'few.csv'), '--chain', 'ur10e', '--out']
-    given += [str(tmp_path / 'out'), '--previous', str(tmp_path / 'earlier.yaml')]
-    given += ['--sigma-position', '5e-5', '--sigma-orientation', '2e-4']
-    assert main(given) == 0
-    assert 'elbow_joint.theta by +0.' in capsys.readouterr().out
+    write_csv(tmp_path / 'few.csv', rows_of(seen, 0))
+    given = ['identify', 'few.csv', '--chain', 'ur10e']
+    given += ['--sigma-position', '5e-5', '--sigma-orientation', '2e-4', '--previous']
+    status, said, _ = run(*given, 'earlier.yaml', '--out', 'out')
+    assert status == 0
+    assert 'elbow_joint.theta by +0.' in said
     document = json.loads((tmp_path / 'out' / 'result.json').read_text())
     assert document['changed'][0][0]['owner'] == 'elbow_joint'
     text = (tmp_path / 'out' / 'calibration.yaml').read_text()
@@ -269,13 +264,12 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, tmp_path
     assert read.chain.value('elbow_joint.theta') == pytest.approx(
         previous.chain.value('elbow_joint.theta') + 5e-4, abs=1e-4
     )
-    given[-7:-4] = [str(tmp_path / 'again'), '--previous', str(tmp_path / 'out')]
-    assert main(given) == 3
-    said = ' '.join(capsys.readouterr().out.split())
-    assert 'these are measurements to which the calibration was fitted' in said
+    status, said, _ = run(*given, 'out', '--out', 'again')
+    assert status == 3
+    assert 'these are measurements to which the calibration was fitted' in ' '.join(said.split())
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
-    given[-7] = str(tmp_path / 'out')  # over what it brings up to date
-    assert main([*given, '--force']) == 3
+    # over what it brings up to date
+    assert run(*given, 'out', '--out', 'out', '--force')[0] == 3
     assert (tmp_path / 'out' / 'calibration.previous.yaml').read_text() == text
 
 

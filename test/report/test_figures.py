@@ -112,8 +112,12 @@ def test_harmonics_of_gears_are_drawn_and_counted_but_not_listed():
 def test_joints_without_limits_are_not_given_any(rng):
     free = replace(UR10E.joints[0], lower=None, upper=None)
     chain = replace(UR10E, joints=(free, *UR10E.joints[1:]))
-    _, rows = coverage(chain, chain.random_joints(50, rng))
-    assert [row[1] for row in rows[:2]] == ['no limits', '-360 to 360 °']
+    joints = chain.random_joints(50, rng)
+    _, rows = coverage(chain, joints)
+    assert [row[1] for row in rows[:2]] == ['-180 to 180 ° (no limits)', '-360 to 360 °']
+    joints[:, 0] += 2.0  # a turn from where it was measured, not what is between both ranges
+    low = np.degrees(joints[:, 0].min())
+    assert coverage(chain, joints)[1][0][1] == f'{low:.0f} to {low + 360.0:.0f} ° (no limits)'
 
 
 @pytest.mark.parametrize('count', [1, 5, 30, 3001])

@@ -6,14 +6,12 @@ import json
 
 import numpy as np
 import pytest
+from measured import write_images, write_places
 from pages import Page
 
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, photograph
-from calib_ros.cli.main import main
 from calib_ros.cli.options import Status
-from calib_ros.files.programs import csv_of
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.texts import csv_text, dump_yaml
 
 UR, CAMERA = load_chain('ur10e'), Camera()
 POINTS = np.array([(0.03 * i, 0.03 * j, 0.0) for j in range(1, 5) for i in range(1, 7)])
@@ -26,33 +24,22 @@ def photographs(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp('camera'), np.random.default_rng(5)
     true = before_camera(faulty(UR, Cell(), rng), CAMERA, POINTS, True, rng)
     seen = photograph(true, CAMERA, POINTS, True, 30, rng, noise=0.1)
-    board = {'type': 'charuco', 'columns': 7, 'rows': 5, 'square': 0.03, 'marker': 0.022}
-    (folder / 'board.yaml').write_text(dump_yaml(board | {'dictionary': 'DICT_5X5_250'}))
-    fx, fy, cx, cy, *bent = CAMERA.lens.values.values()
-    lens = {'k': [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], 'd': bent}
-    (folder / 'camera.yaml').write_text(dump_yaml(lens))
-    pairs = zip(seen.images.tolist(), seen.pixels.tolist(), strict=True)
-    rows = [(f'{image}.png', n % len(POINTS), u, v) for n, (image, (u, v)) in enumerate(pairs)]
-    (folder / 'corners.csv').write_text(csv_text([('image', 'corner', 'u', 'v'), *rows]))
-    names = [f'{image}.png' for image in range(30)]
+    write_images(folder, seen, CAMERA.lens, 0.03)
     joints = seen.joints[:: len(POINTS)].copy()
-    for name in ('places', 'slipped'):
-        table = csv_of([f'q{k}' for k in range(1, 7)], joints).splitlines()
-        lines = [f'{a},{b}' for a, b in zip(['image', *names], table, strict=True)]
-        (folder / f'{name}.csv').write_text('\n'.join(lines))
-        joints[SLIPPED:, 2] += 3e-3
+    joints[SLIPPED:, 2] += 3e-3
+    write_places(folder / 'slipped.csv', joints)
     return folder
 
 
 @pytest.fixture
-def identified(photographs, monkeypatch, tmp_path, capsys):
+def identified(photographs, run, monkeypatch, tmp_path):
     monkeypatch.chdir(photographs)
 
     def identified(places):
         words = ['identify', '--chain', 'ur10e', '--eye-in-hand', '--sigma-pixel', '0.1']
         words += ['--detections', 'corners.csv', '--board', 'board.yaml', '--places', places]
-        status = main([*words, '--intrinsics', 'camera.yaml', '--out', str(tmp_path / 'out')])
-        return status, ' '.join(capsys.readouterr().out.split()), tmp_path / 'out'
+        status, out, _ = run(*words, '--intrinsics', 'camera.yaml', '--out', tmp_path / 'out')
+        return status, ' '.join(out.split()), tmp_path / 'out'
 
     return identified
 

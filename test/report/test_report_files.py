@@ -11,10 +11,11 @@ import pytest
 from measured import UR, measured, rows_of, write_csv
 from pages import Page
 
-from calib_ros.cli.main import main
 from calib_ros.files.export import exports
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+
+IDENTIFY = ('identify', 'cell.csv', '--chain', 'ur5e')
 
 
 def test_exported_files_carry_the_hash_of_the_table(solved):
@@ -27,12 +28,12 @@ def test_exported_files_carry_the_hash_of_the_table(solved):
         assert digest in each.content, each.name
 
 
-def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
+def test_identify_writes_what_it_was_told(table, run, tmp_path):
+    told = ('--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012')
+    status, said, _ = run(*IDENTIFY, *told, '--out', 'out', '--tolerance', 5, '--pdf')
+    assert status == 0
+    assert 'arm gets better, and within the tolerance of 5 mm' in said
     out = tmp_path / 'out'
-    told = ['--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012']
-    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), *told]
-    assert main([*arguments, '--tolerance', '5', '--pdf']) == 0
-    assert 'arm gets better, and within the tolerance of 5 mm' in capsys.readouterr().out
     content = (out / 'report.pdf').read_bytes()
     assert content.startswith(b'%PDF')
     assert len(content) < 2e6
@@ -51,41 +52,37 @@ def test_identify_writes_what_it_was_told(table, tmp_path, capsys):
     )
 
 
-def test_without_its_extra_the_other_files_are_written(table, tmp_path, capsys, monkeypatch):
+@pytest.mark.usefixtures('table')
+def test_without_its_extra_the_other_files_are_written(run, tmp_path, monkeypatch):
     for name in ('jinja2', 'weasyprint'):
         monkeypatch.setitem(sys.modules, name, None)
-    out = tmp_path / 'out'
-    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', '--out', str(out), '--pdf']
-    assert main(arguments) == 0
-    told, said = capsys.readouterr()
-    assert told.endswith(f'wrote {out}\n')  # nothing to open
+    status, told, said = run(*IDENTIFY, '--out', 'out', '--pdf')
+    assert status == 0
+    assert told.endswith('wrote out\n')  # nothing to open
     assert said.count('\n') == 2
     assert 'calib_ros[report]' in said
     assert 'calib_ros[pdf]' in said
-    names = {path.name for path in out.iterdir()}
+    names = {path.name for path in (tmp_path / 'out').iterdir()}
     assert not {'report.html', 'report.pdf'} & names
     assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
 
 
+@pytest.mark.usefixtures('table')
 @pytest.mark.parametrize('wrong', ['0', '-1', 'nan', 'inf'])
-def test_a_tolerance_that_makes_no_sense_is_refused(table, capsys, wrong):
-    arguments = ['identify', '--csv', str(table), '--chain', 'ur5e', f'--tolerance={wrong}']
-    assert main(arguments) == 1
-    assert '--tolerance must be positive' in capsys.readouterr().err
+def test_a_tolerance_that_makes_no_sense_is_refused(run, wrong):
+    status, _, err = run(*IDENTIFY, f'--tolerance={wrong}')
+    assert status == 1
+    assert '--tolerance must be positive' in err
 
 
-def test_the_other_commands_write_their_pages(solved, tmp_path):
-    out = tmp_path / 'out'
-    out.mkdir()
-    (out / 'calibration.yaml').write_text(Calibration.of(solved[1]).dump())
-    new = write_csv(tmp_path / 'new.csv', rows_of(measured(seed=8, count=12), held_out=0))
-    verified, planned = tmp_path / 'verified', tmp_path / 'plan.csv'
-    judged = ['--calibration', str(out), '--tolerance', '1', '--out', str(verified)]
-    assert main(['verify', str(new), '--chain', 'ur5e', *judged]) == 0
-    assert 'PASS' in Page((verified / 'report.html').read_text()).text
-    assert (verified / 'residuals.csv').read_text().count('\n') == 13
-    arguments = ['plan', '--chain', 'ur5e', '--poses', '12', '--draw', '60', '--out', str(planned)]
-    assert main(arguments) == 0
-    page = Page((tmp_path / 'plan.report.html').read_text())
-    assert 'Test poses' in page.text
-    assert main(arguments) == 1
+def test_the_other_commands_write_their_pages(solved, run, tmp_path):
+    (tmp_path / 'calibration.yaml').write_text(Calibration.of(solved[1]).dump())
+    write_csv(tmp_path / 'new.csv', rows_of(measured(seed=8, count=12), held_out=0))
+    judged = ('--calibration', 'calibration.yaml', '--tolerance', 1, '--out', 'verified')
+    assert run('verify', 'new.csv', '--chain', 'ur5e', *judged)[0] == 0
+    assert 'PASS' in Page((tmp_path / 'verified' / 'report.html').read_text()).text
+    assert (tmp_path / 'verified' / 'residuals.csv').read_text().count('\n') == 13
+    planned = ('plan', '--chain', 'ur5e', '--poses', 12, '--draw', 60, '--out', 'plan.csv')
+    assert run(*planned)[0] == 0
+    assert 'Poses to measure' in Page((tmp_path / 'plan.report.html').read_text()).text
+    assert run(*planned)[0] == 1

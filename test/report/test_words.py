@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
 from datetime import datetime, timezone
 
 import numpy as np
@@ -60,6 +61,9 @@ def test_a_held_out_gross_error_is_counted_where_the_figures_are():
     count = result.validation.figures[1].count
     said = f'{count + 1} held-out poses, 1 of them an outlier not in the figures'
     assert result.validated_by == said
+    problem.sets[0].positions[3] += 0.02
+    folded = identify(replace(problem, held_out=None))
+    assert folded.validated_by.endswith(' poses, 1 of them an outlier not in the figures')
 
 
 def test_the_error_told_is_the_one_within_its_limits():
@@ -71,6 +75,8 @@ def test_the_error_told_is_the_one_within_its_limits():
     assert found.rms > 1.02e-3 * found.comparison.figures[1].rms_mm
     said = 'over poses like these is '
     assert f'{said}{1e3 * found.rms:.4f} mm' in in_words(found)
+    row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
+    assert row.rms_mm == pytest.approx(1e3 * found.rms)
     poses = poses_to_verify(arm, [seen], found.comparison)
     report = verification_report(arm, found, poses, Origin())
     assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]

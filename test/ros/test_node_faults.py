@@ -207,3 +207,15 @@ def test_what_comes_out_after_the_end_is_no_error(tmp_path, capfd):
         node = cell.node
     node._boundary.guarded(node._status.publish)(String())
     assert 'internal error' not in capfd.readouterr().err
+
+
+def test_heavy_losses_are_refused_as_in_a_bag_unless_they_are_allowed(cell, recording):
+    """The node warned and published what `identify` of the same messages refused."""
+    given = topics(recording)
+    for message in given['measured_pose'][::4]:
+        message.header.stamp = Time()
+    cell.play(given)
+    words = '25% of the measurements were dropped (stamps or full buffers), accept the rest with'
+    assert words in cell.in_full(cell.refused('identify'))
+    assert cell.set_parameters({'largest_loss': 0.26})[0].successful
+    cell.done('identify')

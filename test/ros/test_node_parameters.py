@@ -19,7 +19,14 @@ from calib_ros.ros import node as node_module
 from calib_ros.ros.arguments import PARAMETERS, typed
 from calib_ros.settings import STARTUP, Settings
 
-FREE = ('target_filename', 'calibration_filename', 'socket', 'marker_scale', 'use_sim_time')
+FREE = (
+    'target_filename',
+    'calibration_filename',
+    'socket',
+    'largest_loss',
+    'marker_scale',
+    'use_sim_time',
+)
 SHIPPED = Path(__file__).parents[2] / 'config' / 'calibration_node.yaml'
 
 

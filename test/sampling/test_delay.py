@@ -224,12 +224,6 @@ def test_find_delay_names_none_where_none_shows(rng):
     assert find_delay(*nothing) is None
 
 
-def test_find_delay_goes_by_positions_where_there_are_no_orientations(rng):
-    _, motion, _ = true_cell(3)
-    *arguments, _ = speeds(0.123, 30.0, rng, motion)
-    assert find_delay(*arguments, None).seconds == pytest.approx(0.123, abs=3e-2)
-
-
 def test_a_far_stamp_costs_no_time_and_no_memory(rng, monkeypatch):
     """Of one in both streams the speeds would be looked at every 5 ms up to it."""
     _, motion, _ = true_cell(3)

@@ -247,15 +247,6 @@ def test_samples_that_were_fitted_are_known_again():
     assert 'these are measurements to which the calibration was fitted' in words
 
 
-def test_a_bumped_robot_is_noticed():
-    made = session(samples())
-    made.identify()
-    bumped = TRUE.with_offsets({'elbow_joint.theta': 3e-3})
-    drive(made, 8, [tracker(bumped)])
-    now, _ = made.validate()
-    assert now.rms_mm > 0.5
-
-
 def test_what_was_there_before_does_not_judge():
     """Neither samples before the calibration, nor those of an earlier session."""
     made = session(samples(30))
@@ -269,7 +260,9 @@ def test_what_was_there_before_does_not_judge():
 def test_the_calibration_of_another_robot_is_refused():
     made = session(samples())
     panda = load_chain('franka_panda')
-    with pytest.raises(InputError, match='panda_joint7, the robot has shoulder_pan_joint, sh'):
+    with pytest.raises(
+        InputError, match=r'panda_joint7 \(revolute\); the robot has shoulder_pan_joint'
+    ):
         made.adopt(Calibration(panda, panda))
     assert made.calibration is None
 

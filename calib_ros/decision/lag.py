@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses measured before the target had come to rest: each lies towards the stop before.
+
+A device that smooths, late stamps or a creeping arm shows joint values q_i - w (q_i - q_i-1): a
+delay w with the last move as velocity. The arm imitates what depends on q_i alone, and may become
+worse; the rest is most of the residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.result import Identification
+from calib_ros.decision.steps import EXPLAINED
+from calib_ros.decision.suspicions import explained, imitated
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.parameter import DELAY, Parameter
+
+
+def remarked(problem: Problem, result: Identification) -> Identification:
+    """Return the result with the lag that explains most of its residuals, refused if it harms."""
+    known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
+    first, *more = map(_with_moves, problem.sets)
+    stands = all(
+        each.velocity is None and each.pixels is None and not each.socket and not each.plane
+        for each in problem.sets
+    )
+    if result.noise.position <= 1.0 or known or not stands or not first.moving:
+        return result
+    late = replace(problem, observations=first, more=more, held_out=())
+    chain, bases = result.chain, {each.base for each in late.sets if each.moving}
+    for name in bases:
+        chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
+    delays = [Parameter(name, DELAY) for name in sorted(bases)]
+    share = explained(late, chain, result.names, delays)
+    if share < EXPLAINED:
+        return result
+    text = (
+        f'each pose lies towards the stop before, which explains {100.0 * share:.0f} % of what is '
+        'left: the device smooths, stamps are late, or the arm creeps. Set settle to the time '
+        'until measurements rest, and stop for longer'
+    )
+    if imitated(late, result):
+        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
+    return replace(result, remarks=(*result.remarks, text))
+
+
+def _with_moves(each: Observations) -> Observations:
+    """Return poses with the way from the stop before (N, n) as velocity."""
+    order = np.argsort(each.stamps_ns, kind='stable')
+    moves = np.zeros_like(each.joints)
+    moves[order[1:]] = np.diff(each.joints[order], axis=0)
+    return replace(each, velocity=moves, delay=np.zeros(len(each)))
