@@ -121,10 +121,6 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     """
     import yaml
 
-    if len(text) > LARGEST_TEXT:
-        raise error(
-            f'{where} is larger than {LARGEST_TEXT // 1_000_000} MB: is it the right file?'
-        )
     try:
         _weigh(yaml.parse(text, _loader()), where, error)
         documents = [each for each in yaml.load_all(text, _loader()) if each is not None]

@@ -161,9 +161,7 @@ class _Cubes(NamedTuple):
 
 
 def iso_9283_poses(
-    design: Design,
-    rng: np.random.Generator,
-    visibility: Visibility | None = None,
+    design: Design, rng: np.random.Generator, visibility: Visibility | None = None
 ) -> TestPoses:
     """Return five poses to verify an arm in the largest cube found (ISO 9283:1998, 6.10.2).
 

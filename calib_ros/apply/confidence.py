@@ -107,11 +107,9 @@ four standard deviations."""
 class Drift:
     """Result of a chart of one robot: nights of `alarms`, and the night `since` which, for each.
 
-    `scores` (N,) are errors relative to earlier ones as normal variables, NaN in the first night
-    and in the first after an alarm; `sums` (N, 2) are shares of the heights of both charts.
+    `sums` (N, 2) are shares of the heights of both charts.
     """
 
-    scores: FloatArray
     sums: FloatArray
     alarms: tuple[int, ...]
     since: tuple[int, ...]
@@ -127,7 +125,7 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift
     if errors.shape != nus.shape or not (np.isfinite(errors) & (errors > 0.0) & (nus > 0.0)).all():
         raise InputError('errors and degrees of freedom of nights must be as many, and positive')
     limits = [limit(slope, len(SLOPES) * years * 365.25) for slope in SLOPES]
-    scores, shares = np.full(len(errors), np.nan), np.zeros((len(errors), len(SLOPES)))
+    shares = np.zeros((len(errors), len(SLOPES)))
     alarms, since = [], []
     squares = known = 0.0
     sums, starts = np.zeros(len(SLOPES)), np.zeros(len(SLOPES), dtype=int)
@@ -135,9 +133,8 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift
         if known:
             ratio = error**2 / (squares / known)
             chance = max(float(special.fdtrc(nu, known, ratio)), 1e-300)
-            scores[night] = -special.ndtri(chance)
             starts = np.where(sums > 0.0, starts, night)
-            sums = np.maximum(0.0, sums + scores[night] - np.array(SLOPES))
+            sums = np.maximum(0.0, sums - special.ndtri(chance) - np.array(SLOPES))
             shares[night] = sums / limits
             if (shares[night] > 1.0).any():
                 alarms.append(night)
@@ -145,7 +142,7 @@ def drift(rms: Sequence[float], freedom: Sequence[float], years: float) -> Drift
                 squares = known = 0.0
                 sums[:] = 0.0
         squares, known = squares + nu * error**2, known + nu
-    return Drift(scores, shares, tuple(alarms), tuple(since))
+    return Drift(shares, tuple(alarms), tuple(since))
 
 
 def run_length(slope: float, height: float) -> float:

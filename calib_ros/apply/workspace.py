@@ -92,13 +92,12 @@ class Spread:
 class Sector:
     """A part of the workspace in cylinder coordinates of the arm's base, and its RMS error [m].
 
-    `radius`, `height` [m] and `azimuth` [rad] from the x axis are its limits.
+    `radius` and `height` [m] are its limits.
     """
 
     words: str
     radius: tuple[float, float]
     height: tuple[float, float]
-    azimuth: tuple[float, float]
     poses: int
     rms: float
 
@@ -127,13 +126,11 @@ def regions(positions: FloatArray, errors: FloatArray) -> tuple[Sector, ...]:
         inside = (rings == ring) & (levels == level) & (sides == side)
         if inside.sum() < max(1, 0.005 * len(positions)):
             continue
-        middle = 0.5 * np.pi * side
         found.append(
             Sector(
                 f'{RADII[ring]}, {HEIGHTS[level]}, {SIDES[side]}',
                 (float(edges[0][ring]), float(edges[0][ring + 1])),
                 (float(edges[1][level]), float(edges[1][level + 1])),
-                (middle - 0.25 * np.pi, middle + 0.25 * np.pi),
                 int(inside.sum()),
                 float(np.sqrt(np.mean(errors[inside] ** 2))),
             )

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.decision.reasons import Reason, Rule
@@ -20,6 +19,7 @@ from calib_ros.decision.validation import COUNTS, Comparison, log_gain, mean_squ
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.se3 import Flags
 from calib_ros.shown import some
 
 
@@ -84,7 +84,7 @@ def _of_the_fit(
 
 
 def _gain(
-    validation: Comparison, part: str, which: NDArray[np.bool_], *confidence: float
+    validation: Comparison, part: str, which: Flags, *confidence: float
 ) -> tuple[float, float]:
     """Return the `log_gain` in `position` or `orientation` of pairs by a mask (N,)."""
     before, after = (getattr(each, part)[which] for each in (validation.before, validation.after))

@@ -26,7 +26,7 @@ from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index
 
 SLOW = SEVERAL
 """Cosines removed from a series at most, one per ten stops (benchmarks/drift.py)."""
@@ -119,7 +119,7 @@ class Shifts:
         return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
 
 
-def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) -> FloatArray:
+def _by_stop(values: FloatArray, begins: Index, weights: FloatArray) -> FloatArray:
     """Return sums over each stop (..., m c, n) of values (..., c, N) with weights (m, N)."""
     parts = [each * values for each in weights]
     if len(begins) < values.shape[-1]:
@@ -127,7 +127,7 @@ def _by_stop(values: FloatArray, begins: NDArray[np.intp], weights: FloatArray) 
     return np.asarray(np.concatenate(parts, axis=-2))
 
 
-def _weights(observations: Observations, begins: NDArray[np.intp]) -> FloatArray:
+def _weights(observations: Observations, begins: Index) -> FloatArray:
     """Return the weights (m, N) of the rows of each stop: the inverse root of their number.
 
     Pixels also get their image coordinates as weights, with mean square 1 in each stop: sums

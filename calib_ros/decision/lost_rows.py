@@ -14,13 +14,12 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
 SLIPS = (0, 1, -1, 2, -2)
@@ -95,7 +94,7 @@ def _frames(seen: Observations, framed: Framed) -> Iterator[Chain]:
             yield chain
 
 
-def _paired(seen: Observations, rows: NDArray[np.intp], shift: int) -> Observations:
+def _paired(seen: Observations, rows: Index, shift: int) -> Observations:
     """Return measurements of some rows with the joint values of `shift` rows below."""
     return replace(seen.select(rows), joints=seen.joints[rows + shift])
 
@@ -109,7 +108,7 @@ def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> Fl
     return found
 
 
-def _where(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> int:
+def _where(before: Flags, after: Flags) -> int:
     gain = before.astype(int) - after.astype(int)
     return int(np.argmax(np.concatenate([[0], np.cumsum(gain)])))
 

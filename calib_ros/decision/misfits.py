@@ -7,7 +7,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.decision.drift import chance
@@ -16,7 +15,8 @@ from calib_ros.estimation.levels import CERTAIN, FEW, SURE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, Robust
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.estimation.samples import residual_arrays
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
 
 LEAST_STOPS = SOME_POSES // 4
@@ -72,16 +72,26 @@ def arms_own(problem: Problem, robust: Robust) -> str | None:
 
 
 def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
-    """Return at how many configurations all of several targets are off, and its probability."""
+    """Return at how many configurations all of several targets are off, and its probability.
+
+    To one device, an arm's own errors move all targets alike; exchanged ones are off in opposite
+    directions.
+    """
     count = 1 + max(int(each.max()) for each in problem.configurations)
     targets = dict.fromkeys(each.tool for each in problem.sets)
     seen, off = np.zeros((2, len(targets), count))
+    away = np.zeros((len(targets), count, 3))
+    one = len({each.base for each in problem.sets}) == 1
     sets = zip(problem.sets, problem.configurations, robust.distances, strict=True)
     for each, numbers, far in sets:
         row = list(targets).index(each.tool)
         seen[row] += np.bincount(numbers, minlength=count)
         off[row] += np.bincount(numbers, far > OUTLIER, count)
-    present, wrong = seen > 0, off > 0.5 * seen
+        if one and each.distances is None and each.pixels is None:
+            errors, _ = residual_arrays(robust.fit.chain, each)
+            np.add.at(away[row], numbers[far > OUTLIER], errors[far > OUTLIER])
+    alike = (away.sum(axis=0) ** 2).sum(axis=1) >= (away**2).sum(axis=(0, 2))
+    present, wrong = seen > 0, (off > 0.5 * seen) & alike
     several = present.sum(axis=0) > 1
     both = several & (wrong == present).all(axis=0)
     rates = wrong.sum(axis=1) / np.maximum(present.sum(axis=1), 1)
@@ -90,9 +100,7 @@ def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
     return found, float(special.gammainc(found, expected)) if found else 1.0
 
 
-def _with_a_joint(
-    problem: Problem, joints: FloatArray, outliers: NDArray[np.bool_]
-) -> tuple[str, float]:
+def _with_a_joint(problem: Problem, joints: FloatArray, outliers: Flags) -> tuple[str, float]:
     """Return the joint whose values (N, n) best explain outliers (N,), and the chance of that."""
     number = stops(joints)
     begins = np.flatnonzero(np.diff(number, prepend=-1))

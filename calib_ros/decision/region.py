@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.decision.drift import inverse_root
@@ -32,7 +31,7 @@ from calib_ros.estimation.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.shown import Shown
 
 RISK = 0.02
@@ -71,7 +70,7 @@ class Region(Shown):
         model = ErrorModel(self.chain, self.names, self.base, self.tool)
         return sigma_of(model, self.square, joints, components)
 
-    def covers(self, joints: FloatArray) -> NDArray[np.bool_]:
+    def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""
         joints = self.chain.joint_values(joints)
         if np.isinf(self.limit):

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg
 
 from calib_ros.decision.changes import Information
@@ -24,7 +23,7 @@ from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import ROUNDED
 
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
@@ -71,7 +70,7 @@ def may_be_rounding(
     before: Chain,
     names: Sequence[str],
     steps: Mapping[str, float],
-    good: Sequence[NDArray[np.bool_]],
+    good: Sequence[Flags],
 ) -> bool:
     """Tell whether rounding of joint values explains the nominal residuals as well.
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.decision.drift import inverse_root, slow_cosines
 from calib_ros.decision.reasons import Reason, Rule
@@ -32,7 +31,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust, weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index
 
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
@@ -99,7 +98,7 @@ def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | 
     return None if found is None or scan.drifts(found) else scan.described(found)
 
 
-def _some_places(stops: int) -> NDArray[np.intp]:
+def _some_places(stops: int) -> Index:
     """Return stops for a coarse search: spaced by a tenth of those on the shorter side.
 
     A step between two of them is still explained to nine tenths.
@@ -189,7 +188,7 @@ class _Scan:
         last = after.min(initial=self._stops - LEAST_ASIDE)
         return self._best_of(np.arange(first, last + 1), EXPLAINED)
 
-    def _best_of(self, places: NDArray[np.intp], least: float) -> _Found | None:
+    def _best_of(self, places: Index, least: float) -> _Found | None:
         """Return the best step at some stops, if it explains that share of the squares."""
         products = self._to_the_end(places)
         own = products[:, :, [self._names.index(name) for name in self._added]]
@@ -228,7 +227,7 @@ class _Scan:
                 found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))
         return found
 
-    def _to_the_end(self, places: NDArray[np.intp]) -> FloatArray:
+    def _to_the_end(self, places: Index) -> FloatArray:
         """Return products (B, K, P + 1) of moved columns with all, from each stop to the end."""
         own = [self._names.index(name) for name in self._added]
         found = np.zeros((len(places), len(own), len(self._names) + 1))

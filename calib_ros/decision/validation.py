@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.estimation.configurations import distinct
@@ -23,7 +22,7 @@ from calib_ros.estimation.robust import OUTLIER, Robust, distances_of
 from calib_ros.estimation.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import FloatArray, Index, norms
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
 from calib_ros.shown import Shown, as_frame, of_them
 
 COUNTS = 0.005
@@ -32,7 +31,7 @@ COUNTS = 0.005
 
 @dataclass(frozen=True)
 class ErrorFigures:
-    """Figures of position errors over a set of poses, as in ISO 9283."""
+    """Figures of position errors over a set of poses."""
 
     count: int
     rms_mm: float
@@ -54,10 +53,10 @@ class Residuals:
 
     position: FloatArray
     orientation: FloatArray
-    configurations: NDArray[np.intp]
+    configurations: Index
     pixels: FloatArray
 
-    def figures(self, which: NDArray[np.bool_]) -> ErrorFigures:
+    def figures(self, which: Flags) -> ErrorFigures:
         """Return RMS, mean and maximum over the pairs of a mask (N,)."""
         parts = self.position, self.orientation, self.pixels
         distance, angle, away = (norms(part[which]) for part in parts)
@@ -85,16 +84,16 @@ class Comparison(Shown):
 
     before: Residuals
     after: Residuals
-    judged: NDArray[np.bool_]
-    repeated: NDArray[np.bool_] | None = None
+    judged: Flags
+    repeated: Flags | None = None
 
     @property
-    def counting(self) -> NDArray[np.bool_]:
+    def counting(self) -> Flags:
         """Return which pairs (N,) count, with outliers."""
         return np.ones_like(self.judged) if self.repeated is None else ~self.repeated
 
     @property
-    def deciding(self) -> NDArray[np.bool_]:
+    def deciding(self) -> Flags:
         """Return which pairs (N,) are in the figures."""
         return self.counting & self.judged
 
@@ -150,10 +149,7 @@ def residuals(chain: Chain, observations: Observations) -> Residuals:
 
 
 def compare(
-    before: Chain,
-    after: Chain,
-    sets: Sequence[Observations],
-    judged: NDArray[np.bool_] | None = None,
+    before: Chain, after: Chain, sets: Sequence[Observations], judged: Flags | None = None
 ) -> Comparison:
     """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
     numbers = np.concatenate(numbered(sets))
@@ -170,7 +166,7 @@ def validate(
     after: Chain,
     names: Sequence[str],
     robust: Robust,
-    explained: NDArray[np.bool_] | None = None,
+    explained: Flags | None = None,
 ) -> tuple[Comparison | None, str]:
     """Judge both chains on pairs that were not fitted.
 
@@ -196,7 +192,7 @@ def _of_held_out(
     comparison: Comparison,
     after: Chain,
     names: Sequence[str],
-    explained: NDArray[np.bool_] | None,
+    explained: Flags | None,
 ) -> tuple[Comparison, str]:
     if problem.loss != 'none':
         distances = distances_of(after, names, problem.system(problem.judging))
@@ -210,12 +206,7 @@ def _of_held_out(
 
 
 def _cross_validate(
-    problem: Problem,
-    before: Chain,
-    after: Chain,
-    names: Sequence[str],
-    robust: Robust,
-    note: str,
+    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust, note: str
 ) -> tuple[Comparison | None, str]:
     groups = problem.configurations
     count = distinct(np.concatenate(groups))
@@ -241,8 +232,8 @@ def _cross_validate(
 def left_out(
     chains: Iterable[tuple[Chain, Chain]],
     sets: Sequence[Observations],
-    groups: Sequence[NDArray[np.intp]],
-    folds: Sequence[NDArray[np.intp]],
+    groups: Sequence[Index],
+    folds: Sequence[Index],
 ) -> tuple[Residuals, Residuals]:
     """Return the residuals of every fold by its own two chains, before and after.
 
@@ -264,7 +255,7 @@ def left_out(
     return before, after
 
 
-def _repeated(problem: Problem) -> NDArray[np.bool_]:  # held-out pairs (N,)
+def _repeated(problem: Problem) -> Flags:  # held-out pairs (N,)
     if not problem.judging:
         return np.zeros(0, dtype=bool)
     numbers = numbered(problem.all_sets)
@@ -291,9 +282,7 @@ def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int
 
 
 def _joined(
-    pieces: Sequence[Residuals],
-    configurations: NDArray[np.intp],
-    index: NDArray[np.intp] | slice = slice(None),
+    pieces: Sequence[Residuals], configurations: Index, index: Index | slice = slice(None)
 ) -> Residuals:
     return Residuals(
         np.concatenate([piece.position for piece in pieces])[index],
@@ -369,10 +358,7 @@ def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -
 
 
 def log_gain(
-    before: FloatArray,
-    after: FloatArray,
-    configurations: NDArray[np.intp],
-    confidence: float = CONFIDENT,
+    before: FloatArray, after: FloatArray, configurations: Index, confidence: float = CONFIDENT
 ) -> tuple[float, float]:
     """Return the log of RMS before / RMS after, and its size that chance could cause.
 

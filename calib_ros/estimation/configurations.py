@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from calib_ros.estimation.levels import ALIKE, CLEARLY, TELLING
-from calib_ros.kinematics.se3 import FloatArray, cos_sin
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index, cos_sin
 from calib_ros.settings import Settings
 
 STILL = 2.0 * Settings.still
@@ -22,25 +22,25 @@ SCATTER = 0.02
 """Largest scatter [rad or m] of visits to one configuration (benchmarks/harm.py)."""
 
 
-def distinct(numbers: NDArray[np.intp]) -> int:
+def distinct(numbers: Index) -> int:
     """Return the number of different configurations in (N,)."""
     return int(np.count_nonzero(np.bincount(numbers)))
 
 
-def stops(joints: FloatArray) -> NDArray[np.intp]:
+def stops(joints: FloatArray) -> Index:
     """Return the stop number (N,) of consecutive joint values (N, n)."""
     moved = np.zeros(len(joints), dtype=np.intp)
     moved[1:] = ~_still(np.diff(joints, axis=0))
     return np.cumsum(moved)
 
 
-def _still(change: FloatArray) -> NDArray[np.bool_]:
+def _still(change: FloatArray) -> Flags:
     """Return which changes (N, n) of joint values are within STILL (N,), modulo a turn."""
     change = np.abs(change) % (2.0 * np.pi)
     return np.asarray(np.minimum(change, 2.0 * np.pi - change).max(axis=1) <= STILL)
 
 
-def configurations(joints: FloatArray) -> NDArray[np.intp]:
+def configurations(joints: FloatArray) -> Index:
     """Return the configuration number (N,) of joint values (N, n).
 
     Values within STILL of each other are one configuration, whenever they were taken: a program in
@@ -63,7 +63,7 @@ def configurations(joints: FloatArray) -> NDArray[np.intp]:
     return np.asarray(label[number], dtype=np.intp)
 
 
-def _repeats(place: FloatArray) -> NDArray[np.intp]:
+def _repeats(place: FloatArray) -> Index:
     """Return the configuration number (N,) of places (N, 2 n), where scattered visits are one.
 
     If the distances between nearest places have a gap of a factor of CLEARLY, those below it are
@@ -99,7 +99,7 @@ def _graph(
     return coo_array((lengths, ends), shape=(count, count))
 
 
-def _pairs(place: FloatArray, reach: float) -> NDArray[np.intp]:
+def _pairs(place: FloatArray, reach: float) -> Index:
     """Return the pairs (K, 2) of rows of (N, D) within reach of each other.
 
     Searched in a projection to three directions, which keeps all pairs: trees of more dimensions

@@ -177,12 +177,12 @@ def posterior_of(
     reduced = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
     alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
     vector = matrix @ offsets + reduced[:-1, -1]
+    also = ['scale'] if lengths else []
+    known = {**known, 'scale': sigma_scale} if sigma_scale else known
     groups = [None if n in known else group_of(chain, n) for n in every]
-    stds = [known.get(n, np.inf) for n in every]
-    if lengths:
-        groups.append(None if sigma_scale else 'scale')
-        stds.append(sigma_scale or np.inf)
-    evidence = Evidence(matrix, vector, np.array(stds) ** -2, groups, TYPICAL | {'scale': scale})
+    groups += [None if n in known else n for n in also]
+    given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2
+    evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
     beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
     size, slope = evidence.most_probable(beside_it)
     sought = evidence, matrix, vector, len(every), size, beside_it

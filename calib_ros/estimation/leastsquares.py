@@ -23,11 +23,11 @@ from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, Index
 from calib_ros.settings import EXACT, EXCEPTION, Settings
 from calib_ros.shown import Shown
 
-Folds: TypeAlias = Sequence[NDArray[np.intp]]
+Folds: TypeAlias = Sequence[Index]
 """Fold number (N,) of every sample, set by set."""
 STEP_TOLERANCE = 1e-6
 """Convergence: the RMS step of the predictions in sigma or, if larger, in RMS residuals. A
@@ -135,7 +135,7 @@ def gram(rows: FloatArray) -> FloatArray:
     return np.asarray(flat @ flat.T)
 
 
-def owners(rows: Sequence[FloatArray]) -> NDArray[np.intp]:
+def owners(rows: Sequence[FloatArray]) -> Index:
     """Return the sample number (R,), over all sets, of each row of `stacked`."""
     ends = np.cumsum([each.shape[2] for each in rows]).tolist()
     numbers = [np.arange(end - each.shape[2], end) for end, each in zip(ends, rows, strict=True)]

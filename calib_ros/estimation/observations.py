@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import configurations, stops
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import Shown
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
@@ -80,7 +80,7 @@ class Observations(Shown):
     joints: FloatArray
     positions: FloatArray
     rotations: FloatArray
-    oriented: NDArray[np.bool_]
+    oriented: Flags
     covariance: FloatArray | None = None
     approach: FloatArray | None = None
     distances: FloatArray | None = None
@@ -153,7 +153,7 @@ class Observations(Shown):
         joints: FloatArray,
         pixels: FloatArray,
         points: FloatArray,
-        images: NDArray[np.intp],
+        images: Index,
         on_flange: bool = False,
     ) -> Observations:
         """Make observations of board `points` (N, 3) [m] at `pixels` (N, 2).
@@ -276,7 +276,7 @@ class Observations(Shown):
         return self.tool if self.on_flange else self.base
 
     @cached_property
-    def images(self) -> NDArray[np.intp]:
+    def images(self) -> Index:
         """Return the image number (N,) of each row of pixels."""
         other = np.zeros(len(self), dtype=np.intp)
         other[1:] = np.diff(self.stamps_ns) != 0
@@ -284,12 +284,12 @@ class Observations(Shown):
         return np.cumsum(other)
 
     @cached_property
-    def configurations(self) -> NDArray[np.intp]:
+    def configurations(self) -> Index:
         """Return the configuration number (N,) of each pair."""
         return configurations(self.joints)
 
     @cached_property
-    def stops(self) -> NDArray[np.intp]:
+    def stops(self) -> Index:
         """Return the stop number (N,) of each pair, in sequence."""
         return stops(self.joints)
 
@@ -316,7 +316,7 @@ def _refuse_other_than_rotations(turns: FloatArray) -> None:
         )
 
 
-def numbered(sets: Sequence[Observations]) -> tuple[NDArray[np.intp], ...]:
+def numbered(sets: Sequence[Observations]) -> tuple[Index, ...]:
     """Return the configuration numbers (N,) of each set, counted over all sets."""
     if len(sets) == 1:
         return (sets[0].configurations,)

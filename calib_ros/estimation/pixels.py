@@ -17,7 +17,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.resection import image_products
@@ -27,7 +26,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.lens import View, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +40,8 @@ class _Images:
     """
 
     part: slice
-    begins: NDArray[np.intp]
-    owner: NDArray[np.intp]
+    begins: Index
+    owner: Index
     columns: FloatArray
     twist: FloatArray
     lens: list[int]
@@ -70,11 +69,7 @@ class PixelSamples(Samples):
         return 2
 
     def products(
-        self,
-        chain: Chain,
-        names: Sequence[str],
-        count: int = 1,
-        folds: NDArray[np.intp] | None = None,
+        self, chain: Chain, names: Sequence[str], count: int = 1, folds: Index | None = None
     ) -> FloatArray:
         """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
         size = len(names)
@@ -124,7 +119,7 @@ class PixelSamples(Samples):
         pixels, _ = seen_residuals(chain, self.observations)
         return self.in_sigma(pixels, np.full((self.count, 3), np.nan))
 
-    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
+    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, Index | slice]]:
         """Yield the residuals (M, 2) of all points, then the shared ones of all images.
 
         Points beyond INNER times the usual residual of their image count as much as that.

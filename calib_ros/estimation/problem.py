@@ -11,7 +11,6 @@ from functools import cached_property
 from numbers import Integral, Real
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation import identifiability
@@ -23,7 +22,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Parameter, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 
@@ -225,7 +224,7 @@ class Problem(Shown):
         return (*self.sets, *self.judging)
 
     @cached_property
-    def configurations(self) -> tuple[NDArray[np.intp], ...]:
+    def configurations(self) -> tuple[Index, ...]:
         """Return the configuration numbers (N,) of each set to fit, counted over all sets."""
         return numbered(self.sets)
 

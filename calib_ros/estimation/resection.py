@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import DEGENERATE
@@ -22,7 +21,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens, View, view
 from calib_ros.kinematics.newton import Normal, minimise
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 
 
 def board_poses(observations: Observations, lens: Lens) -> Observations:
@@ -51,7 +50,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     return seen.inverted() if observations.on_flange else seen
 
 
-def _per_image(rows: FloatArray, index: NDArray[np.intp]) -> FloatArray:
+def _per_image(rows: FloatArray, index: Index) -> FloatArray:
     """Return the means (M, ...) of rows (N, ...) over each image."""
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     counts = np.diff(begins, append=len(index)).reshape(-1, *[1] * (rows.ndim - 1))
@@ -86,15 +85,13 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
     return np.asarray(np.linalg.inv(image_products(rows, begins)))
 
 
-def _seen(lens: Lens, poses: FloatArray, index: NDArray[np.intp], points: FloatArray) -> View:
+def _seen(lens: Lens, poses: FloatArray, index: Index, points: FloatArray) -> View:
     """Return the view of points (3, C) at board poses (M, 4, 4)."""
     axes, origin = poses[:, :3, :3].transpose(2, 1, 0), poses[:, :3, 3].T
     return view(lens, axes, origin, index, points, False)
 
 
-def image_products(
-    rows: FloatArray, begins: NDArray[np.intp], first: int | None = None
-) -> FloatArray:
+def image_products(rows: FloatArray, begins: Index, first: int | None = None) -> FloatArray:
     """Return products (M, F, S) of the first F rows (S, 2, C) with all, image by image."""
     size, _, count = rows.shape
     points = np.diff(begins, append=count)
@@ -136,7 +133,7 @@ def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArr
     return poses @ se3.invert(board), np.minimum(rms, others)
 
 
-def _determine_a_pose(observations: Observations, index: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _determine_a_pose(observations: Observations, index: Index) -> Flags:
     """Return which images (M,) show enough points, not in line on board or image."""
     assert observations.points is not None
     assert observations.pixels is not None
@@ -150,7 +147,7 @@ def _determine_a_pose(observations: Observations, index: NDArray[np.intp]) -> ND
     return np.asarray(usable)
 
 
-def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp]) -> FloatArray:
+def _from_homography(plane: FloatArray, rays: FloatArray, index: Index) -> FloatArray:
     """Return poses (M, 4, 4) from points (N, 2) [m] of the plane and rays (N, 2)."""
     begins = np.flatnonzero(np.diff(index, prepend=-1))
     scale = np.sqrt((plane**2).sum(axis=1).mean())
@@ -178,12 +175,12 @@ def _from_homography(plane: FloatArray, rays: FloatArray, index: NDArray[np.intp
 
 
 def _refined(
-    poses: FloatArray, points: FloatArray, pixels: FloatArray, index: NDArray[np.intp], lens: Lens
+    poses: FloatArray, points: FloatArray, pixels: FloatArray, index: Index, lens: Lens
 ) -> tuple[FloatArray, FloatArray]:
     """Return poses (M, 4, 4) refined on the pixels (N, 2), and RMS residuals (M,) [px]."""
     count = np.bincount(index)
 
-    def linearise(poses: FloatArray, which: NDArray[np.intp]) -> Normal:
+    def linearise(poses: FloatArray, which: Index) -> Normal:
         moving = np.zeros(len(count), dtype=bool)
         moving[which] = True
         these = np.flatnonzero(moving[index])

@@ -22,7 +22,6 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE, Fit, System, minimise
@@ -30,7 +29,7 @@ from calib_ros.estimation.levels import ALIKE, SURE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.trimmed import trimmed_start, trimmed_sum, unknown
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDS, FloatArray, norms
+from calib_ros.kinematics.se3 import ROUNDS, Flags, FloatArray, norms
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
@@ -60,12 +59,12 @@ class Robust:
     loss: str
 
     @property
-    def good(self) -> tuple[NDArray[np.bool_], ...]:
+    def good(self) -> tuple[Flags, ...]:
         """Return which samples (N,) of each set are no gross errors."""
         return tuple(each <= OUTLIER for each in self.distances)
 
     @property
-    def outliers(self) -> NDArray[np.bool_]:
+    def outliers(self) -> Flags:
         """Return which samples (N,) of all sets are gross errors."""
         return (np.concatenate(self.distances) > OUTLIER) & (self.loss != 'none')
 

@@ -24,7 +24,7 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.lens import require_lens, view
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 from calib_ros.values import LARGEST
 
@@ -109,11 +109,7 @@ class Samples:
             yield part, shift, turn if self.oriented else empty, model
 
     def products(
-        self,
-        chain: Chain,
-        names: Sequence[str],
-        count: int = 1,
-        folds: NDArray[np.intp] | None = None,
+        self, chain: Chain, names: Sequence[str], count: int = 1, folds: Index | None = None
     ) -> FloatArray:
         """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
         size = len(names) + 1
@@ -140,8 +136,8 @@ class Samples:
         return np.asarray(found[:, :, order[:, np.newaxis], order])
 
     def sums(
-        self, chain: Chain, names: Sequence[str], groups: NDArray[np.intp]
-    ) -> Iterator[tuple[NDArray[np.intp], tuple[FloatArray, ...]]]:
+        self, chain: Chain, names: Sequence[str], groups: Index
+    ) -> Iterator[tuple[Index, tuple[FloatArray, ...]]]:
         """Yield numbers (n,) of successive groups, and summed rows (P + 1, c, n) by part."""
         first = 0
         for block in self.parts(chain, names):
@@ -228,7 +224,7 @@ class Samples:
             return position, np.where(self.observations.oriented[:, None], turned, np.nan)
         return position / self.sigmas[0], orientation / self.sigmas[1]
 
-    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, NDArray[np.intp] | slice]]:
+    def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, Index | slice]]:
         """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
         for part in self.whitened_residuals(chain):
             yield part, slice(None)

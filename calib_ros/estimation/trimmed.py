@@ -18,12 +18,11 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.estimation.leastsquares import System, minimise
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, Flags, FloatArray
 
 STARTS = 500
 """As in FAST-LTS."""
@@ -103,7 +102,7 @@ class _Halves:
         self._groups = [samples.observations.configurations for samples in system.sets]
         self._sizes = [int(np.ceil(0.5 * (1.0 + need) * s.count)) for s in system.sets]
 
-    def draw(self, need: float) -> NDArray[np.bool_]:
+    def draw(self, need: float) -> Flags:
         """Return seeded starts: of every set half the configurations that all parameters need.
 
         Fewer make a start without gross errors likelier; priors resolve ties.
@@ -116,7 +115,7 @@ class _Halves:
             masks.append((rank < np.ceil(0.5 * need * count))[:, group])
         return np.concatenate(masks, axis=1)
 
-    def concentrate(self, squares: FloatArray) -> tuple[NDArray[np.bool_], FloatArray]:
+    def concentrate(self, squares: FloatArray) -> tuple[Flags, FloatArray]:
         """Return the samples with the shortest residuals, and the sums (S,) of their squares."""
         masks = np.zeros(squares.shape, dtype=bool)
         for part, size in zip(self.parts, self._sizes, strict=True):
@@ -145,7 +144,7 @@ class _Linear:
         self._matrix = extra.T @ extra + HALF_THE_DIGITS * np.eye(len(names))
         self._gradient = extra.T @ offset
 
-    def squares(self, masks: NDArray[np.bool_]) -> FloatArray:
+    def squares(self, masks: Flags) -> FloatArray:
         """Return the squared residuals (S, N) of all samples after a fit to each mask."""
         count, width, size = self._columns.shape
         chosen = masks.astype(float)

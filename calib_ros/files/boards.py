@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
@@ -36,10 +35,10 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import csv_text, parse_yaml, read_text, to_cell
-from calib_ros.values import parse_mapping, parse_number
+from calib_ros.values import parse_like, parse_mapping, parse_number
 
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
@@ -117,7 +116,7 @@ class Board:
         return self.columns * self.square - less, self.rows * self.square - less
 
 
-def _grid(columns: int, rows: int) -> NDArray[np.intp]:
+def _grid(columns: int, rows: int) -> Index:
     return np.column_stack([each.ravel() for each in np.meshgrid(range(columns), range(rows))])
 
 
@@ -125,14 +124,12 @@ def read_board(path: Path) -> Board:
     """Read a board from YAML."""
     text = read_text(path, what='board ')
     content = parse_mapping(parse_yaml(text, str(path)), KEYS, str(path), KEYS[:-1])
-    for key in ('columns', 'rows'):
-        if type(content[key]) is not int:
-            raise ConfigError(f'{path}: {key} must be a whole number, not {content[key]!r}')
-    if not isinstance(content.get('legacy', False), bool):
-        raise ConfigError(f'{path}: legacy must be true or false, not {content["legacy"]!r}')
-    sizes = {key: parse_number(content[key], f'{path}: {key}') for key in ('square', 'marker')}
-    texts = {key: str(content[key]) for key in ('type', 'dictionary')}
-    return Board(**content | sizes | texts)
+    usual = {'columns': 0, 'rows': 0, 'square': 0.0, 'marker': 0.0, 'legacy': False}
+    parsed: dict[str, Any] = {
+        key: parse_like(usual[key], value, f'{path}: {key}') if key in usual else str(value)
+        for key, value in content.items()
+    }
+    return Board(**parsed)
 
 
 def read_lens(path: Path, found: Detections | None = None) -> Lens:
@@ -208,8 +205,8 @@ class Detections:
     """
 
     names: tuple[str, ...]
-    image: NDArray[np.intp]
-    corner: NDArray[np.intp]
+    image: Index
+    corner: Index
     pixels: FloatArray
     lines: tuple[int, ...] = ()
     size: tuple[int, int] | None = None

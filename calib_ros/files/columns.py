@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import from_cell
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
@@ -24,8 +24,7 @@ from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 Row = tuple[int, Sequence[str]]
 """Line number and cells."""
-Lines = NDArray[np.intp]
-Codes = tuple[NDArray[np.intp], list[str]]
+Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 
 
@@ -35,7 +34,7 @@ class Columns:
 
     path: Path
     header: tuple[str, ...]
-    lines: Lines
+    lines: Index
 
     def where(self, row: int, name: str) -> str:
         """Return the place of a cell for messages."""
@@ -61,7 +60,7 @@ class Columns:
         names: Sequence[str],
         largest: float = LARGEST,
         values: FloatArray | None = None,
-        needed: NDArray[np.bool_] | bool = True,
+        needed: Flags | bool = True,
     ) -> FloatArray:
         """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none.
 
@@ -102,7 +101,7 @@ class Columns:
         place, names = numbered([from_cell(each) for each in found])
         return place[numbers], names
 
-    def blank(self, name: str) -> NDArray[np.bool_]:
+    def blank(self, name: str) -> Flags:
         """Return (N,) which cells of a column are empty."""
         return np.array([not text for text in self.texts(name)], dtype=bool)
 
@@ -149,7 +148,7 @@ class MadeColumns(Columns):
             words={name: [words[k] for k in index] for name, words in self.words.items()},
         )
 
-    def blank(self, name: str) -> NDArray[np.bool_]:
+    def blank(self, name: str) -> Flags:
         """Return (N,) which cells of a column are empty."""
         return np.isnan(self.values[name]) if name in self.values else super().blank(name)
 
@@ -211,7 +210,7 @@ def lines_in_words(lines: Sequence[int]) -> str:
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
 
 
-def distinct(codes: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def distinct(codes: Index) -> tuple[Index, Index]:
     """Return the different rows of (N, C) in order of appearance, and their indices (N,)."""
     if not codes.any():
         return codes[:1], np.zeros(len(codes), dtype=np.intp)

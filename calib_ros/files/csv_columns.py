@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.files.columns import Codes, Columns, MadeColumns, Row, numbered, of_cells
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
 from calib_ros.values import MOST_NAMES
@@ -36,7 +36,7 @@ class TextColumns(Columns):
     _ends: NDArray[np.int32]
     """Ends of the cells (N, C) in the text; each starts after the end of the one before."""
 
-    def blank(self, name: str) -> NDArray[np.bool_]:
+    def blank(self, name: str) -> Flags:
         """Return (N,) which cells of a column are empty."""
         begins, ends = self._places(name)
         return np.asarray(begins == ends)

@@ -19,13 +19,13 @@ from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
 from calib_ros.files.photographs import Image, opencv
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
 
-Corners = tuple[NDArray[np.intp], FloatArray]
+Corners = tuple[Index, FloatArray]
 """Numbers (K,) and pixels (K, 2) of a board's corners."""
-Markers = tuple[FloatArray, NDArray[np.intp]]
+Markers = tuple[FloatArray, Index]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
 FEWEST = IN_A_FRAME
@@ -55,7 +55,7 @@ def _halvings(image: Image) -> int:
     return int(np.log2(max(*image.shape[:2], SMALLEST_SIDE) / SMALLEST_SIDE))
 
 
-def marker_cells(board: Board) -> list[NDArray[np.bool_]]:
+def marker_cells(board: Board) -> list[Flags]:
     """Return which cells (B, B) of each marker are black, border included."""
     aruco, dictionary = opencv().aruco, _dictionary(board.dictionary)
     count = len(board.markers)
@@ -153,9 +153,7 @@ class Detector:
         area = self._cv2.INTER_AREA
         return self._cv2.resize(image, size, interpolation=area) if times else image
 
-    def _hidden(
-        self, corners: FloatArray, ids: NDArray[np.intp], size: NDArray[np.intp]
-    ) -> tuple[NDArray[np.intp], ...]:
+    def _hidden(self, corners: FloatArray, ids: Index, size: Index) -> tuple[Index, ...]:
         """Return missing markers that must be in an image, and the box (2,), (2,) around them."""
         points = self._board.around_markers
         others = np.setdiff1d(np.arange(self._count), ids)
@@ -172,9 +170,7 @@ class Detector:
         first = np.maximum(box.min(axis=0) - margin, 0).astype(np.intp)
         return others[inside], first, np.minimum(box.max(axis=0) + margin, size).astype(np.intp)
 
-    def _judged(
-        self, image: Image, corners: FloatArray, ids: NDArray[np.intp]
-    ) -> Corners | Refusal:
+    def _judged(self, image: Image, corners: FloatArray, ids: Index) -> Corners | Refusal:
         number, pixels = self._corners(image, corners, ids)
         if len(number) < self._fewest:
             return Refusal(
@@ -206,7 +202,7 @@ class Detector:
         flat = self._cv2.perspectiveTransform(others.reshape(1, -1, 2), matrix)
         return np.asarray(flat).reshape(others.shape)
 
-    def _charuco(self) -> Callable[[Image, FloatArray, NDArray[np.intp]], Corners]:
+    def _charuco(self) -> Callable[[Image, FloatArray, Index], Corners]:
         board, aruco = self._board, self._cv2.aruco
         size = (board.columns, board.rows)
         if self._new:
@@ -224,7 +220,7 @@ class Detector:
         else:
             made = aruco.CharucoBoard_create(*size, board.square, board.marker, self._dictionary)
 
-        def found(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:
+        def found(image: Image, corners: FloatArray, ids: Index) -> Corners:
             pixels = number = None
             around = [each[np.newaxis] for each in corners.astype(np.float32)]
             shape = ids.astype(np.int32)[:, np.newaxis]
@@ -333,7 +329,7 @@ def detect(
     return Detections(names, image, corner, pixels, size=most), len(refused)
 
 
-def _of_markers(image: Image, corners: FloatArray, ids: NDArray[np.intp]) -> Corners:
+def _of_markers(image: Image, corners: FloatArray, ids: Index) -> Corners:
     order = np.argsort(ids)
     number = (4 * ids[order, np.newaxis] + np.arange(4)).ravel()
     return number, corners[order].reshape(-1, 2)

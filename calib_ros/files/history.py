@@ -300,7 +300,10 @@ class History:
         path = self._path(serial, key)
         try:
             with self._files.open(path, 'rb') as file:
-                return _conformed(parquet.ParquetFile(file).read(), key)
+                found = parquet.read_table(file, schema=_schema())  # of other columns none
+            if found.column('key').to_pylist() != [key]:
+                raise ValueError('its name is not its key')
+            return found
         except Exception as err:  # a damaged file fails in many ways
             raise InputError(f'{path} is not a row of a history ({err}): {AWAY}') from err
 
@@ -352,18 +355,6 @@ def _schema() -> Any:
     kinds |= {'tuple[str, ...]': pa.list_(text), 'FloatArray': pa.list_(number)}
     columns = [(each.name, kinds[str(each.type)]) for each in fields(Row)]
     return pa.schema([('key', pa.string()), *columns])
-
-
-def _conformed(table: Any, key: str) -> Any:
-    """Return the table of a key's file with the current columns, empty if missing."""
-    import pyarrow as pa
-
-    if table.column('key').to_pylist() != [key]:
-        raise ValueError('its name is not its key')
-    for each in _schema():
-        if each.name not in table.column_names:
-            table = table.append_column(each, pa.nulls(len(table), each.type))
-    return table.select(_schema().names).cast(_schema())
 
 
 def _rows_of(table: Any) -> list[Row]:

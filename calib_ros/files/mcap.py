@@ -102,7 +102,7 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
 
 
 def logged(
-    chunk: bytes, channels: Mapping[int, Channel]
+    chunk: bytes, channels: Mapping[int, Channel], room: Room
 ) -> tuple[list[tuple[int, Channel, bytes]], Exception | None]:
     """Return the messages of a chunk on some channels (by number), in order of log time.
 
@@ -111,6 +111,7 @@ def logged(
     """
     chunk = chunk[_HEAD.size :]
     begin, end, size, checksum = _CHUNK.unpack_from(chunk)
+    room.take(size)
     content = _unpacked(chunk)
     if len(content) != size or checksum not in (0, zlib.crc32(content)):
         raise ValueError('a chunk does not have its size and checksum')
@@ -127,11 +128,6 @@ def logged(
     return found, problem
 
 
-def unpacked_size(chunk: bytes) -> int:
-    """Return the stated size of a chunk's content; the record has kind and size."""
-    return int(_CHUNK.unpack_from(chunk, _HEAD.size)[2])
-
-
 def string(record: bytes, start: int) -> str:
     """Return the text at an offset of a record."""
     (size,) = struct.unpack_from('<I', record, start)
@@ -140,7 +136,7 @@ def string(record: bytes, start: int) -> str:
 
 def unpacked(data: bytes, compression: str, largest: int) -> bytes:
     """Return decompressed data, as much as there is."""
-    module: Any = _module(compression) if compression else None
+    module: Any = module_of(compression) if compression else None
     found = data
     if compression == 'lz4':
         found = module.LZ4FrameDecompressor().decompress(data, largest + 1)
@@ -161,13 +157,8 @@ def _unpacked(chunk: bytes) -> bytes:
     return unpacked(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
 
 
-def open_zstd(file: Path) -> Any:
-    """Open a compressed file for reading."""
-    return _module('zstd').open(file, 'rb')
-
-
 @cache  # searching a missing module takes ten times as long as a message
-def _module(compression: str) -> Any:
+def module_of(compression: str) -> Any:
     """Return the decompression module: one of those that rosbags requires."""
     for name in MODULES.get(compression, ()):
         with suppress(ImportError):

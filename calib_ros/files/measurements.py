@@ -18,7 +18,6 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
-    Lines,
     MadeColumns,
     check_quaternions,
     distinct,
@@ -28,7 +27,7 @@ from calib_ros.files.columns import (
 from calib_ros.files.csv_columns import named_by_option, refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.sample import socket_place
 from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults
 
@@ -49,16 +48,16 @@ class Measurements:
     """
 
     path: Path
-    lines: Lines
+    lines: Index
     stamps_ns: NDArray[np.int64]
     joints: FloatArray
     approach: FloatArray | None
     velocity: FloatArray | None
     acceleration: FloatArray | None
-    kind: NDArray[np.intp]
+    kind: Index
     position: FloatArray
     rotation: FloatArray
-    oriented: NDArray[np.bool_]
+    oriented: Flags
     distance: FloatArray
     covariance: FloatArray | None
     session: Codes
@@ -66,9 +65,9 @@ class Measurements:
     target: Codes
     frame_id: Codes
     view: Codes
-    eye_in_hand: NDArray[np.bool_]
-    test: NDArray[np.bool_]
-    removed: NDArray[np.bool_]
+    eye_in_hand: Flags
+    test: Flags
+    removed: Flags
     delay: FloatArray
     count: NDArray[np.int64]
     spread: FloatArray
@@ -110,7 +109,7 @@ class Measurements:
         )
 
     @cached_property
-    def codes(self) -> NDArray[np.intp]:
+    def codes(self) -> Index:
         """Return the codes (N, 6) of frames and sets; session, device, target first."""
         words = (self.session[0], self.device[0], self.target[0])
         return np.column_stack([*words, self.eye_in_hand, self.kind, self.test])
@@ -256,7 +255,7 @@ class _Blocks:
         self._numbers = columns.numbers(names)
 
     def of(
-        self, names: tuple[str, ...], needed: NDArray[np.bool_] | bool, largest: float = LARGEST
+        self, names: tuple[str, ...], needed: Flags | bool, largest: float = LARGEST
     ) -> FloatArray | None:
         """Return the numbers (N, len(names)) of a block, None if all are blank."""
         if names not in self._at:
@@ -265,9 +264,7 @@ class _Blocks:
         found = self._columns.block(names, largest, found, needed)
         return None if len(found) and np.isnan(found[:, 0]).all() else found
 
-    def one(
-        self, name: str, largest: float = LARGEST, needed: NDArray[np.bool_] | bool = False
-    ) -> FloatArray:
+    def one(self, name: str, largest: float = LARGEST, needed: Flags | bool = False) -> FloatArray:
         """Return the numbers (N,) of a column, 0 if blank."""
         found = self.of((name,), needed, largest)
         return np.zeros(len(self._columns.lines)) if found is None else np.nan_to_num(found[:, 0])
@@ -312,7 +309,7 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
     return columns.integers('stamp_ns', lines)
 
 
-def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
+def _devices(columns: Columns, kind: Index) -> Codes:
     if not kind.any():
         return columns.labels('device')
     labels = [columns.labels(name) for name in ('device', 'plane', 'location', 'socket')]
@@ -336,9 +333,7 @@ def _devices(columns: Columns, kind: NDArray[np.intp]) -> Codes:
     return found[number], different
 
 
-def _turned(
-    columns: Columns, quat: FloatArray | None, placed: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], FloatArray]:
+def _turned(columns: Columns, quat: FloatArray | None, placed: Flags) -> tuple[Flags, FloatArray]:
     """Return which poses (N,) are oriented, and the rotations (N, 3, 3)."""
     if quat is None:
         return np.zeros(len(placed), bool), np.tile(np.eye(3), (len(placed), 1, 1))
@@ -350,10 +345,7 @@ def _turned(
 
 
 def _covariance(
-    columns: Columns,
-    upper: FloatArray | None,
-    placed: NDArray[np.bool_],
-    oriented: NDArray[np.bool_],
+    columns: Columns, upper: FloatArray | None, placed: Flags, oriented: Flags
 ) -> FloatArray | None:
     """Return the covariances (N, 6, 6), NaN where missing, None if all are."""
     if upper is None:

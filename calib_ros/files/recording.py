@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib_ros.atomic import whole_folder, write_file
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.bags import rosbag2, typestore
-from calib_ros.kinematics.se3 import FloatArray, to_quat
+from calib_ros.kinematics.se3 import Flags, FloatArray, to_quat
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.messages import JOINT_STATE, VALIDATION
 
@@ -30,11 +30,11 @@ class Recording:
     joint_stamps_ns: NDArray[np.int64]
     joints: FloatArray
     poses: Observations
-    held_out: NDArray[np.bool_]
+    held_out: Flags
 
     @classmethod
     def of_dwells(
-        cls, joint_names: tuple[str, ...], observations: Observations, held_out: NDArray[np.bool_]
+        cls, joint_names: tuple[str, ...], observations: Observations, held_out: Flags
     ) -> Recording:
         """Return a table as a recording: the arm stands for 0.4 s at every row, once a second.
 

@@ -112,7 +112,7 @@ def _with_log(file: Path, target: Path) -> None:
 def _unpack_file(file: Path, target: Path) -> None:
     room = mcap.Room(file.stat().st_size)
     try:
-        with target.open('wb') as out, mcap.open_zstd(file) as packed:
+        with target.open('wb') as out, mcap.module_of('zstd').open(file, 'rb') as packed:
             while part := packed.read(1 << 20):
                 room.take(len(part))
                 out.write(part)
@@ -323,8 +323,7 @@ def _stored(storage: Any, streams: Mapping[str, Stream]) -> Iterator[tuple[Strea
                 file.seek(chunk.chunk_start_offset)
                 try:
                     data = file.read(chunk.chunk_length)
-                    room.take(mcap.unpacked_size(data))
-                    messages, wrong = mcap.logged(data, channels)
+                    messages, wrong = mcap.logged(data, channels, room)
                 except Exception as err:  # see `replay`
                     messages, wrong = [], err
                 found += messages

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import InputError, UnknownNameError, unreadable
 from calib_ros.estimation.observations import Observations
@@ -47,7 +46,7 @@ from calib_ros.identification.records import Owner
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.problems import Measured
 from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
@@ -379,7 +378,7 @@ def _cut_off(path: Path, line: int) -> str:
     return f'{path}: line {line} was cut off and is ignored'
 
 
-def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> NDArray[np.intp]:
+def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> Index:
     numbers, known = labels
     if not sessions and len(known) > 1:
         raise InputError(

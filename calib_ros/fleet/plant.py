@@ -146,14 +146,13 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
         if not isinstance(entry, dict):
             entry = {'files': entry}
         entry = parse_mapping(entry, KEYS['measured'], f'{where}: measured')
-        files, session = entry.get('files'), entry.get('session', '')
+        files = entry.get('files')
+        session = parse_like('', entry.get('session', ''), f'{where}: session')
         if not isinstance(files, str) or not files or len(files) > MOST_ENTRIES:
             raise ConfigError(
                 f'{where}: measured must be a pattern of bags or tables, a file or URL with *, '
                 f'or a list of them, not {files!r:.100}'
             )
-        if not isinstance(session, str):
-            raise ConfigError(f'{where}: session must be text, not {session!r}')
         found.append(Measured(files if '://' in files else str(folder / files), session))
     return tuple(found)
 

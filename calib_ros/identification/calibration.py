@@ -138,18 +138,12 @@ class Calibration(Shown):
         shift = before[:, :3, 3] - after[:, :3, 3]
         return norms(shift), norms(turn)
 
-    def sigma(self, joints: FloatArray) -> FloatArray:
+    def sigma(self, joints: FloatArray, components: slice = np.s_[:3]) -> FloatArray:
         """Return the standard deviation (N,) [m] of predicted positions; NaN if unknown.
 
-        With a region it is the expected error, unmodelled effects included.
+        Of orientations [rad] by other `components` of the pose. With a region it is the expected
+        error, unmodelled effects included.
         """
-        return self._sigma(joints, np.s_[:3])
-
-    def sigma_turned(self, joints: FloatArray) -> FloatArray:
-        """Return the same (N,) [rad] of orientations."""
-        return self._sigma(joints, np.s_[3:])
-
-    def _sigma(self, joints: FloatArray, components: slice) -> FloatArray:
         if self.region is not None:
             return self.region.sigma(joints, components)
         if self.covariance is None:
@@ -210,7 +204,7 @@ class Calibration(Shown):
         """
         if self.covariance is None:
             return '', ''
-        shift, turn = self.sigma(joints), self.sigma_turned(joints)
+        shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
         words = (
             f'the calibration knows these poses to {1e3 * shift.max(initial=0.0):.3f} mm at the '
             f'target measured and {1e3 * turn.max(initial=0.0):.3f} mrad, or better (one sigma)'

@@ -20,7 +20,7 @@ from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import COUNTS, log_gain
 from calib_ros.estimation.evidence import group_of
-from calib_ros.estimation.leastsquares import owners, stacked
+from calib_ros.estimation.leastsquares import gram, owners, stacked
 from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
@@ -82,7 +82,7 @@ class LinearModel:
         owner = owners(rows)
         self._folds = [dealing[owner] for dealing in dealings]
         self._inside = np.array([d == k for d in self._folds for k in range(problem.folds)])
-        self._products = np.array([_square(self._columns[:, part].T) for part in self._inside])
+        self._products = np.array([gram(self._columns[:, part]) for part in self._inside])
         self._pairs = [
             effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
@@ -176,10 +176,7 @@ class LinearModel:
         return pairs[int(np.argmax(shares[:, 0]))], several
 
     def _shares(
-        self,
-        chosen: Sequence[str],
-        groups: Sequence[Sequence[str]],
-        progress: Notify = quiet,
+        self, chosen: Sequence[str], groups: Sequence[Sequence[str]], progress: Notify = quiet
     ) -> FloatArray:
         """Return the shares (G, S) of shifted residuals explained by groups of effects.
 
@@ -249,7 +246,7 @@ class LinearModel:
         ends = [*which, self._number['']]
         folds = self._problem.folds
         parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
-        rest = parts.sum(axis=0) + _square(extra)
+        rest = parts.sum(axis=0) + gram(extra.T)
         # a fold may hold all of a column
         scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))
         weights = np.zeros((len(parts), len(self._columns)))
@@ -281,7 +278,3 @@ class LinearModel:
                 size = given or usual
             found[k] = self._noise / size if size else 0.0
         return found
-
-
-def _square(rows: FloatArray) -> FloatArray:
-    return np.asarray(rows.T @ rows)

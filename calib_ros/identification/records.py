@@ -32,7 +32,7 @@ from calib_ros.kinematics.chain_file import (
 from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
-from calib_ros.values import parse_number, parse_numbers
+from calib_ros.values import parse_like, parse_number, parse_numbers
 
 Owner: TypeAlias = tuple[str, bool, bool, str]
 """Session, camera on the flange, socket; device or target."""
@@ -82,12 +82,7 @@ class Record:
                 f'{where} is a chain, but not a calibration: it does not say where its numbers '
                 'come from (key "calibration"); give the calibration.yaml from calib_ros identify'
             )
-        if not isinstance(record.get('accepted', True), bool):
-            given = record['accepted']
-            raise ConfigError(
-                f'{where}: calibration.accepted must be true or false, not {given!r}'
-            )
-        if record.get('accepted') is False:
+        if not parse_like(True, record.get('accepted', True), f'{where}: calibration.accepted'):
             raise ConfigError(
                 f'{where} was not accepted: identify again, from more or better poses'
             )

@@ -32,6 +32,7 @@ from calib_ros.values import (
     LARGEST,
     MOST_NAMES,
     ROUNDED,
+    parse_like,
     parse_mapping,
     parse_name,
     parse_number,
@@ -252,13 +253,6 @@ def dump_chain(chain: Chain, calibration: Mapping[str, Any] | None = None) -> st
     return dump_yaml(document)
 
 
-def _flag(content: dict[str, Any], where: str, default: bool) -> bool:
-    fixed = content.get('fixed', default)
-    if not isinstance(fixed, bool):
-        raise ConfigError(f'{where}.fixed must be true or false, not {fixed!r}')
-    return fixed
-
-
 def _texts(values: Iterable[object]) -> bool:
     return all(isinstance(value, str) for value in values)
 
@@ -315,7 +309,7 @@ def _frame(value: object, where: str) -> Frame | None:
     delay = content.get('delay')
     return Frame(
         se3.transform(se3.from_quat(quat), xyz),
-        _flag(content, where, False),
+        parse_like(False, content.get('fixed', False), f'{where}.fixed'),
         None if delay is None else parse_number(delay, f'{where}.delay'),
         None if content.get('lens') is None else _lens(content['lens'], f'{where}.lens'),
     )
@@ -325,4 +319,5 @@ def _lens(value: object, where: str) -> Lens:
     content = parse_mapping(value, (*LENS_KINDS, 'fixed'), where, IN_PIXELS)
     given = [kind for kind in LENS_KINDS if kind in content]
     numbers = {kind: parse_number(content[kind], f'{where}.{kind}') for kind in given}
-    return Lens(**numbers, fixed=_flag(content, where, True))
+    fixed = parse_like(True, content.get('fixed', True), f'{where}.fixed')
+    return Lens(**numbers, fixed=fixed)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics.joint import Frame, Joint
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, cross
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index, cross
 from calib_ros.kinematics.walk import Walk
 
 
@@ -64,12 +64,9 @@ GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 
 """Groups of effects that can be fitted together. `gear` has the harmonics at the gear ratio and
 twice that; others are found from data (`model_choice.py`). `coupling` is that of the wrist, the
 last three joints."""
-EXPECTED = dict.fromkeys(GROUPS, 1e-4)
+EXPECTED = dict.fromkeys(GROUPS, 1e-4) | dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
 """Typical size [rad] of an effect by group: a third of an arc minute for drives, an arc minute for
 bending (at a torque arm of a metre) and play."""
-EXPECTED |= dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
-"""Size [rad] that an effect may have, by its group: a third of an arc minute of a drive's own
-errors, an arc minute of what bends (for a torque arm of a metre) or has play."""
 
 
 def group_of(name: str) -> str:
@@ -217,7 +214,7 @@ def _driven(names: tuple[str, ...], joint_names: tuple[str, ...]) -> list[int]:
 @lru_cache(maxsize=256)
 def _by_kind(
     names: tuple[str, ...], joint_names: tuple[str, ...]
-) -> dict[str, tuple[NDArray[np.intp], NDArray[np.intp], FloatArray]]:
+) -> dict[str, tuple[Index, Index, FloatArray]]:
     number = {name: i for i, name in enumerate(joint_names)}
     found: dict[str, list[tuple[int, int, float]]] = {}
     for row, name in enumerate(names):
@@ -233,9 +230,7 @@ def _by_kind(
     }
 
 
-def _torques(
-    chain: _Arm, q: FloatArray, joints: NDArray[np.intp], ends: FloatArray | None
-) -> FloatArray:
+def _torques(chain: _Arm, q: FloatArray, joints: Index, ends: FloatArray | None) -> FloatArray:
     """Return torques (E, B) of unit weights [m] at the `ends` (E,) of links, or of all masses."""
     start = chain.frame('base').matrix
     frames, places = chain.walk.along(q, start)

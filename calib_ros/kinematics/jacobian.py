@@ -27,7 +27,6 @@ from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import effects, se3
@@ -40,7 +39,7 @@ from calib_ros.kinematics.parameter import (
     Parameter,
     parameters_of,
 )
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.kinematics.walk import Walk
 
 
@@ -133,10 +132,7 @@ class ErrorModel:
         return frames, target
 
     def jacobian(
-        self,
-        q: FloatArray,
-        approach: FloatArray | None = None,
-        velocity: FloatArray | None = None,
+        self, q: FloatArray, approach: FloatArray | None = None, velocity: FloatArray | None = None
     ) -> FloatArray:
         """Return the Jacobian (N, 6, P) of position [m] and orientation [rad] at poses q (N, n).
 
@@ -165,18 +161,18 @@ class _Layout(NamedTuple):
     """
 
     rotations: int
-    order: NDArray[np.intp]
-    axes: NDArray[np.intp]
-    points: NDArray[np.intp]
-    levers: NDArray[np.intp]
-    shifts: NDArray[np.intp]
-    turns: NDArray[np.intp]
+    order: Index
+    axes: Index
+    points: Index
+    levers: Index
+    shifts: Index
+    turns: Index
     still: tuple[int, ...]
     behind: slice
     bent: bool
     effects: tuple[str, ...]
     driven: tuple[slice, slice]
-    joints: NDArray[np.intp]
+    joints: Index
     delay: int | None
 
 
@@ -185,10 +181,7 @@ Line: TypeAlias = tuple[int | None, int, bool]
 
 
 def _lines(
-    joints: Mapping[str, int],
-    standard: bool,
-    frames: Sequence[str],
-    ends: tuple[str, str],
+    joints: Mapping[str, int], standard: bool, frames: Sequence[str], ends: tuple[str, str]
 ) -> dict[str, Line]:
     """Return the line of a walk that each parameter of joints and frames moves along or about."""
     at = {ends[0]: len(joints) + 1, ends[1]: len(joints) + 2}
@@ -267,7 +260,7 @@ def _twist(
     )
 
 
-def _indices(numbers: Iterable[int]) -> NDArray[np.intp]:
+def _indices(numbers: Iterable[int]) -> Index:
     found = np.array([*numbers], dtype=np.intp)
     found.setflags(write=False)
     return found

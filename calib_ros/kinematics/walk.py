@@ -15,9 +15,8 @@ alpha and beta along x, x and y of the frame after L (before its turn by beta fo
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import FloatArray, cos_sin
+from calib_ros.kinematics.se3 import Flags, FloatArray, cos_sin
 
 BLOCK = 1024
 """Samples per operation: their arrays fit the caches (benchmarks/peers.py)."""
@@ -31,7 +30,7 @@ class Walk:
     """
 
     def __init__(
-        self, table: FloatArray, signs: FloatArray, turning: NDArray[np.bool_], standard: bool
+        self, table: FloatArray, signs: FloatArray, turning: Flags, standard: bool
     ) -> None:
         a, alpha, d, theta, self.beta = table.T
         self._theta = theta[:, np.newaxis]

@@ -12,6 +12,7 @@ import numpy as np
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.verification import Verification
 from calib_ros.apply.workspace import Placements, Sector, Spread, Survey, in_base, regions
+from calib_ros.estimation.levels import ALIKE
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
@@ -58,7 +59,7 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
         ),
     ),
     'holds': (
-        Verdict('good', 'The calibration still holds: the error has not grown'),
+        Verdict('good', f'The calibration holds: at most {ALIKE:g} times its former error'),
         (TOLERANCE,),
     ),
     'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),

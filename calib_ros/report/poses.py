@@ -28,7 +28,7 @@ from calib_ros.estimation.robust import MANY
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.parameter import DH_KINDS
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
@@ -67,10 +67,10 @@ class Poses:
     turned_after: FloatArray
     in_sigma: FloatArray  # (N, 6) `after` in stated sigmas, position first; NaN: not measured
     role: NDArray[np.str_]  # FITTED, JUDGED or REPEATED
-    outlier: NDArray[np.bool_]
+    outlier: Flags
     size: FloatArray  # of the residual in usual errors; NaN where the pose was not fitted
-    corner: NDArray[np.bool_]  # of a board in an image
-    set: NDArray[np.intp]  # of observations, by its number
+    corner: Flags  # of a board in an image
+    set: Index  # of observations, by its number
     tools: FloatArray  # (S, 4, 4) of the sets
     lines: bool = False  # stamps are the lines of a table, in seconds
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
@@ -80,7 +80,7 @@ class Poses:
         return len(self.joints)
 
     @property
-    def judged(self) -> NDArray[np.bool_]:
+    def judged(self) -> Flags:
         """Return the poses (N,) that judge, all if none was held out, without outliers."""
         chosen = self.role == JUDGED
         return np.asarray((chosen | ~chosen.any()) & ~self.outlier)
@@ -280,7 +280,7 @@ def _packed(values: NDArray[Any], kind: str) -> str:
     return base64.b64encode(values.astype(kind).tobytes()).decode()
 
 
-def _worst(poses: Poses) -> NDArray[np.intp]:
+def _worst(poses: Poses) -> Index:
     error = np.linalg.norm(poses.after, axis=1)
     good = np.argsort(np.where(poses.outlier, -1.0, error))[-WORST:]
     gross = np.argsort(np.where(poses.outlier, error, -1.0))[-WORST:]
@@ -317,7 +317,7 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
     return found
 
 
-def _quantiles(values: FloatArray, place: NDArray[np.intp]) -> list[Any]:
+def _quantiles(values: FloatArray, place: Index) -> list[Any]:
     """Return the SHARES (3, B) of values (N,) in bins (N,), None for empty ones."""
     known = ~np.isnan(values)
     values, place = values[known], place[known]

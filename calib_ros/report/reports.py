@@ -201,6 +201,9 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         'Remaining errors against device noise',
         'If only the stated noise of the measuring device remained, all dots would lie on the '
         'dotted line. A steeper line means more error, understated noise, or few poses.',
+        f'Stated in the settings: {1e3 * problem.sigma_position:g} mm, '
+        f'{1e3 * problem.sigma_orientation:.3g} mrad and {problem.sigma_pixel:g} px in each '
+        'direction; a measurement with a covariance has its own.',
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),

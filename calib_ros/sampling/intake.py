@@ -17,9 +17,8 @@ from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import Index
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import alike, head
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import (
@@ -50,7 +49,7 @@ Deserialise: TypeAlias = Callable[[Any, str], Any]
 """Converts bytes and a type to a message."""
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and their messages, serialised or not, in order of arrival."""
-Row: TypeAlias = tuple[int, int, NDArray[np.float64]]
+Row: TypeAlias = tuple[int, int, FloatArray]
 """Place, stamp [ns] and numbers of one message."""
 Found: TypeAlias = 'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
 """Messages with the same names: places (N,), names, first and last stamp, reader."""

@@ -71,17 +71,13 @@ class Frames:
     def __init__(self, owners: Mapping[str, Owner] | None = None) -> None:
         self._sessions: list[str] = []
         self._ends: dict[tuple[str, str], list[tuple[bool, str]]] = {}
-        self._owners = dict(owners or {})
-        for name, (session, eye, socket, label) in self._owners.items():
+        self.owners = dict(owners or {})
+        """Session, device or target of each frame."""
+        for name, (session, eye, socket, label) in self.owners.items():
             if session not in self._sessions:
                 self._sessions.append(session)
             if not socket:
                 self._end(name.partition('_')[0], session, (eye, label))
-
-    @property
-    def owners(self) -> Mapping[str, Owner]:
-        """Return session, device or target of each frame."""
-        return self._owners
 
     def of(self, sample: Sample) -> tuple[str, str]:
         """Return the names of base and tool of a sample.
@@ -106,7 +102,7 @@ class Frames:
         )
 
     def _own(self, name: str, owner: Owner) -> str:
-        while self._owners.setdefault(name, owner) != owner:
+        while self.owners.setdefault(name, owner) != owner:
             name += '_'
         return name
 

@@ -8,7 +8,7 @@ import pytest
 from surveyed import TASK, UR, calibrated, identified
 
 from calib_ros.apply import workspace
-from calib_ros.apply.workspace import regions, survey
+from calib_ros.apply.workspace import SIDES, regions, survey
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.files.programs import csv_of, read_joints, read_poses
@@ -115,7 +115,7 @@ def test_the_worst_region_is_found_and_named(rng):
     for region in found:
         inside = (region.radius[0] <= radius) & (radius <= region.radius[1])
         inside &= (region.height[0] <= positions[:, 2]) & (positions[:, 2] <= region.height[1])
-        middle = np.mean(region.azimuth)
+        middle = 0.5 * np.pi * SIDES.index(region.words.split(', ')[2])
         inside &= np.abs((azimuth - middle + np.pi) % (2.0 * np.pi) - np.pi) <= 0.25 * np.pi
         assert inside.sum() == pytest.approx(region.poses, abs=2)
 

@@ -166,7 +166,9 @@ def test_outliers_that_go_with_a_joint_are_the_arms(rng):
     assert 'depend on wrist_1_joint' in ' '.join(result.refusals)
 
 
-def test_stops_at_which_all_targets_are_off_are_the_arms(rng):
+@pytest.mark.parametrize('exchanged', [0, 6])
+def test_stops_at_which_all_targets_are_off_are_the_arms(rng, exchanged):
+    """Unless the targets were mistaken for each other, as markers are."""
     true = arm(rng)
     true = replace(true, frames=(*true.frames, ('tool_B', random_frame(rng, 0.2))))
     q = UR10E.random_joints(40, rng)
@@ -175,6 +177,10 @@ def test_stops_at_which_all_targets_are_off_are_the_arms(rng):
     first = replace(measure(true, driven, rng, *NOISE), joints=q)
     other = replace(true, tool=true.frame('tool_B'))
     second = replace(measure(other, driven, rng, *NOISE), joints=q, tool='tool_B')
+    mixed = [2, 8, 15, 21, 27, 36][:exchanged]
+    for part in ('positions', 'rotations'):
+        one, other = getattr(first, part), getattr(second, part)
+        one[mixed], other[mixed] = other[mixed], one[mixed]
     result = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
-    assert len(result.outliers) == 6
+    assert len(result.outliers) == 6 + 2 * exchanged
     assert 'at 3 stops all targets were set aside as gross errors' in result.refusals[0]

@@ -381,9 +381,14 @@ def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, name
 def test_workbooks(tmp_path):
     openpyxl = pytest.importorskip('openpyxl')
     book = openpyxl.Workbook()
-    book.active.title, units = 'first', ['rad', 'rad', 'm', 'm', 'm']
+    book.active.title = 'first'
     sheet = book.create_sheet('measured')
-    for row in (['a title'], NAMES, units, *np.column_stack([JOINTS, PLACES]).tolist()):
+    for row in (
+        ['a title'],
+        NAMES,
+        ['rad', 'rad', 'm', 'm', 'm'],
+        *np.column_stack([JOINTS, PLACES]).tolist(),
+    ):
         sheet.append(row)
     path = tmp_path / 'cell.xlsx'
     book.save(path)

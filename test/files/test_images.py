@@ -173,7 +173,7 @@ BOARD = 'type: charuco\ncolumns: 5\nrows: 7\nsquare: 0.036\nmarker: 0.026\ndicti
 @pytest.mark.parametrize(
     ('old', 'new', 'said'),
     [
-        ('columns: 5', 'columns: 5.0', 'columns must be a whole number'),
+        ('columns: 5', 'columns: 5.5', 'columns must be a whole number'),
         ('columns: 5', 'columns: 1', 'columns of a board must be from 2 to 1000, not 1'),
         ('marker: 0.026', 'marker: 0.036', 'needs 0 < marker < square'),
         ('square: 0.036', 'square: 36', 'in metres, not 0.026 and 36'),

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
-from calib_ros.files.mcap import Kind, _module, logged, records
+from calib_ros.files.mcap import Kind, Room, logged, module_of, records
 from calib_ros.texts import LARGEST_TABLE
 
 try:
@@ -43,6 +43,10 @@ def chunk(content, compression='', checked=True, begin=0, end=2**63):
     return record(Kind.CHUNK, head + sizes + body)
 
 
+def messages_of(chunk, channels):
+    return logged(chunk, channels, Room(1 << 50))
+
+
 MESSAGES = [(1, 5, b'one'), (2, 6, b'other'), (1, 7, b''), (3, 7, b'three')]
 CONTENT = b''.join(message(*each) for each in MESSAGES)
 
@@ -57,7 +61,7 @@ def test_messages_come_in_the_order_of_their_log_times(compression, checked, giv
     begin, end = sorted(limits)
     content = record(Kind.CHANNEL, b'any') + b''.join(message(*each) for each in given_)
     given_chunk = chunk(content, compression, checked, begin, end)
-    found, problem = logged(given_chunk, {1: 'a', 3: 'c'})
+    found, problem = messages_of(given_chunk, {1: 'a', 3: 'c'})
     assert problem is None
     wanted = [each for each in given_ if each[0] != 2 and begin <= each[1] <= end]
     wanted.sort(key=lambda each: each[1])
@@ -68,13 +72,13 @@ def test_messages_come_in_the_order_of_their_log_times(compression, checked, giv
 @pytest.mark.parametrize('compression', sorted(COMPRESSORS))
 def test_a_chunk_with_a_wrong_byte_is_refused(compression):
     good = chunk(CONTENT, compression)
-    whole = logged(good, {1: 1, 2: 2, 3: 3})
+    whole = messages_of(good, {1: 1, 2: 2, 3: 3})
     assert len(whole[0]) == 4
     for place in range(25, len(good)):  # from the size on
         bad = bytearray(good)
         bad[place] ^= 0x55
         try:
-            found = logged(bytes(bad), {1: 1, 2: 2, 3: 3})
+            found = messages_of(bytes(bad), {1: 1, 2: 2, 3: 3})
         except Exception:
             continue
         # Bytes that no reader needs, such as the checksum that a compressor adds.
@@ -85,11 +89,11 @@ def test_a_chunk_that_is_cut_off_is_refused():
     good = chunk(CONTENT, checked=False)
     for length in range(len(good)):
         with pytest.raises((ValueError, struct.error)):
-            logged(good[:length], {1: 1})
+            messages_of(good[:length], {1: 1})
 
 
 def test_the_messages_before_a_damaged_one_are_used():
-    found, problem = logged(chunk(CONTENT[:-2]), {1: 'a', 3: 'c'})
+    found, problem = messages_of(chunk(CONTENT[:-2]), {1: 'a', 3: 'c'})
     assert found == [(5, 'a', b'one'), (7, 'a', b'')]
     assert 'a record in a chunk is damaged' in str(problem)
 
@@ -97,15 +101,15 @@ def test_the_messages_before_a_damaged_one_are_used():
 def test_an_unknown_compression_is_named():
     named = chunk(CONTENT, 'zstd').replace(b'zstd', b'brot')
     with pytest.raises(OSError, match='decompress brot'):
-        logged(named, {1: 1})
+        messages_of(named, {1: 1})
 
 
 @pytest.fixture
 def unknown():
     """Nobody has looked for what unpacks before, nor will know what was found."""
-    _module.cache_clear()
+    module_of.cache_clear()
     yield
-    _module.cache_clear()
+    module_of.cache_clear()
 
 
 @pytest.mark.usefixtures('unknown')
@@ -114,7 +118,7 @@ def test_what_unpacks_is_looked_for_once(monkeypatch):
     sought, find = [], importlib.import_module
     monkeypatch.setattr(importlib, 'import_module', lambda name: sought.append(name) or find(name))
     for _ in range(3):
-        logged(chunk(CONTENT, 'zstd'), {3: 'c'})
+        messages_of(chunk(CONTENT, 'zstd'), {3: 'c'})
     assert sought
     assert len(set(sought)) == len(sought)
 
@@ -129,7 +133,7 @@ def test_the_zstd_of_older_rosbags_will_do(monkeypatch):
         monkeypatch.setitem(sys.modules, module, None)
     named = SimpleNamespace(ZstdDecompressor=Decompressor, ZstdCompressionDict=None)
     monkeypatch.setitem(sys.modules, 'zstandard', named)
-    assert logged(chunk(CONTENT, 'zstd'), {3: 'c'}) == ([(7, 'c', b'three')], None)
+    assert messages_of(chunk(CONTENT, 'zstd'), {3: 'c'}) == ([(7, 'c', b'three')], None)
 
 
 @pytest.mark.parametrize('compression', ['lz4', 'zstd'])
@@ -140,7 +144,7 @@ def test_a_chunk_that_unpacks_to_more_than_it_says_or_may_is_refused(compression
     assert len(bomb) < 1_000_000
     tracemalloc.start()
     with pytest.raises(ValueError, match='more than'):
-        logged(bytes(bomb), {1: 1})
+        messages_of(bytes(bomb), {1: 1})
     with pytest.raises(ValueError, match='more than'):
         list(records(bytes(bomb)))
     assert tracemalloc.get_traced_memory()[1] < 2.5 * LARGEST_TABLE
@@ -151,7 +155,7 @@ def test_chunks_within_chunks_are_refused():
     nested = chunk(chunk(CONTENT))
     with pytest.raises(ValueError, match='a chunk is within a chunk'):
         list(records(nested))
-    found, problem = logged(nested, {1: 1})
+    found, problem = messages_of(nested, {1: 1})
     assert found == []
     assert problem is not None
 

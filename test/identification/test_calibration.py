@@ -48,7 +48,7 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     assert again == before
     q = UR.random_joints(200, np.random.default_rng(1))
     for ours, theirs in ((found, read), (replace(found, region=None), replace(read, region=None))):
-        for ask in ('removed', 'sigma', 'sigma_turned', 'remaining'):
+        for ask in ('removed', 'sigma', 'remaining'):
             np.testing.assert_allclose(
                 getattr(theirs, ask)(q), getattr(ours, ask)(q), rtol=1e-6, atol=1e-12
             )
@@ -56,7 +56,7 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     jacobian = ErrorModel(found.chain, found.names).jacobian(q)
     variances = np.einsum('ncp,pr,ncr->nc', jacobian, found.covariance, jacobian)
     bare = replace(read, region=None)
-    for sigma, part in ((bare.sigma(q), slice(3)), (bare.sigma_turned(q), slice(3, 6))):
+    for sigma, part in ((bare.sigma(q), slice(3)), (bare.sigma(q, np.s_[3:]), slice(3, 6))):
         np.testing.assert_allclose(sigma**2, variances[:, part].sum(axis=1), rtol=1e-6)
     scale = np.sqrt(np.diag(found.covariance))
     difference = (read.covariance - found.covariance) / np.outer(scale, scale)
@@ -103,7 +103,7 @@ def test_of_a_file_of_before_what_it_tells_is_known(found):
     read = parse_calibration(yaml.safe_dump(document, sort_keys=False), 'c.yaml')
     q = UR.random_joints(300, np.random.default_rng(1))
     assert (read.names, read.covariance, read.noise, read.owners) == ((), None, None, {})
-    assert np.isnan(replace(read, region=None).sigma_turned(q)).all()
+    assert np.isnan(replace(read, region=None).sigma(q, np.s_[3:])).all()
     np.testing.assert_allclose(read.remaining(q), found.remaining(q), rtol=1e-6)
     first, second = (np.sqrt(np.mean(each.removed(q)[0] ** 2)) for each in (read, found))
     assert first == pytest.approx(second, rel=0.05)
