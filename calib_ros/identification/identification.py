@@ -39,6 +39,7 @@ from calib_ros.estimation.fitting import (
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
+from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXCEPTION
@@ -91,6 +92,7 @@ def _identified(
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     posterior = fitted.posterior(size, considered(chain, names, problem.fixed), doubts)
+    posterior = replace(posterior, unmodelled=unmodelled_errors(posterior, robust.system))
     step = find_step(problem, names, robust)
     result = Identification(
         chain=chain,
