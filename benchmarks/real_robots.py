@@ -79,13 +79,24 @@ def row(label, figures, result, seconds):
     }
 
 
+def held(unseen, result):
+    """Return the share of measured positions within the 95 % ellipsoids of predicted ones."""
+    axes = result.confidence_ellipsoid(unseen.joints)
+    error = unseen.positions - result.chain.forward(unseen.joints)[:, :3, 3]
+    along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
+    return float(np.mean((along**2).sum(axis=1) <= 1.0))
+
+
 def rows_of(problem):
     """Yield the lines of one data set."""
     begin = time.perf_counter()
     result = identify(problem)
     seconds = time.perf_counter() - begin
     yield row('nominal', result.validation.figures[0], result, 0.0)
-    yield row('geometric', result.validation.figures[1], result, seconds)
+    line = row('geometric', result.validation.figures[1], result, seconds)
+    if problem.judging and not problem.judging[0].inverse:
+        line['within_95'] = held(problem.judging[0], result)
+    yield line
     plain = identify(replace(problem, loss='none'))
     yield row('geometric, plain', plain.validation.figures[1], plain, 0.0)
     if problem.separations:
@@ -202,6 +213,10 @@ def main():
                 f'  {line["model"]:18} RMS {line["rms_mm"]:7.3f}  mean {line["mean_mm"]:7.3f}  '
                 f'max {line["max_mm"]:7.3f} mm  {line["parameters"]:3} parameters  '
                 f'{"accepted" if line["accepted"] else "NOT accepted":12} {line["seconds"]:5.2f} s'
+            )
+        if 'within_95' in lines[1]:
+            print(
+                f'  held-out rows within the 95 % ellipsoids: {100 * lines[1]["within_95"]:.1f} %'
             )
         if 'chosen' in lines[-1]:
             print(f'  chosen: {"; ".join(lines[-1]["chosen"]) or "nothing"}')

@@ -194,15 +194,15 @@ def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
     region = compensator.region
     if region is None or region.whole:
         return []
-    errors = region.sigma(result.command)
+    errors = region.known(result.command)
     outside = np.flatnonzero(errors > region.limit)
     share = 100.0 * len(outside) / len(errors)
     return [
         Refusal(
             k,
-            f'the calibration is not valid in {share:.0f} % of the program, as here: an error of '
-            f'{1e3 * errors[k]:.3f} mm is expected, where it is valid at most '
-            f'{1e3 * region.limit:.3f} mm; identify again with poses near it',
+            f'the calibration is not valid in {share:.0f} % of the program, as here: by its '
+            f'parameters an error of {1e3 * errors[k]:.3f} mm is expected, where it is valid at '
+            f'most {1e3 * region.limit:.3f} mm; identify again with poses near it',
         )
         for k in outside.tolist()
     ]

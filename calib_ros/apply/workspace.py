@@ -62,7 +62,7 @@ def survey(arm: Calibration, count: int, rng: np.random.Generator) -> Survey:
     joints = arm.chain.random_joints(count, rng)
     removed, turned = arm.removed(joints)
     positions, sigma = in_base(arm.chain, joints)[:, :3, 3], arm.sigma(joints)
-    return Survey(joints, positions, removed, turned, sigma, np.hypot(sigma, arm.residual or 0.0))
+    return Survey(joints, positions, removed, turned, sigma, arm.remaining(joints))
 
 
 def in_base(chain: Chain, joints: FloatArray) -> FloatArray:

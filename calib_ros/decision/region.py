@@ -15,7 +15,7 @@ for.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,7 +24,7 @@ from scipy import special
 from calib_ros.decision.drift import inverse_root
 from calib_ros.decision.packing import damaged, packed, parse_rows, unpacked
 from calib_ros.errors import UnknownNameError
-from calib_ros.estimation.evidence import Mixed, Posterior
+from calib_ros.estimation.evidence import Mixed, Posterior, with_unmodelled
 from calib_ros.estimation.levels import KNOWN, UNUSUAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import BLOCK
@@ -49,7 +49,8 @@ class Region(Shown):
     K) times its transpose. Predicted positions may be off by `limit` [m], infinite if the whole
     joint range is used; `share` is the used share of it. It was measured between `base` and
     `tool`. `by_scale`, unknown for a loaded region, is the probability that the device is out of
-    scale and makes the arm worse there.
+    scale and makes the arm worse there. `unmodelled` are the sizes [rad] of random turns and
+    tilts of the joints beyond the parameters.
     """
 
     chain: Chain
@@ -61,21 +62,27 @@ class Region(Shown):
     base: str = 'base'
     tool: str = 'tool'
     by_scale: float = 0.0
+    unmodelled: tuple[float, float] = (0.0, 0.0)
 
     def sigma(self, joints: FloatArray, components: slice = np.s_[:3]) -> FloatArray:
         """Return the expected error (N,) [m] of positions predicted at joint values (N, n).
 
         Of orientations [rad] by other `components` of the pose.
         """
-        model = ErrorModel(self.chain, self.names, self.base, self.tool)
-        return sigma_of(model, self.square, joints, components)
+        names, square = with_unmodelled(self.chain, self.names, self.square, self.unmodelled)
+        model = ErrorModel(self.chain, names, self.base, self.tool)
+        return sigma_of(model, square, joints, components)
+
+    def known(self, joints: FloatArray) -> FloatArray:
+        """Return the expected error (N,) [m] by the parameters alone, compared with `limit`."""
+        return replace(self, unmodelled=(0.0, 0.0)).sigma(joints)
 
     def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""
         joints = self.chain.joint_values(joints)
         if np.isinf(self.limit):
             return np.ones(len(joints), dtype=bool)
-        return np.asarray(self.sigma(joints) <= self.limit)
+        return np.asarray(self.known(joints) <= self.limit)
 
     @property
     def whole(self) -> bool:
@@ -102,6 +109,7 @@ class Region(Shown):
             'names': list(self.names),
             'root': packed(self.square),
             'device': [' '.join(f'{x:.9e}' for x in row) for row in self.device],
+            'unmodelled': list(self.unmodelled),
         }
 
 
@@ -147,6 +155,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             if frame not in chain.frame_names:
                 raise UnknownNameError('frame', frame, chain.frame_names)
         limit = document['limit']
+        turn, tilt = map(float, document.get('unmodelled', (0.0, 0.0)))
         region = Region(
             chain,
             names,
@@ -155,13 +164,15 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             np.inf if limit is None else float(limit),
             float(document['share']),
             *ends,
+            unmodelled=(turn, tilt),
         )
     except UnknownNameError as err:
         what = f'{where}: calibration.region: {err.what}'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
         raise damaged('region', where, err) from err
-    if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
+    fine = 0.0 <= turn < np.inf and 0.0 <= tilt < np.inf
+    if not (fine and region.limit > 0.0 and 0.0 <= region.share <= 1.0):
         raise damaged('region', where)
     return region
 
@@ -201,7 +212,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     share = float(np.mean(far <= limit))
     limit = np.inf if share == 1.0 else limit
     known = posterior.chain, posterior.names, posterior.square, posterior.device
-    return Region(*known, limit, share, *ends, by_scale)
+    return Region(*known, limit, share, *ends, by_scale, posterior.unmodelled)
 
 
 _Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]

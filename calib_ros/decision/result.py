@@ -126,7 +126,11 @@ class Identification(Shown):
         sources = self.uncertainty.parts
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
         freedom = self.uncertainty.freedom_of(shares)
-        values, vectors = np.linalg.eigh(self.pose_covariance(q)[:, :3, :3])
+        posterior, squares = self.posterior, self.pose_covariance(q)[:, :3, :3]
+        biased = ErrorModel(posterior.chain, posterior.names).jacobian(q)[:, :3] @ posterior.shift
+        even = np.eye(3) * ((biased**2).sum(axis=1) / 3.0)[:, np.newaxis, np.newaxis]
+        squares = squares + even - biased[:, :, np.newaxis] * biased[:, np.newaxis]
+        values, vectors = np.linalg.eigh(squares)
         square = 3.0 * special.fdtri(3, np.minimum(freedom, KNOWN), level)
         square = np.where(freedom > KNOWN, special.chdtri(3, 1.0 - level), square)
         length = np.sqrt(square[:, np.newaxis] * np.maximum(values, 0.0))

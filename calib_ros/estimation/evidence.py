@@ -54,6 +54,25 @@ def _group(name: str) -> str:
     return group if group in TYPICAL else 'drive'
 
 
+def turns_and_tilts(chain: Chain) -> tuple[list[Parameter], list[Parameter]]:
+    """Return what turns each joint about its axis (slides it, if prismatic), and tilts it."""
+    tilts = [Parameter(name, kind) for name in chain.joint_names for kind in ('alpha', 'beta')]
+    return [joint.driven for joint in chain.joints], tilts
+
+
+def with_unmodelled(
+    chain: Chain, names: tuple[str, ...], square: FloatArray, sizes: Sequence[float]
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Return names and expected squares (P, P) with turns and tilts of some sizes [rad]."""
+    for size, turns in zip(sizes, turns_and_tilts(chain), strict=True):
+        if size:
+            names = tuple(dict.fromkeys((*names, *turns)))
+            square = np.pad(square, (0, len(names) - len(square)))
+            index = [names.index(name) for name in turns]
+            square[index, index] += size**2
+    return names, square
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Posterior(Shown):
     """Posterior of a fitted arm, given the data and the sizes of its errors.
@@ -81,6 +100,8 @@ class Posterior(Shown):
         scale error and rounded joint values may be off.
     rival : (float, float, (P,), (P, P)), optional
         The same for a device out of scale: log odds, scale minus one, mean and covariance.
+    unmodelled : (float, float)
+        Sizes [rad] of turns and tilts of the joints beyond all names (`unmodelled.py`).
     """
 
     chain: Chain
@@ -93,6 +114,7 @@ class Posterior(Shown):
     sizes: Mapping[str, float]
     doubted: tuple[Mixed, ...]
     rival: tuple[float, float, FloatArray, FloatArray] | None = None
+    unmodelled: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
     def square(self) -> FloatArray:
@@ -104,8 +126,9 @@ class Posterior(Shown):
 
         In world axes, unmodelled effects included.
         """
-        rows = ErrorModel(self.chain, self.names, base, tool).jacobian(joints)
-        return np.asarray(rows @ self.square @ np.swapaxes(rows, 1, 2))
+        names, square = with_unmodelled(self.chain, self.names, self.square, self.unmodelled)
+        rows = ErrorModel(self.chain, names, base, tool).jacobian(joints)
+        return np.asarray(rows @ square @ np.swapaxes(rows, 1, 2))
 
     def stds_of(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations (K,) of undetermined parameters of the arm."""

@@ -111,9 +111,7 @@ class _Stops:
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     """Return which neighbours share errors, and the resulting noise."""
     kinds = tuple(LENGTHS)
-    total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
-    share = max(1, -(-total // MOST_STOPS))
-    few = _gather(fit.chain, names, system, share, MOST_STOPS // 20)
+    few, share = gathered(fit.chain, names, system, MOST_STOPS)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < TELLING:
         return Shared(**correlations, found=(), middles={})
@@ -221,8 +219,6 @@ class _Forms:
 
     def sizes(self, kernels: dict[int, list[tuple[str, float]]]) -> dict[int, FloatArray]:
         """Return, by part, the sizes (1 + K,) of the independent part and each kernel."""
-        from scipy import optimize  # slow to import, rarely needed
-
         white = np.eye(len(self._units))
         every = dict.fromkeys(kernel for own in kernels.values() for kernel in own)
         known = {kernel: self._units.kernel(*kernel) for kernel in every}
@@ -230,24 +226,38 @@ class _Forms:
             part: np.array([white, *(known[kernel] for kernel in kernels.get(part, ()))])
             for part in self.parts
         }
-        moments = self._moments(matrices)
-        scale = np.sqrt(np.maximum(np.diag(moments), HALF_THE_DIGITS))
-        scaled = moments / np.outer(scale, scale)
-        # weighted by the covariance of the forms under white noise; those without spread, if
-        # hardly more was measured than fitted, carry no information
-        squares, directions = linalg.eigh(scaled)
-        informative = squares > HALF_THE_DIGITS * squares[-1]
-        roots, directions = np.sqrt(squares[informative]), directions[:, informative]
-        values = self._values(matrices) / scale
-        sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, values @ directions / roots)[0]
+        sizes = nonnegative(self._moments(matrices), self._values(matrices))
         ends = np.cumsum([len(own) for own in matrices.values()])[:-1]
-        return dict(zip(self.parts, np.split(sizes / scale, ends), strict=True))
+        return dict(zip(self.parts, np.split(sizes, ends), strict=True))
+
+
+def nonnegative(moments: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the sizes (F,) >= 0 that equate forms with their values (F,), by moments (F, F)."""
+    from scipy import optimize  # slow to import, rarely needed
+
+    scale = np.sqrt(np.maximum(np.diag(moments), HALF_THE_DIGITS))
+    scaled = moments / np.outer(scale, scale)
+    # weighted by the covariance of the forms under white noise; those without spread, if hardly
+    # more was measured than fitted, carry no information
+    squares, directions = linalg.eigh(scaled)
+    informative = squares > HALF_THE_DIGITS * squares[-1]
+    roots, directions = np.sqrt(squares[informative]), directions[:, informative]
+    along = (values / scale) @ directions / roots
+    sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, along)[0]
+    return np.asarray(sizes / scale)
 
 
 def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
     """Return products (P, P) of columns (n, c, P)."""
     size = first.shape[2]
     return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
+
+
+def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[_Stops, int]:
+    """Return the stops of all sets, and k: of more than `most`, every k-th run of a twentieth."""
+    total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
+    share = max(1, -(-total // most))
+    return _gather(chain, names, system, share, most // 20), share
 
 
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:

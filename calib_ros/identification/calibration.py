@@ -8,6 +8,8 @@ position rows of the error model, and the RMS error r on held-out poses:
 
     removed(q) = |p_nominal - p|      sigma(q)^2 = tr J C J^T      remaining(q)^2 = sigma^2 + r^2
 
+Errors of the joints that no parameter explains add to sigma but, being in r, not to `remaining`.
+
 Commanded by its nominal model the arm is expected to miss by the root of removed^2 + remaining^2,
 by its calibrated model by `remaining`.
 """
@@ -151,8 +153,13 @@ class Calibration(Shown):
         return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
 
     def remaining(self, joints: FloatArray) -> FloatArray:
-        """Return the expected remaining error (N,) [m] at joint values (N, n); NaN if unknown."""
-        return np.hypot(self.sigma(joints), self.residual or 0.0)
+        """Return the expected remaining error (N,) [m] at joint values (N, n); NaN if unknown.
+
+        The held-out error contains what no parameter explains, so that counts once.
+        """
+        sigma = self.sigma(joints)
+        known = sigma if self.region is None else self.region.known(joints)
+        return np.maximum(sigma, np.hypot(known, self.residual or 0.0))
 
     def expected(self, joints: FloatArray, model: Model) -> FloatArray:
         """Return the expected error (N,) [m] of a model at joint values (N, n)."""

@@ -41,6 +41,7 @@ from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.levels import SCALE
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
+from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXCEPTION
@@ -94,6 +95,7 @@ def _identified(
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
     posterior = fitted.posterior(size, more, doubts)
+    posterior = replace(posterior, unmodelled=unmodelled_errors(posterior, robust.system))
     region, scaled = _region(fitted, posterior, size, more, doubts)
     step = find_step(problem, names, robust)
     result = Identification(

@@ -207,6 +207,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
+            *filter(None, (words.unmodelled_in_words(result),)),
             *(() if drift else (words.neighbours_in_words(result.noise),)),
             *map(words.chance_in_words, () if result.chance is None else (result.chance,)),
         ),

@@ -250,6 +250,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'observability': asdict(result.observability),
         'predicted_sigma_mm': sigma_over_range(result),
         'sizes': dict(result.posterior.sizes),
+        'unmodelled': dict(zip(('turns', 'tilts'), result.posterior.unmodelled, strict=True)),
         'region': None if result.region is None else region_figures(result.region),
         'priors': result.priors,
         'effects': dict(result.chain.effects),
@@ -291,6 +292,17 @@ def scatter_in_words(noise: Noise) -> str:
         return f'{text}: the device is better than stated.'
     text += ': the device is worse than stated, or the arm has errors that this model lacks.'
     return f'{text} The intervals are widened accordingly.'
+
+
+def unmodelled_in_words(result: Identification) -> str:
+    """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
+    turn, tilt = (1e3 * size for size in result.posterior.unmodelled)
+    if not turn + tilt:
+        return ''
+    return (
+        f"What remains looks like the arm's own: joints off by {turn:.3f} mrad about their axes "
+        f'and {tilt:.3f} mrad across, which the model lacks. Expected errors include it.'
+    )
 
 
 def drift_in_words(noise: Noise) -> str:

@@ -17,7 +17,7 @@ from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.jacobian import orientation_error
+from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.report.words import as_document, summary
 
 pytestmark = pytest.mark.usefixtures('unsearched')
@@ -168,6 +168,35 @@ def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
     assert np.sqrt(np.mean(np.sum(turned**2, axis=0)) / np.mean(known**2)) < 1.25
 
 
+@pytest.mark.parametrize('kind', ['theta', 'alpha'])
+def test_positions_are_within_the_ellipsoids_whatever_turns_or_tilts_the_joints(kind):
+    """By 50 waves a turn, or twice a turn across the axis; the device's sigmas are not known."""
+    inside = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        true, q = arm(seed), UR10E.random_joints(160, rng)
+        model = ErrorModel(true, [f'{name}.{kind}' for name in true.joint_names])
+        sizes = 3e-4 * rng.uniform(0.3, 1.0, 6)
+        waves = sizes * np.sin((50 if kind == 'theta' else 2) * q + rng.uniform(0.0, 6.28, 6))
+        off = np.einsum('nij,nj->ni', model.jacobian(q), waves)
+        seen = measure(true, q, rng, 5e-5, 2e-4)
+        seen = replace(
+            seen,
+            positions=seen.positions + off[:, :3],
+            rotations=se3.exp_rotation(off[:, 3:]) @ seen.rotations,
+        )
+        found = identify(Problem(UR10E, seen.select(np.arange(60))))
+        turn, tilt = found.posterior.unmodelled
+        assert (turn > tilt) == (kind == 'theta')
+        error = found.chain.forward(q)[60:, :3, 3] - true.forward(q)[60:, :3, 3] - off[60:, :3]
+        axes = found.confidence_ellipsoid(q[60:])
+        along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
+        inside.append((along**2).sum(axis=1) <= 1.0)
+        stated = np.trace(found.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)
+        np.testing.assert_allclose(found.region.sigma(q) ** 2, stated)
+    assert np.mean(inside) > 0.9
+
+
 def test_expected_errors_hold_where_a_joint_that_hardly_moved_is_used():
     """The ellipsoids hold 95 % of the positions, also where the prior alone tells the errors."""
     held, ratios = [], []
@@ -210,6 +239,8 @@ def test_a_device_out_of_scale_does_not_spoil_an_arm_of_small_errors(seed):
         {'limit': [1.0]},
         {'share': 2.0},
         {'share': None},
+        {'unmodelled': [0.0]},
+        {'unmodelled': [0.0, -1.0]},
         {'names': ['no_joint.a']},
         {'names': None},
         {'root': ['1.0']},

@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the arm that no parameter explains: how far its joints turn and tilt at random.
+
+Play, gear harmonics, wobbling bearings and a rocking base act at the joints, so their errors grow
+with the distance of the target from these; the noise of a device does not. That tells them apart
+even if the sigmas of the device are unknown. With the columns Q of the posterior, scaled by a root
+of its covariance, its residuals r have the covariance B V B + B - B^2, B = I - Q Q^T. In
+
+    V = v_0 I_position + v_1 I_orientation + v_2 K_turns + v_3 K_tilts
+
+K holds the products, stop by stop, of the columns of turns of all joints about their axes, or of
+tilts. If a test finds r^T K r larger than white noise allows, sizes v >= 0 equate these forms with
+their expected values (MINQUE, Rao 1971).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import special
+
+from calib_ros.estimation.evidence import Posterior, turns_and_tilts
+from calib_ros.estimation.leastsquares import System, gram
+from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
+from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.shared_errors import gathered, nonnegative
+from calib_ros.estimation.sizes import solved
+from calib_ros.kinematics.se3 import FloatArray
+
+
+def unmodelled_errors(posterior: Posterior, system: System) -> tuple[float, float]:
+    """Return the sizes [rad] of random turns and tilts of the joints, zero without evidence.
+
+    Those of a prismatic joint along its axis [m] count as turns.
+    """
+    names, groups = posterior.names, turns_and_tilts(posterior.chain)
+    every = tuple(dict.fromkeys((*names, *groups[0], *groups[1])))
+    units, _ = gathered(posterior.chain, every, system, SOME_POSES)
+    if len(units) < TELLING:
+        return 0.0, 0.0
+    parts = [part for part in units.parts if part.any()]
+    found = _explained(posterior, [part[[*range(len(names)), -1]] for part in parts])
+    if found is None:
+        return 0.0, 0.0
+    step, root, scales = found
+    parts = [part / scale for part, scale in zip(parts, scales, strict=True)]
+    rows = np.concatenate(parts, axis=1).transpose(2, 1, 0)  # (n, c, P)
+    residual = rows[..., -1] + rows[..., : len(names)] @ step
+    part_of = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
+    whites = rows.any(axis=2) & (part_of == np.arange(len(parts))[:, np.newaxis, np.newaxis])
+    turned = [rows[..., [every.index(name) for name in group]] for group in groups]
+    kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
+    kernels += [columns @ np.swapaxes(columns, 1, 2) for columns in turned]
+    turn, tilt = _sizes(np.array(kernels), rows[..., : len(names)] @ root, residual).tolist()
+    return turn, tilt
+
+
+def _explained(
+    posterior: Posterior, parts: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Return step to the posterior mean (P,), root (P, P) of its covariance, and noise by part.
+
+    From weighted rows (P + 1, c, n) of each part; None if nothing is left to judge by.
+    """
+    inverse = np.array([1.0 / posterior.priors.get(name, np.inf) for name in posterior.names])
+    products = np.array([gram(part) for part in parts])
+    counts = np.array([np.count_nonzero(part.any(axis=0)) for part in parts])
+    variances = np.ones(len(parts))
+    for _ in range(SEVERAL):
+        total = np.tensordot(1.0 / variances, products, 1)
+        vector = total[:-1, -1] - posterior.offsets * inverse**2
+        mean, root = solved(total[:-1, :-1], vector, inverse**2)
+        last = np.append(-mean, 1.0)
+        taken = ((products[:, :-1, :-1] @ root) * root).sum(axis=(1, 2)) / variances
+        left = last @ products @ last
+        if not ((left > 0.0) & (taken < counts)).all():
+            return None
+        variances = left / (counts - taken)
+    return -mean, root, np.sqrt(variances)
+
+
+def _sizes(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return the standard deviations (2,) of the last two kernels (K, n, c, c).
+
+    For the posterior's columns (n, c, P), scaled, and its residuals (n, c).
+    """
+    spread = kernels @ basis
+    taken = np.einsum('kncp,ncp->k', spread, basis, optimize=True)
+    values = np.einsum('knij,ni,nj->k', kernels, residual, residual, optimize=True)
+    listed = kernels.reshape(len(kernels), -1)
+    pairs, white, arm = listed @ listed.T, np.s_[:-2], np.s_[-2:]
+    excess = (values + taken - np.einsum('knii->k', kernels))[arm]
+    sizes = np.diag(pairs)  # white kernels have nothing in common
+    own = sizes[arm] - (pairs[arm, white] ** 2 / sizes[white]).sum(axis=1)
+    if not (excess > special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * own)).any():
+        return np.zeros(2)
+    flat, spread = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (basis, spread))
+    inner = flat.T @ spread
+    cross, both = (x @ x.T for x in (x.reshape(len(kernels), -1) for x in (spread, inner)))
+    values -= taken - np.tensordot(inner, inner[white].sum(axis=0))
+    return np.asarray(np.sqrt(nonnegative(pairs - 2.0 * cross + both, values)[arm]))
