@@ -134,7 +134,7 @@ def _recalibrated(
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
     columns = Columns(arm.chain, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
-    earlier, before = arm.changed(np.zeros(len(arm.names))), arm.square
+    earlier, before = arm.changed(np.zeros(len(arm.names)), arm.square), arm.square
     found = arm.solved(system)
     while len(changed) < SEVERAL and (reasons := arm.reasons(found.information, columns)):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
@@ -263,9 +263,19 @@ class _Arm:
         known = self.previous.names
         return [k for k, name in enumerate(self.names) if name in known or name.of_dh]
 
-    def changed(self, change: FloatArray) -> Chain:
-        """Return the chain with changes (P,); considered effects stay zero."""
-        own: dict[str, float] = {self.names[k]: float(change[k]) for k in self.own}
+    def applied(self, change: FloatArray, covariance: FloatArray) -> FloatArray:
+        """Return the change (P,) by poses if the considered effects are zero, as in the chain.
+
+        Without them other parameters follow: those of an arm that has the effects do not fit.
+        """
+        rest = np.setdiff1d(np.arange(len(change)), self.own)
+        effects = covariance[np.ix_(rest, rest)]
+        return np.asarray(change - covariance[:, rest] @ np.linalg.pinv(effects) @ change[rest])
+
+    def changed(self, change: FloatArray, covariance: FloatArray) -> Chain:
+        """Return the chain with the `applied` changes (P,)."""
+        applied = self.applied(change, covariance)
+        own: dict[str, float] = {self.names[k]: float(applied[k]) for k in self.own}
         return replace(self.chain, effects=self.previous.chain.effects).with_offsets(own)
 
     def solved(self, system: System) -> _Found:
@@ -334,7 +344,7 @@ def _judged(
     for products in parts.sum(axis=0) - parts:
         matrix = products[:-1, :-1]
         rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
-        chains.append((earlier, arm.changed(rest.mean(arm.square)[0])))
+        chains.append((earlier, arm.changed(*rest.mean(arm.square))))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
     return Comparison(before, after, every)
@@ -343,7 +353,7 @@ def _judged(
 def _updated(
     arm: _Arm, found: _Found, problem: Problem, changed: Sequence[Sequence[Explanation]]
 ) -> Calibration:
-    previous, chain = arm.previous, arm.changed(found.change)
+    previous, chain = arm.previous, arm.changed(found.change, found.covariance)
     before = previous.before
     for name in before.frame_names:
         old, new, current = (each.frame(name) for each in (previous.chain, chain, before))
@@ -352,10 +362,9 @@ def _updated(
             moved = current.matrix @ se3.invert(old.matrix) @ new.matrix
         before = before.with_frame(name, replace(current, matrix=moved))
     own, region = arm.own, previous.region
+    left = found.change - arm.applied(found.change, found.covariance)
+    square = found.covariance + np.outer(left, left)
     if region is not None:
-        left = found.change.copy()
-        left[own] = 0.0
-        square = found.covariance + np.outer(left, left)
         effects = [name for name, _ in region.chain.effects]
         region = replace(region, chain=chain.with_effects(effects), square=square)
     record = {
@@ -371,7 +380,7 @@ def _updated(
         chain=chain,
         before=before,
         names=tuple(arm.names[k] for k in own),
-        covariance=found.covariance[np.ix_(own, own)],
+        covariance=square[np.ix_(own, own)],
         region=region,
         record=record,
         rows=Fingerprint.of(problem.all_sets, previous.rows),

@@ -94,6 +94,18 @@ def test_of_an_arm_that_has_not_changed_nothing_is_claimed(earlier):
     )
 
 
+@pytest.mark.parametrize('seed', range(2))
+def test_errors_that_the_model_lacks_do_not_spoil_an_update(seed):
+    """They are put down to considered effects, which the chain in use leaves out."""
+    true = faulty(UR10E, Cell(), np.random.default_rng(seed))
+    names = [f'{joint.name}.{wave}_1' for joint in UR10E.joints for wave in ('sin', 'cos')]
+    true = true.with_effects(names).with_offsets(dict.fromkeys(names, 3e-4))
+    first = Calibration.of(identify(problem(true, 80, seed)))
+    done = recalibrate(first, problem(true, 20, seed + 100), 0.0)
+    assert done.accepted
+    assert done.after.rms_mm < 1.02 * done.before.rms_mm
+
+
 @pytest.mark.parametrize('stated', [True, False])
 def test_new_poses_have_the_noise_of_the_earlier_ones(stated):
     """Of a device that is five times as noisy as assumed by default, stated once or never."""
@@ -287,10 +299,11 @@ def test_poses_that_tell_of_new_frames_only_do_not_make_the_arm_worse():
     first = found[0].spread(300)
     previous = Calibration.of(identify(Problem(chain, first)))
     many = np.random.default_rng(0).choice(len(found[1]), 60, replace=False)
-    for chosen in ([68, 110, 149, 226, 305, 462, 699, 864], many):
+    for chosen, helps in (([68, 110, 149, 226, 305, 462, 699, 864], False), (many, True)):
         few = found[1].select(np.array(chosen))
         done = recalibrate(previous, Problem(chain, few), 0.0, new=('base', 'tool'))
         assert done.before.rms_mm < 1.0
-        assert not done.accepted
-        assert 'in new frames, fits the new poses better' in done.refusal()[0]
-    assert done.after.rms_mm < 1.5 * done.before.rms_mm  # with frames fitted to 360 rows
+        assert done.accepted is helps
+        if not helps:
+            assert 'in new frames, fits the new poses better' in done.refusal()[0]
+    assert done.after.rms_mm < done.before.rms_mm  # with frames fitted to 360 rows
