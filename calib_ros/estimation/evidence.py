@@ -176,22 +176,20 @@ def posterior_of(
     doubts: Mapping[str, float] | None = None,
     at_the_fit: Normal | None = None,
     judging: bool = True,
-    sigma_scale: float = 0.0,
 ) -> Posterior:
     """Return the posterior of fitted parameters and considered effects, linearised at the fit.
 
     Offsets of the fitted `chain` from the `nominal` one are normal about zero. `names` were fitted
     to the `system` with its weights and noise of size `noise` [sigma given]; `more` effects are
-    considered. `known` are given priors [m or rad], `doubts` standard deviations of parameters
-    that something else moves too, `at_the_fit` the last normal equations if known, `sigma_scale`
-    the standard deviation of the device's scale, 0 if unknown. Doubts are only evaluated if
-    `judging`.
+    considered. `known` are given priors [m or rad], also of the device's scale, `doubts` standard
+    deviations of parameters that something else moves too, `at_the_fit` the last normal equations
+    if known. Doubts are only evaluated if `judging`.
     """
     chain = chain.with_effects([name for name in more if not Parameter(name).of_dh])
     every = (*names, *more)
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
-    unsure = bool(lengths) and scale == SCALE and not sigma_scale
+    unsure = bool(lengths) and scale == SCALE and 'scale' not in known
     what = beside, lengths, bool(more), at_the_fit
     plain, cross, doubtful = products_with_doubts(whole, every, system, noise, *what)
     offsets = np.zeros(len(plain) - 1)
@@ -201,7 +199,6 @@ def posterior_of(
     alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
     vector = matrix @ offsets + reduced[:-1, -1]
     also = ['scale'] if lengths else []
-    known = {**known, 'scale': sigma_scale} if sigma_scale else known
     groups = [None if n in known else group_of(chain, n) for n in every]
     groups += [None if n in known else n for n in also]
     given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2

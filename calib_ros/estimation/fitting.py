@@ -116,10 +116,13 @@ class Fitted:
         judging: bool = True,
     ) -> Posterior:
         """Return the posterior of the fit with `more` effects considered."""
-        model, given, names = self.problem.model, self.problem.given, self.names
-        known = None if more else self.robust.fit.normal
-        how = doubts, known, judging, self.problem.sigma_scale
-        found = posterior_of(self.chain, model, names, self.system, noise, given, more, *how)
+        problem, names = self.problem, self.names
+        given = dict(problem.given)
+        if problem.sigma_scale:
+            given['scale'] = problem.sigma_scale
+        how = doubts, None if more else self.robust.fit.normal, judging
+        fitted = self.chain, problem.model, names, self.system
+        found = posterior_of(*fitted, noise, given, more, *how)
         return found if self.held is None else found.held_at(*self.held)
 
 

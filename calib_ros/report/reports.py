@@ -207,7 +207,7 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
-            *filter(None, (words.unmodelled_in_words(result),)),
+            *_unmodelled(result),
             *(() if drift else (words.neighbours_in_words(result.noise),)),
             *map(words.chance_in_words, () if result.chance is None else (result.chance,)),
         ),
@@ -240,6 +240,16 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
             'base. More is expected to remain far from the measured poses.',
             figure=figures.error_map(found),
         )
+
+
+def _unmodelled(result: Identification) -> list[str]:
+    """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
+    turn, tilt = (1e3 * size for size in result.posterior.unmodelled)
+    text = (
+        f"What remains looks like the arm's own: joints off by {turn:.3f} mrad about their axes "
+        f'and {tilt:.3f} mrad across, which the model lacks. Expected errors include it.'
+    )
+    return [text] if turn + tilt else []
 
 
 def _effects(result: Identification) -> Section:

@@ -294,17 +294,6 @@ def scatter_in_words(noise: Noise) -> str:
     return f'{text} The intervals are widened accordingly.'
 
 
-def unmodelled_in_words(result: Identification) -> str:
-    """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
-    turn, tilt = (1e3 * size for size in result.posterior.unmodelled)
-    if not turn + tilt:
-        return ''
-    return (
-        f"What remains looks like the arm's own: joints off by {turn:.3f} mrad about their axes "
-        f'and {tilt:.3f} mrad across, which the model lacks. Expected errors include it.'
-    )
-
-
 def drift_in_words(noise: Noise) -> str:
     """Return the evidence for drift: errors shared in succession only."""
     return neighbours_in_words(noise) if noise.shared == ('successive',) else ''

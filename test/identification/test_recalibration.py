@@ -50,7 +50,7 @@ def test_a_joint_whose_zero_has_slipped_is_named_and_mended_by_8_poses(earlier, 
     assert after < 1.5 * rms(previous.chain, true, Q)
     assert f'{joint}.theta by +0.' in reason.in_words()
     assert found.refusal() == ('', '')
-    sigma = found.calibration.sigma(Q)
+    sigma = found.calibration.region.known(Q)  # by chance this arm seems to lack an effect
     assert 0.5 < after / np.sqrt(np.mean(sigma**2)) < 2.0
 
 
