@@ -30,10 +30,10 @@ def remarked(problem: Problem, result: Identification) -> Identification:
         each.velocity is None and each.pixels is None and not each.socket and not each.plane
         for each in problem.sets
     )
-    if result.noise.position <= 1.0 or known or not stands or not first.moving:
+    bases = {each.base for each in (first, *more) if each.moving}
+    if result.noise.position <= 1.0 or known or not stands or not bases:
         return result
-    late = replace(problem, observations=first, more=more, held_out=())
-    chain, bases = result.chain, {each.base for each in late.sets if each.moving}
+    late, chain = replace(problem, observations=first, more=more, held_out=()), result.chain
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
     delays = [Parameter(name, DELAY) for name in sorted(bases)]

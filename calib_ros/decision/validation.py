@@ -195,8 +195,11 @@ def _of_held_out(
     explained: Flags | None,
 ) -> tuple[Comparison, str]:
     if problem.loss != 'none':
-        distances = distances_of(after, names, problem.system(problem.judging))
-        judged = np.concatenate(distances) <= OUTLIER
+        judged, new = ~comparison.counting, comparison.counting
+        ends = np.cumsum([len(each) for each in problem.judging])[:-1]
+        pairs = zip(problem.judging, np.split(new, ends), strict=True)
+        sets = [each.select(rows) for each, rows in pairs if rows.any()]
+        judged[new] = np.concatenate(distances_of(after, names, problem.system(sets))) <= OUTLIER
         judged |= np.False_ if explained is None else explained
         comparison = replace(comparison, judged=judged)
     text = f'{comparison.counting.sum()} held-out poses{comparison.omitted}'

@@ -99,6 +99,11 @@ def test_held_out_samples_at_fitted_configurations_decide_nothing(rng):
     single = identify(Problem(UR10E, seen, held_out=held_out.select(np.arange(19, 21)), **SIGMAS))
     assert single.accepted
     assert single.validated_by.startswith('5-fold cross-validation over 40 different poses')
+    far = held_out.select(np.arange(15, 23))
+    far.positions[5:] += 0.5  # against those that repeat, all new ones would be outliers
+    wrong = identify(Problem(UR10E, seen, held_out=far, **SIGMAS))
+    assert (wrong.validation.outliers, wrong.validation.figures[1].count) == (0, 3)
+    assert not wrong.accepted
 
 
 @pytest.mark.parametrize('design', ['sweep', 'grid'])
