@@ -295,12 +295,15 @@ class History:
             raise InputError(f'the history {folder} cannot be read: {err}') from err
 
     def _read(self, serial: str, key: str) -> Any:
+        import pyarrow as pa
         import pyarrow.parquet as parquet
 
         path = self._path(serial, key)
         try:
-            with self._files.open(path, 'rb') as file:
-                found = parquet.read_table(file, schema=_schema())  # of other columns none
+            data = pa.BufferReader(self._files.cat_file(path))
+            # threads of pyarrow abort some processes at their end
+            read = parquet.ParquetFile(data).read(use_threads=False)
+            found = pa.Table.from_pylist(read.to_pylist(), schema=_schema())
             if found.column('key').to_pylist() != [key]:
                 raise ValueError('its name is not its key')
             return found
@@ -324,7 +327,8 @@ class History:
 
         with suppress(OSError, pa.ArrowException):
             data = self._files.cat_file(f'{self._folder(serial, ".cache/")}.arrow')
-            table = pa.ipc.open_file(io.BytesIO(data)).read_all()
+            alone = pa.ipc.IpcReadOptions(use_threads=False)  # see `_read`
+            table = pa.ipc.open_file(data, options=alone).read_all()
             if table.schema.equals(_schema()):
                 return table
         return _schema().empty_table()
