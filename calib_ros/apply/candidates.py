@@ -168,8 +168,8 @@ def iso_9283_poses(
     The arm reaches the cube and the device sees it, beside the z axis of the base; its edges are
     parallel to the base frame. All poses have one orientation: P1 is at the centre, P2 to P5 on a
     diagonal plane, each a tenth of the diagonal away from a corner. Cubes grow about 500 reachable
-    centres while inverse kinematics tracks their corners. Where an arm can keep its orientation in
-    none, as with fewer than six joints, the orientation is any.
+    centres while inverse kinematics tracks their corners. If the arm can keep its orientation in
+    none, as with fewer than six joints, orientations vary.
     """
     middle = draw_candidates(design, 500, rng, visibility)
     corners = np.repeat(middle[:, np.newaxis], 8, axis=1)
@@ -184,8 +184,8 @@ def iso_9283_poses(
             break
     else:
         raise InputError(
-            'the arm reaches all corners of no cube: choose test poses yourself; any new ones '
-            'will do'
+            'the arm cannot reach all corners of any cube: choose test poses yourself; any new '
+            'ones will do'
         )
     travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
     best = cubes.select(travel.argmin()[np.newaxis])

@@ -200,9 +200,9 @@ def _outside(compensator: Compensator, result: Compensation) -> list[Refusal]:
     return [
         Refusal(
             k,
-            f'the calibration is not valid in {share:.0f} % of the program, as here: by its '
-            f'parameters an error of {1e3 * errors[k]:.3f} mm is expected, where it is valid at '
-            f'most {1e3 * region.limit:.3f} mm; identify again with poses near it',
+            f'the calibration is not valid in {share:.0f} % of the program, as here: the '
+            f'expected error by its parameters, {1e3 * errors[k]:.3f} mm, exceeds the limit of '
+            f'{1e3 * region.limit:.3f} mm; identify again with poses near it',
         )
         for k in outside.tolist()
     ]

@@ -27,9 +27,10 @@ from calib_ros.report.advice import ENOUGH
 from calib_ros.report.applied import plan_report
 
 TESTS = (
-    'P1 to P5 of ISO 9283 in a cube of {:.3f} m, {} orientation: visit them in turn, 30 times, '
+    'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}: visit them in turn, 30 times, '
     'and measure. Collisions are not checked'
 )
+ORIENTED = 'various orientations', 'one orientation'
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -46,7 +47,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     with screen.work('choosing poses') as work:
         if options.iso9283:
             tests = iso_9283_poses(design, rng, visibility)
-            words = TESTS.format(tests.edge, 'one' if tests.oriented else 'any')
+            words = TESTS.format(tests.edge, ORIENTED[tests.oriented])
             joints, plan = tests.joints, None
         else:
             joints, words, plan = _measurement(options, design, visibility, rng, work)

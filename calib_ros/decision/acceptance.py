@@ -35,7 +35,7 @@ def refusals(
 
     `own_behaviour` describes outliers that are the arm's own (`misfits.py`), `may_be_rounding` is
     the verdict of `rounding.py`, `sized` tells whether the measurements fix the size and shape of
-    the arm, and `scaled` is the scale of the device, minus one, that alone leaves no region.
+    the arm, and `scaled` is the error of the device's scale if that alone leaves no region.
     """
     failed = [*_of_the_fit(problem, result, own_behaviour)]
     validation = result.validation
@@ -137,9 +137,9 @@ def _of_the_gain(
 def out_of_scale(scale: float) -> str:
     """Return that a scale of the device, given minus one, may make the calibrated arm worse."""
     return (
-        f'{grown(scale)}, as by a measuring device that is out of scale; '
-        'then the correction would make the arm worse. If a known length shows the right scale, '
-        'set sigma_scale'
+        f'{grown(scale)}, as if the measuring device were out of scale; then the correction '
+        'would make the arm worse. If a known length shows that its scale is right, set '
+        'sigma_scale'
     )
 
 

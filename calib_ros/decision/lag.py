@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses measured before the target had come to rest: each lies towards the stop before.
+"""Poses measured before the target had come to rest: each lies towards the previous stop.
 
 A device that smooths, late stamps or a creeping arm shows joint values q_i - w (q_i - q_i-1): a
 delay w with the last move as velocity. The arm imitates what depends on q_i alone, and may become
@@ -41,9 +41,9 @@ def remarked(problem: Problem, result: Identification) -> Identification:
     if share < EXPLAINED:
         return result
     text = (
-        f'each pose lies towards the stop before, which explains {100.0 * share:.0f} % of what is '
-        'left: the device smooths, stamps are late, or the arm creeps. Set settle to the time '
-        'until measurements rest, and stop for longer'
+        f'poses lie towards the previous stop, which explains {100.0 * share:.0f} % of the '
+        'residuals: the device smooths, stamps are late, or the arm creeps. Set settle to the '
+        'time until measurements rest, and stop for longer'
     )
     if imitated(late, result):
         return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
@@ -51,7 +51,7 @@ def remarked(problem: Problem, result: Identification) -> Identification:
 
 
 def _with_moves(each: Observations) -> Observations:
-    """Return poses with the way from the stop before (N, n) as velocity."""
+    """Return poses with the move from the previous stop (N, n) as velocity."""
     order = np.argsort(each.stamps_ns, kind='stable')
     moves = np.zeros_like(each.joints)
     moves[order[1:]] = np.diff(each.joints[order], axis=0)

@@ -325,7 +325,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
     for keys in dict.fromkeys(((*held,), (*held[:1],), (*held[1:],))):
         if keys:
             what = f'the chain file gives a wrong {" and ".join(keys)} (fixed: true)'
-            remedy = 'correct it, or leave out fixed: true there'
+            remedy = 'correct it, or remove fixed: true there'
             base, tool = (None if key in keys else getattr(chain, key) for key in ('base', 'tool'))
             arm = replace(chain, base=base, tool=tool)
             yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)

@@ -275,7 +275,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
         if imitates or share > EXPLAINED:
             lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
             text = f'other intrinsics of the camera than those given explain {100.0 * share:.0f} %'
-            text += f' of what is left: {lens}, or calibrate the camera as it is used'
+            text += f' of the residuals: {lens}, or calibrate the camera as it is used'
             return text, imitates
     return '', False
 

@@ -55,7 +55,7 @@ def _group(name: str) -> str:
 
 
 def turns_and_tilts(chain: Chain) -> tuple[list[Parameter], list[Parameter]]:
-    """Return what turns each joint about its axis (slides it, if prismatic), and tilts it."""
+    """Return parameters that turn each joint (slide it, if prismatic), and that tilt its axis."""
     tilts = [Parameter(name, kind) for name in chain.joint_names for kind in ('alpha', 'beta')]
     return [joint.driven for joint in chain.joints], tilts
 

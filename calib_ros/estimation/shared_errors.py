@@ -254,7 +254,7 @@ def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[_Stops, int]:
-    """Return the stops of all sets, and k: of more than `most`, every k-th run of a twentieth."""
+    """Return the stops of all sets, or of every k-th run of `most` / 20 if there are more; k."""
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // most))
     return _gather(chain, names, system, share, most // 20), share

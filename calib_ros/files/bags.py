@@ -46,10 +46,10 @@ class Replayed:
         dropped for their stamp or a full buffer; not what the device did not see.
         """
         if self.recorded is None and largest_loss < 1.0:
-            text = f'how much of the bag is lost is not known, {ALLOW} 1'
+            text = f'how much of the bag is lost is not known: {ALLOW} 1'
             return (Reason(Rule.UNKNOWN_LOSS, text),)
         share = max(0.0, 1.0 - self.read / self.recorded) if self.recorded else 0.0
-        text = f'{share:.0%} of the messages could not be read, {allowing(share)}'
+        text = f'{100.0 * share:.0f} % of the messages could not be read: {allowing(share)}'
         unreadable = [Reason(Rule.UNREADABLE, text)] if share > largest_loss else []
         return (*unreadable, *too_much_lost(account, largest_loss))
 

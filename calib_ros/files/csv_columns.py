@@ -256,7 +256,9 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     }
     of_joints = [f'q{k}' for k in range(1, joints + 1)]
     whole = found.keys() >= {*of_joints}
-    like = like_joints(header, joints) if found.keys() & {*of_joints} else {}
+    lacking = found.keys() & {*of_joints}
+    fewer = bool(lacking) and 'q1' in header and 'q0' not in header
+    like = like_joints(header, joints) if lacking and not fewer else {}
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
     if whole or like:
         others = {name: found[name] for name in found if name not in of_joints}
@@ -268,7 +270,8 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     for option, unit in reversed(units):
         if re.search(rf'(?<!\w){unit}(?!\w)', named):
             more = f' --{option} {unit.replace("°", "deg")}{more}'
-    return f'Columns of other names: --columns "{",".join(given)}"{more}'
+    options = f'Columns of other names: --columns "{",".join(given)}"{more}'
+    return f'Is it another arm (--chain)? {options}' if fewer else options
 
 
 def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:

@@ -142,7 +142,7 @@ def _region(
     more: Sequence[str],
     doubts: Mapping[str, float],
 ) -> tuple[Region | None, float]:
-    """Return the region, and the scale of the device, minus one, that alone leaves none, or 0.
+    """Return the region, and the error of the device's scale if that alone leaves none, or 0.
 
     The posterior is that with `more` effects, `doubts` and noise of a `size`.
     """

@@ -340,7 +340,7 @@ def refuse_other_joints(
         for each in (chain, other)
     )
     if ours != theirs:
-        raise error(f'{what} has the joints {ours}; {whose} has {theirs}: are they of one robot?')
+        raise error(f'{what} has the joints {ours}; {whose} has {theirs}: are they the same arm?')
 
 
 @lru_cache(maxsize=64)

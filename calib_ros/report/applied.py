@@ -256,6 +256,7 @@ def verification_report(
     state, steps = standing(found)
     gain = sections.gain(found.comparison, intervals=False)
     title = 'Accuracy before and after the correction'
+    different = 'Different poses', f'{found.configurations:,}'
     accuracy = sections.accuracy_section(
         title, found.comparison, poses.things, COMPUTED, intervals=False
     )
@@ -267,9 +268,7 @@ def verification_report(
         picture=sections.distribution(poses),
         steps=steps,
         remarks=(*warnings, *hints(found)),
-        identity=sections.identity_of(
-            chain, origin, poses, ('Different poses', str(found.configurations)), table_hash(chain)
-        ),
+        identity=sections.identity_of(chain, origin, poses, different, table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(
             *((_by_configuration(found),) if found.each else ()),

@@ -65,7 +65,7 @@ def workspace_png(survey: Survey) -> bytes:
         axes[0].hist(1e3 * errors, bins=60, color=AFTER, alpha=0.7)
         for share, style in ((0.5, '-'), (0.95, '--')):
             value = 1e3 * float(np.quantile(errors, share))
-            name = f'{share:.0%}: {value:.3f} mm'
+            name = f'{100.0 * share:.0f} %: {value:.3f} mm'
             axes[0].axvline(value, color='black', linestyle=style, label=name)
         axes[0].set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
         axes[0].legend(frameon=False)

@@ -246,8 +246,9 @@ def _unmodelled(result: Identification) -> list[str]:
     """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
     turn, tilt = (1e3 * size for size in result.posterior.unmodelled)
     text = (
-        f"What remains looks like the arm's own: joints off by {turn:.3f} mrad about their axes "
-        f'and {tilt:.3f} mrad across, which the model lacks. Expected errors include it.'
+        f"Part of the remaining error looks like the arm's own, which the model lacks: joints off "
+        f'by {turn:.3f} mrad about their axes and {tilt:.3f} mrad across them (one sigma). '
+        'Expected errors include it.'
     )
     return [text] if turn + tilt else []
 

@@ -89,7 +89,7 @@ def hints(found: Verification) -> list[str]:
     if found.common < NEARER:
         lines.append(
             'without one common shift and turn of all positions, only '
-            f'{100.0 * found.common:.0f} % of the error would remain: was the measuring device '
+            f'{100.0 * found.common:.2g} % of the error would remain: was the measuring device '
             'moved? If on purpose, --new-base fits its frame, and --new-tool that of a new target'
         )
     elif 1e-3 * found.comparison.figures[1].rms_mm > Settings.largest_error:

@@ -80,7 +80,7 @@ BESIDE_SETTINGS = (
     Parameter(
         'largest_loss',
         EXCEPTION,
-        'share of joint states or measurements that may be dropped for stamps or full buffers',
+        'largest share of joint states or measurements dropped because of stamps or full buffers',
         False,
         0.0,
     ),

@@ -123,12 +123,12 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
 
 def apart(ahead: float) -> Hint:
     """Report clocks too far apart: measurements are `ahead` of the joint states [s]."""
-    when, unless = ('after', 'both still arrive')
+    when, other = ('after', 'check that joint states still arrive')
     if ahead < 0.0:
-        when, unless = ('before', 'the device does not just send late (lateness)')
+        when, other = ('before', 'raise lateness if the device sends late')
     words = (
         f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state: synchronise '
-        f'the clocks (NTP, PTP) if {unless}, and repeat the poses of that time'
+        f'the clocks (NTP, PTP), or {other}; then repeat the poses of that time'
     )
     return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks', words)
 
@@ -165,7 +165,7 @@ def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     counts = ((JOINTS, account.joint_states), (POSES, account.poses))
     shares = {name: lost(name, count, account.dropped)[0] for name, count in counts}
     return [
-        Reason(Rule.DROPPED, f'{share:.0%} of the {name} {LOST}, {allowing(share)}')
+        Reason(Rule.DROPPED, f'{100.0 * share:.0f} % of the {name} {LOST}: {allowing(share)}')
         for name, share in shares.items()
         if share > largest_loss
     ]
@@ -183,8 +183,8 @@ def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint
         total = received[kind]
         share, cause = lost(kind, total, dropped)
         if share > EXCEPTION and share * total >= NO_ACCIDENT:
-            words = f'{share:.0%} of the {kind} {LOST}: {cause}'
-            found.append(Hint(f'{share:.0%} of the {kind} are dropped: {cause}', words))
+            words = f'{100.0 * share:.0f} % of the {kind} {LOST}: {cause}'
+            found.append(Hint(f'{100.0 * share:.0f} % of the {kind} are dropped: {cause}', words))
     return found
 
 
@@ -253,7 +253,7 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
         return None
     where = ', '.join(f'{value:g}' for value in max(places, key=lambda key: len(places[key]))[3:])
     return Hint(
-        f'{len(repeated)} poses are repeated: is the device frozen?',
+        f'{len(repeated)} poses repeat a position: is the device frozen?',
         f'{len(repeated)} poses repeat a position to the last digit, such as {where} m: does the '
         'device see the target, and does its driver send live data? Clear and measure again',
         explains=False,

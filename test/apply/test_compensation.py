@@ -338,7 +338,7 @@ def test_settings_out_of_range_are_refused(setting, complaint):
 
 
 def test_chains_of_other_joints_are_refused():
-    with pytest.raises(ConfigError, match='are they of one robot'):
+    with pytest.raises(ConfigError, match='are they the same arm'):
         Compensator(UR, ROBOTS['puma560'])
 
 

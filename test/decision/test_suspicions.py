@@ -313,7 +313,7 @@ def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_ha
     result = identify(Problem(UR, seen))
     assert result.accepted == (not refused)
     assert (Rule.LAG in [each.rule for each in result.refusals]) == refused
-    assert any('towards the stop before' in each for each in result.remarks) == (share == 1e-4)
+    assert any('towards the previous stop' in each for each in result.remarks) == (share == 1e-4)
 
 
 @pytest.mark.parametrize('size', [3e-4, 1e-3])

@@ -355,7 +355,10 @@ def test_axes_called_like_accelerations_are_none(run, tmp_path):
             ['x', 'y', 'z', 'a', 'b'],
             '--columns "q*=NAME*"; joint values in another file: --joints FILE',
         ),
-        (['q1', 'a', 'x', 'y', 'z'], '--columns "q2=NAME"'),
+        (
+            ['q1', 'c11', 'c12', 'y', 'z'],
+            'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
+        ),
         (
             ['J1 [°]', 'J2 [°]', 'x [mm]', 'y [mm]', 'z [mm]'],
             '--columns "q*={J* [°]},x={x [mm]},y={y [mm]},z={z [mm]}" --length mm --angle deg',

@@ -121,7 +121,7 @@ def test_topics_whose_names_are_no_text_are_not_read(bag, column, known):
     [
         (100, 100, 0.1, ''),
         (100, 91, 0.1, ''),
-        (100, 80, 0.1, '20% of the messages could not be read'),
+        (100, 80, 0.1, '20 % of the messages could not be read'),
         (100, 80, 0.25, ''),
         (None, 80, 0.1, 'not known'),
         (None, 80, 1.0, ''),

@@ -181,7 +181,7 @@ def test_a_calibration_is_read_from_its_file_or_folder(tmp_path):
         ('ur10e', None, 'is a chain, but not a calibration'),
         ('ur10e', {}, 'is a chain, but not a calibration'),
         ('ur10e', {'accepted': False}, 'was not accepted'),
-        ('puma560', {'samples': 3}, 'the nominal chain has .* are they of one robot'),
+        ('puma560', {'samples': 3}, 'the nominal chain has .* are they the same arm'),
         ('ur5e', {'samples': 3}, r'is not the calibration of this robot: .*elbow_joint\.a'),
         ('ur10', {'nominal': nominal_document(load_chain('ur10e'))}, r'\.d 0.1807 and not 0.1273'),
         ('ur10e', {'nominal': {'convention': 'standard'}}, 'must be a list of 5 numbers'),

@@ -222,7 +222,7 @@ def test_much_that_is_dropped_is_told_and_why(share, count):
     found = told(made)
     assert len(found) == count
     if count:
-        said = r'\d\d% of the measurements were dropped .*: zero stamp \(fill header.stamp'
+        said = r'\d\d % of the measurements were dropped .*: zero stamp \(fill header.stamp'
         assert re.match(said, found[0])
 
 
@@ -251,7 +251,7 @@ def test_other_values_with_the_same_stamp_are_told(of, other, count):
     warnings = told(made)
     assert len(warnings) == count
     for words in warnings:
-        said = rf'[45]\d% of the {of} were dropped .*: different values with the same stamp'
+        said = rf'[45]\d % of the {of} were dropped .*: different values with the same stamp'
         assert re.match(said, words)
 
 

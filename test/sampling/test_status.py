@@ -140,7 +140,7 @@ def test_poses_that_do_not_follow_the_arm_are_told():
     assert not made.warnings
     still = {'position': np.full(3, 1e-16), 'rotation': np.eye(3)}
     made.restore([replace(each, **still) for each in good[8:]])
-    assert '22 poses are repeated: is the device frozen?' in made.status()
+    assert '22 poses repeat a position: is the device frozen?' in made.status()
     assert '22 poses repeat a position to the last digit, such as 0, 0, 0 m' in made.warnings[0]
 
 
@@ -150,7 +150,7 @@ def test_stops_at_which_the_last_place_was_repeated_are_told(every, told):
     spreads = [0.0 if k % every == 0 else 1e-5 for k in range(30)]
     given = zip(samples(30), spreads, strict=True)
     made = session([replace(each, count=9, spread=spread) for each, spread in given])
-    assert ('poses are repeated: is the device frozen?' in made.status()) == told
+    assert ('poses repeat a position: is the device frozen?' in made.status()) == told
 
 
 def test_the_status_is_never_an_error():
