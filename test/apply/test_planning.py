@@ -137,7 +137,7 @@ def test_half_of_the_measured_poses_predict_as_well_as_all():
     half = identify(replace(problem, observations=fitted.select(chosen)))
     whole = identify(problem).validation.figures[1].rms_mm
     assert half.validation.figures[1].rms_mm < 1.1 * whole
-    left = half.validation.after.position[half.validation.judged]
+    left = half.validation.after.position[half.validation.deciding]
     noise = problem.sigma_position * half.noise.position
     assert 0.8 < np.sqrt(np.mean((left / noise) ** 2)) < 1.25
 

@@ -293,6 +293,6 @@ def test_programs_are_corrected_inside_the_region_only(local, folder):
         refused.append([each.sample for each in result.refusals if 'not valid' in each.reason])
         first = min(each.reason for each in result.refusals if 'not valid' in each.reason)
         assert 'not valid in 25 % of the program' in first
-        said = f'valid at most {1e3 * local.region.limit:.3f} mm; identify again'
+        said = f'exceeds the limit of {1e3 * local.region.limit:.3f} mm; identify again'
         assert first.endswith(f'{said} with poses near it')
     assert refused == [list(range(15, 20))] * 2
