@@ -10,10 +10,10 @@ import pytest
 from robots import DATA, needs_data
 from scipy.spatial.transform import Rotation
 
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout, presets
+from calib_ros.files.layouts import Layout, load_layout
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
@@ -79,16 +79,6 @@ def test_poses_of_a_leica_as_published(run, tmp_path):
     foreign = Foreign(load_layout('ipa_leica'), load_chain('ur10'))
     direct = read_table(raw, 6, foreign=foreign)
     np.testing.assert_array_equal(direct.fitted[0].covariance, covariance)
-
-
-def test_later_columns_may_use_our_names_of_earlier_ones():
-    """As messages about a wrong setting name them."""
-    given = ['q*=J*', 'q1=q2,q2=q1', 'q2=q2-{q1},target=q1']
-    columns = layout_of('', given, {}).columns
-    assert (columns['q1'], columns['q2']) == ('(J2)', '((J1))-{q1}')
-    assert columns['target'] == 'q1'
-    coupled = layout_of('fanuc', ['q3=q3-q2'], {}).columns['q3']
-    assert coupled == '(J3 + J2)-(J2)'
 
 
 EULER = [a + b + c for a in 'XYZ' for b in 'XYZ' for c in 'XYZ' if a != b and b != c]
@@ -257,44 +247,6 @@ def test_a_log_of_universal_robots(tmp_path):
     (tmp_path / 'table.csv').write_text(text + '1,2,3\n')
     with pytest.raises(InputError, match=r'has 3 rows, .* has 4'):
         read_table(tmp_path / 'table.csv', 2, foreign=foreign)
-
-
-def test_every_preset_says_where_its_format_is_documented():
-    assert len(presets()) >= 11
-    for name in presets():
-        layout = load_layout(name)
-        assert layout.description
-        assert layout.source
-        for each in layout.columns.values():
-            Expression.parse(each)
-
-
-def test_presets_of_users_and_their_faults(tmp_path):
-    path = tmp_path / 'mine.yaml'
-    path.write_text('length: mm\ncolumns: {x: 2*A}\n')
-    assert load_layout(str(path)).columns == {'x': '2*A'}
-    for text, error in (
-        ('lenght: mm', UnknownNameError),
-        ('length: ell', ConfigError),
-        ('columns: {w: A}', ConfigError),
-        ('columns: [1]', ConfigError),
-        ('inverse: 3', ConfigError),
-        ('euler: XXY', ConfigError),
-        ('- 1', ConfigError),
-    ):
-        path.write_text(text)
-        with pytest.raises(error):
-            load_layout(str(path))
-    with pytest.raises(UnknownNameError, match='optitrack'):
-        load_layout('optitrak')
-
-
-@pytest.mark.parametrize(
-    'text', ['a**b', 'f(x)', 'a b', '1+', '__import__("os")', '{}', '', 'a;b']
-)
-def test_what_is_no_expression(text):
-    with pytest.raises(ConfigError, match='not an expression'):
-        Expression.parse(text)
 
 
 def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
