@@ -95,7 +95,6 @@ def _choose_groups(
     together = model.judge(chosen, every, 'all')
     if not together.pays:
         return
-    model.quieten(together)
     for group in left:
         others = [name for name in every if name not in groups[group]]
         verdict = model.judge([*chosen, *others], groups[group], group)
@@ -103,7 +102,9 @@ def _choose_groups(
             verdicts[group] = verdict
         else:
             every = others
-    chosen += every
+    if every:
+        chosen += every
+        model.quieten(together)
 
 
 def _choose_harmonics(
