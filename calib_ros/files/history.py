@@ -190,11 +190,12 @@ def judged(
 
 
 def verified(chain: Chain, found: Verification, about: Filing) -> Row:
-    """Return the row of a verification."""
+    """Return the row of a verification; without freedom, and so in no chart, of fitted poses."""
     before, after = found.comparison.figures
     figures = before, replace(after, rms_mm=1e3 * found.rms)
     limits = found.lower, found.upper
-    return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=found.freedom)
+    freedom = None if found.reused else found.freedom
+    return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=freedom)
 
 
 def _row(

@@ -75,8 +75,11 @@ def test_the_error_told_is_the_one_within_its_limits():
     assert found.rms > 1.02e-3 * found.comparison.figures[1].rms_mm
     said = 'over poses like these is '
     assert f'{said}{1e3 * found.rms:.4f} mm' in in_words(found)
-    row = verified(arm, found, Filing('7', datetime.now(timezone.utc), 'i', 's'))
-    assert row.rms_mm == pytest.approx(1e3 * found.rms)
+    filing = Filing('7', datetime.now(timezone.utc), 'i', 's')
+    row = verified(arm, found, filing)
+    assert (row.rms_mm, row.rms_freedom) == pytest.approx((1e3 * found.rms, found.freedom))
+    fitted = replace(found, reused=0.1)  # no night of a chart
+    assert verified(arm, fitted, filing).rms_freedom is None
     poses = poses_to_verify(arm, [seen], found.comparison)
     report = verification_report(arm, found, poses, Origin())
     assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
