@@ -140,12 +140,17 @@ def _outcome(task: Task) -> Outcome:
 
 @contextmanager
 def fetched(url: str) -> Iterator[Path]:
-    """Yield a local path, or that of a copy of a remote file or folder."""
+    """Yield a local path, or that of a copy of a remote file or folder.
+
+    Copies lie in the folder of the worker, which dask empties even after the worker was killed.
+    """
+    from distributed import get_worker
+
     files, path = _file_system(url)
     if is_local(files):
         yield Path(path)
         return
-    with TemporaryDirectory(prefix='calib_ros_') as folder:
+    with TemporaryDirectory(dir=get_worker().local_directory) as folder:
         target = Path(folder) / PurePosixPath(path).name
         files.get(path, str(target), recursive=_is_folder(files, path))
         yield target

@@ -63,8 +63,10 @@ def served(tmp_path):
     return tmp_path
 
 
-def test_whatever_is_killed_each_result_is_filed_once(served):
-    history, known = served / 'history', served / 'scheduler.json'
+def test_whatever_is_killed_each_result_is_filed_once_and_no_copy_is_left(served, monkeypatch):
+    history, known, copies = served / 'history', served / 'scheduler.json', served / 'tmp'
+    copies.mkdir()
+    monkeypatch.setenv('TMPDIR', str(copies))
     with (
         started(DASK, 'scheduler', *ALONE, '--port', '0', '--scheduler-file', known),
         started(DASK, 'worker', '--scheduler-file', known, *ONE, *ALONE) as nannies,
@@ -89,6 +91,7 @@ def test_whatever_is_killed_each_result_is_filed_once(served):
         assert left < 17
         assert main(command) == 0
         assert filed() == 17
+    assert not list(copies.rglob('*.csv'))
     rows = [row for serial in 'ABC' for row in History(history).rows(serial)]
     assert len({row.key for row in rows}) == len({row.source for row in rows}) == 17
     assert all(row.accepted for row in rows)
