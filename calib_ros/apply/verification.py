@@ -26,9 +26,10 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from calib_ros.apply.candidates import TILTED
-from calib_ros.apply.commanded import meant
+from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.decision.validation import Comparison, compare
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
@@ -176,7 +177,7 @@ def verify(
         have freedoms.
     commanded : (M, n), optional
         Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
-        poses there. Each measurement belongs to one of them (`commanded.py`).
+        poses there. Each measurement belongs to one of them, as it is or corrected.
     progress : Notify
         Receives the share done.
 
@@ -227,7 +228,7 @@ def _compared(
             raise InputError('the commanded joint values are not all finite numbers')
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         arms = arm.before, arm.chain
-        found = [meant(*arms, each.joints, commanded) for each in sets]
+        found = [_meant(*arms, each.joints, commanded) for each in sets]
         wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
@@ -330,3 +331,27 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
         frame = chain.frame(base)
         chain = chain.with_frame(base, replace(frame, matrix=motion @ frame.matrix))
     return chain
+
+
+def _meant(
+    nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
+) -> tuple[FloatArray, Index]:
+    """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
+
+    The nearest of the program (M, n), as it is or corrected by the calibration, and which (N,)
+    were nearer to it corrected (1) or as it is (0). If points of a path are closer than the
+    correction, corrected ones are nearer to other points than to their own. Measurements further
+    from the program than any correction raise an InputError.
+    """
+    far, _ = cKDTree(commanded).query(joints, p=np.inf)
+    lost = np.flatnonzero(far > Compensator.largest_turn)
+    if lost.size:
+        raise InputError(
+            f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from '
+            'the nearest commanded joint values: does it belong to that program?'
+        )
+    change = Compensator(nominal, calibrated).follower.solve(commanded).change
+    both = np.concatenate([commanded, commanded + change])
+    _, nearest = cKDTree(both).query(joints, p=np.inf)
+    corrected, point = np.divmod(nearest, len(commanded))
+    return commanded[point], corrected

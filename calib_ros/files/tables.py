@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,29 +42,18 @@ from calib_ros.files.measurements import (
     joined,
     measurements,
 )
-from calib_ros.identification.records import Owner
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.problems import Measured
-from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
+from calib_ros.sampling.sample import Measured, Sample, View, gathered
 from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
 
 USUAL_SIGMAS = (Settings.sigma_position, Settings.sigma_orientation)
 """Default standard deviations [m, rad]."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Table(Measured):
-    """Content of a table; with `by_line` stamps are lines, in seconds."""
-
-    warnings: tuple[str, ...] = ()
-    by_line: bool = False
-    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is
 
 
 def read_table(
@@ -75,7 +64,7 @@ def read_table(
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,
-) -> Table:
+) -> Measured:
     """Read a CSV table, or one in any other layout.
 
     Parameters
@@ -101,19 +90,23 @@ def read_table(
         For a missing column, a value that is not a number, an ambiguous session, or measurements
         of one device in different frames. The message names the line.
     """
-    path = Path(path)
-    if foreign is not None:
-        made, warnings = foreign.convert(path)
-        return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
-    if path.is_file() and path.stat().st_size > LARGEST_TABLE:
+    path, by_line = Path(path), False
+    warnings: tuple[str, ...] = ()
+    rows: Measurements | None = None
+    if foreign is None and path.is_file() and path.stat().st_size > LARGEST_TABLE:
         rows, warnings = _of_journal(path, joints, progress) or (None, ())
-        if rows is not None:
-            chosen = rows.select(_rows_of(path, rows.session, sessions))
-            return _table(chosen, sigmas, eye_in_hand, warnings)
-    data, warnings = _read(path, columns(joints))
-    found = columns_of(path, data, progress)
-    warnings = (*warnings, *_unread(found, joints))
-    return table_of(found, joints, sessions, sigmas, eye_in_hand, warnings)
+    if rows is not None:
+        rows = rows.select(_rows_of(path, rows.session, sessions))
+    else:
+        found: Columns
+        if foreign is not None:
+            found, warnings = foreign.convert(path)
+        else:
+            data, warnings = _read(path, columns(joints))
+            found = columns_of(path, data, progress)
+            warnings = (*warnings, *_unread(found, joints))
+        rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
+    return _table(rows, sigmas, eye_in_hand, warnings, by_line)
 
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
@@ -123,15 +116,8 @@ def _unread(found: Columns, joints: int) -> Iterator[str]:
         yield f'{found.path}: {turns} are left out: give --euler or --rotation-vector to use them'
 
 
-def table_of(
-    found: Columns,
-    joints: int,
-    sessions: Sequence[str] = (),
-    sigmas: tuple[float, float] = USUAL_SIGMAS,
-    eye_in_hand: bool = False,
-    warnings: tuple[str, ...] = (),
-) -> Table:
-    """Return the table of columns; arguments as in `read_table`."""
+def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
+    """Return the measurements of some sessions."""
     if not len(found.lines):
         measurements(found, joints)  # names missing columns first
         raise InputError(f'{found.path} has no rows')
@@ -139,42 +125,37 @@ def table_of(
         names = ', '.join(sessions)
         raise InputError(f'{found.path} has no column "session" to choose "{names}" from')
     rows = _rows_of(found.path, found.labels('session'), sessions)
-    chosen = found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
-    made = measurements(chosen, joints)
-    return _table(made, sigmas, eye_in_hand, warnings, 'stamp_ns' not in found.header)
+    every = np.array_equal(rows, np.arange(len(found.lines)))
+    return measurements(found if every else found.select(rows), joints)
 
 
 def _table(
     made: Measurements,
-    sigmas: tuple[float, float],
-    eye_in_hand: bool,
-    warnings: tuple[str, ...],
+    sigmas: tuple[float, float] = USUAL_SIGMAS,
+    eye_in_hand: bool = False,
+    warnings: tuple[str, ...] = (),
     by_line: bool = False,
-) -> Table:
+) -> Measured:
     made = made.kept()
     made.check_frames()
     if made.test.all():
         raise InputError(f'{made.path} has no rows to fit, only rows marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
-    frames = Frames()
     if made.view[1] != ['']:
-        samples = [*_samples(made)]
-        fitted, held_out = collect(samples, sigmas, frames)
+        found = gathered([*_samples(made)], sigmas)
     else:  # arrays, with one example of each kind
         _, number = distinct(made.codes)
-        samples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
+        examples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
 
         def observed(members: Sequence[int]) -> Observations:
             rows = np.isin(number, members)
             return (made if rows.all() else made.select(rows)).observations()
 
-        fitted, held_out = sets_of(samples, observed, sigmas, frames)
-    pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
+        found = gathered(examples, sigmas, observed=observed)
     place, names = made.frame_id
     world_frame = next((names[k] for k in place.tolist() if names[k]), '')
-    more = warnings, by_line, frames.owners
-    return Table(fitted, held_out, pairs, world_frame, cameras, *more)
+    return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)
 
 
 def check_table(made: MadeColumns) -> None:
@@ -185,7 +166,7 @@ def check_table(made: MadeColumns) -> None:
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
-    table_of(made, joints, tuple(dict.fromkeys(made.words.get('session', ()))))
+    _table(_chosen(made, joints, tuple(dict.fromkeys(made.words.get('session', ())))))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:

@@ -38,7 +38,7 @@ from calib_ros.files.history import (
     settings_hash,
 )
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.progress import Progress

@@ -46,8 +46,7 @@ from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_un
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.problems import check_settings
-from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sample import Sample, check_settings
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0
