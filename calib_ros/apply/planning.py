@@ -219,35 +219,23 @@ def efficiency(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Shown):
-    """Poses to measure, and the accuracy to expect.
-
-    Attributes
-    ----------
-    joints : (K, n)
-        Joint values [rad or m], the most informative first.
-    visit : (K,)
-        Visiting order.
-    travel : float
-        Time of all moves [s].
-    accuracy : (K,)
-        Predicted RMS position error [m] with the first 1, 2, ... K of them.
-    at_random : (K,)
-        The same with candidates taken at random (median of draws).
-    efficiency : float or None
-        Lower bound relative to the best choice of as many candidates; None for o2 to o5 and for
-        too few poses to determine all parameters.
-    lacking : tuple of str
-        Parameters that no choice of these candidates would determine; they are ignored.
-
-    """
+    """Poses to measure, and the accuracy to expect."""
 
     joints: FloatArray
+    """(K, n) joint values [rad or m], the most informative first."""
     visit: Index
+    """(K,) visiting order."""
     travel: float
+    """Time of all moves [s]."""
     accuracy: FloatArray
+    """(K,) predicted RMS position error [m] with the first 1, 2, ... K of them."""
     at_random: FloatArray
+    """(K,) the same with candidates taken at random (median of draws)."""
     efficiency: float | None
+    """Lower bound relative to the best choice of as many candidates; None for o2 to o5 and for
+    too few poses to determine all parameters."""
     lacking: tuple[str, ...]
+    """Parameters that no choice of these candidates would determine; they are ignored."""
 
     def to_frame(self) -> Any:
         """Return the joint values [rad or m] in visiting order as a pandas.DataFrame.

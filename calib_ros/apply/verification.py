@@ -78,58 +78,40 @@ class Attained:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Verification(Shown):
-    """Errors before and after a correction, and the verdict.
-
-    Attributes
-    ----------
-    comparison : Comparison
-        Residuals by the nominal and by the calibrated arm.
-    tolerance : float or None
-        Wanted RMS position error [m].
-    confidence : float
-        Of the interval.
-    group : (N,)
-        Configuration of each measurement; `configurations` counts them.
-    rms, lower, upper : float
-        RMS position error [m] over poses like these, and its interval.
-    freedom : float
-        Degrees of freedom of that error.
-    verdict : str
-        'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds', 'does not hold', or
-        'no verdict' if unknown. No verdict either if fitted measurements look good.
-    needed : int or None
-        Number of configurations that would decide with the same RMS error, if undecided; None if
-        even DECIDING would not.
-    common : float
-        Share of the RMS error that remains without one common shift and turn of all positions.
-    by_program : bool
-        Whether the wanted poses are those of the uncorrected program.
-    fitted : tuple of str
-        Frames fitted to the new measurements.
-    holds : bool or None
-        Whether the error agrees with that of the calibration (`Calibration.holds`), if known.
-    reused : float
-        Share of the measurements that the calibration was fitted to (`Calibration.reused`).
-    uncorrected : bool
-        Whether all measurements were taken at the joint values of the program as it was given.
-    """
+    """Errors before and after a correction, and the verdict."""
 
     comparison: Comparison
+    """Residuals by the nominal and by the calibrated arm."""
     tolerance: float | None
+    """Wanted RMS position error [m]."""
     confidence: float
+    """Of the interval."""
     group: Index
+    """(N,) configuration of each measurement; `configurations` counts them."""
     rms: float
     lower: float
     upper: float
+    """RMS position error [m] over poses like these, and its interval."""
     freedom: float
+    """Degrees of freedom of that error."""
     verdict: Verdict
+    """Without a tolerance 'holds', 'does not hold', or 'no verdict' if unknown; no verdict either
+    if fitted measurements look good."""
     needed: int | None
+    """Number of configurations that would decide with the same RMS error, if undecided; None if
+    even DECIDING would not."""
     common: float
+    """Share of the RMS error that remains without one common shift and turn of all positions."""
     by_program: bool
+    """Whether the wanted poses are those of the uncorrected program."""
     fitted: tuple[str, ...] = ()
+    """Frames fitted to the new measurements."""
     holds: bool | None = None
+    """Whether the error agrees with that of the calibration (`Calibration.holds`), if known."""
     reused: float = 0.0
+    """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     uncorrected: bool = False
+    """Whether all measurements were taken at the joint values of the program as it was given."""
 
     @property
     def configurations(self) -> int:
