@@ -20,11 +20,12 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.applied import standing, verification_report
+from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, in_words, likely, remarks
+from calib_ros.report.verdicts import each_in_words, likely, remarks
 from calib_ros.sampling.sample import gathered
 
-VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -64,7 +65,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
         origin = given.origin_of(options, read)
         report = verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
-        contents['verification.txt'] = f'{in_words(found)}\n'
+        contents['report.md'] = markdown(report, {})
         contents |= given.page_of(report, screen, pdf=options.pdf)
     return status
 
