@@ -90,22 +90,22 @@ def read_table(
         For a missing column, a value that is not a number, an ambiguous session, or measurements
         of one device in different frames. The message names the line.
     """
-    path, by_line = Path(path), False
-    warnings: tuple[str, ...] = ()
-    rows: Measurements | None = None
-    if foreign is None and path.is_file() and path.stat().st_size > LARGEST_TABLE:
-        rows, warnings = _of_journal(path, joints, progress) or (None, ())
-    if rows is not None:
+    path, journal = Path(path), None
+    if foreign is None and path.is_file():  # a pipe can be read once only
+        journal = _of_journal(path, joints, progress)
+    if journal is not None:
+        rows, warnings = journal
+        if rows is None:
+            raise InputError(f'{path} has no rows')
         rows = rows.select(_rows_of(path, rows.session, sessions))
+        return _table(rows, sigmas, eye_in_hand, warnings)
+    found: Columns
+    if foreign is not None:
+        found, warnings = foreign.convert(path)
     else:
-        found: Columns
-        if foreign is not None:
-            found, warnings = foreign.convert(path)
-        else:
-            data, warnings = _read(path, columns(joints))
-            found = columns_of(path, data, progress)
-            warnings = (*warnings, *_unread(found, joints))
-        rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
+        found = columns_of(path, read_bytes(path, LARGEST_TABLE, InputError), progress)
+        warnings = tuple(_unread(found, joints))
+    rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
     return _table(rows, sigmas, eye_in_hand, warnings, by_line)
 
 
@@ -172,11 +172,10 @@ def check_table(made: MadeColumns) -> None:
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
     """Return the samples of a journal, possibly none, and warnings; leave out damaged rows."""
     damaged: list[int] = []
-    found = _of_journal(path, joints, damaged=damaged)
-    if found is None:  # cut off, or a table
-        data, warnings = _read(path, columns(joints))
-        found = measurements(columns_of(path, data), joints), warnings
-    made, warnings = found
+    made, warnings = _of_journal(path, joints, damaged=damaged) or (
+        measurements(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), joints),
+        (),
+    )
     if damaged:
         words = f'{path}: {lines_in_words(damaged)} cannot be read: left out, but kept in the file'
         warnings = (*warnings, words)
@@ -188,17 +187,16 @@ def _of_journal(
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
     """Return the rows of a journal, None if empty, and warnings; None for other files.
 
-    A node's journal may have any length, since its samples were in memory: it is read in parts,
-    and other files are refused at the first part. The lines of damaged rows go into a list;
-    without one they are refused.
+    It may have any length, since its samples were in memory: it is read in parts. The lines of
+    damaged rows go into a list; without one they are refused.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
     parts: list[Measurements] = []
     lines, rest = 1, b''
     try:
         with path.open('rb') as file:
-            if file.read(len(header)) != header:
-                return None
+            if (begin := file.read(len(header))) != header:
+                return (None, ()) if begin and header.startswith(begin) else None
             size = path.stat().st_size
             while data := file.read(LARGEST_TEXT):
                 whole, end, rest = (rest + data).rpartition(b'\n')
@@ -213,8 +211,8 @@ def _of_journal(
                 progress(min(file.tell() / size, 1.0))
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
-    made = joined(parts) if parts else None
-    return made, (_cut_off(path, lines + 1),) if rest else ()
+    cut_off = f'{path}: line {lines + 1} was cut off and is ignored'
+    return joined(parts) if parts else None, (cut_off,) if rest else ()
 
 
 def _rows(
@@ -340,23 +338,6 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
     rows = [cells(sample) for sample in samples]
     used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
     return csv_text([row[k] for k in used] for row in (names, *rows))
-
-
-def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
-    """Return the content of a table, and warnings; `journal` is the header of a journal."""
-    data = read_bytes(path, LARGEST_TABLE, InputError)
-    header = ','.join(journal).encode() + b'\n'
-    if data and header.startswith(data):
-        return header, ()
-    begin = data.rfind(b'\n') + 1
-    cut = data.startswith(header) and not is_whole(data[begin:], len(journal))
-    whole = data[:begin] if cut else data
-    warnings = (_cut_off(path, whole.count(b'\n') + 1),) if len(whole) < len(data) else ()
-    return whole, warnings
-
-
-def _cut_off(path: Path, line: int) -> str:
-    return f'{path}: line {line} was cut off and is ignored'
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> Index:
