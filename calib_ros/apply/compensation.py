@@ -109,10 +109,7 @@ def compensate(
     `approach` (N, n) holds the signs of the preceding velocities, for backlash; `progress`
     receives the share done.
 
-    Raises
-    ------
-    InputError
-        For joint values of the wrong shape, or not finite.
+    Raises InputError for joint values of the wrong shape, or not finite.
     """
     command = np.array(joints, dtype=np.float64)
     count = len(compensator.nominal.joints)

@@ -51,10 +51,8 @@ def compensate_program(
     Velocities and accelerations follow the corrected path; times and other joints do not change.
     Refused points are NaN; `progress` receives the share done.
 
-    Raises
-    ------
-    InputError, UnknownNameError
-        For a missing joint of the arm, and arrays that do not match the names.
+    Raises InputError or UnknownNameError for a missing joint of the arm, and arrays that do not
+    match the names.
     """
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]

@@ -142,31 +142,19 @@ def verify(
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
-    Parameters
-    ----------
-    arm : Calibration
-        Before and after.
-    sets : sequence of Observations
-        New measurements of poses or positions, in the frames of the calibration.
-    tolerance : float, optional
-        Largest acceptable RMS position error [m]; without it the verdict is whether the
-        calibration holds.
-    confidence : float
-        Of the interval.
-    new_base, new_tool : bool
-        The measuring device was moved; the target was replaced or remounted. Their frames are
-        fitted, and absorb the errors of as many configurations, of three freedoms each, as they
-        have freedoms.
-    commanded : (M, n), optional
-        Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
-        poses there. Each measurement belongs to one of them, as it is or corrected.
-    progress : Notify
-        Receives the share done.
+    `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
+    `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
+    calibration holds. `confidence` is that of the interval; `progress` receives the share done.
 
-    Raises
-    ------
-    InputError
-        For too few poses, distances, unknown devices or targets, or poses far from all commands.
+    With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
+    remounted. Their frames are fitted, and absorb the errors of as many configurations, of three
+    freedoms each, as they have freedoms.
+
+    `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
+    defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.
+
+    Raises InputError for too few poses, distances, unknown devices or targets, or poses far from
+    all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm.chain, sets, tolerance, confidence, fitted)

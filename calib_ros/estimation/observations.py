@@ -110,10 +110,8 @@ class Observations(Shown):
 
         With `rotations` (N, 3, 3) they are poses. Masked values count as missing.
 
-        Raises
-        ------
-        InputError
-            For arrays that are not numeric, have another shape, or are not rotations.
+        Raises InputError for arrays that are not numeric, have another shape, or are not
+        rotations.
         """
         joints, positions = _numbers('joints', joints), _numbers('positions', positions)
         if joints.ndim != 2:

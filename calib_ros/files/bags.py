@@ -65,14 +65,8 @@ class Replayed:
 def replay(path: Path | str, session: CalibrationSession, progress: Notify = quiet) -> Replayed:
     """Feed a bag to a session; return what could be read.
 
-    Parameters
-    ----------
-    path : Path or str
-        Folder of a rosbag2 recording, or one of its .mcap or .db3 files.
-    session : CalibrationSession
-        Receives the messages; its settings name topics if the types are ambiguous.
-    progress : Notify
-        Receives the share of messages read.
+    The path is the folder of a rosbag2 recording, or one of its .mcap or .db3 files. The settings
+    of the session name topics if the types are ambiguous; `progress` receives the share read.
     """
     path = Path(path)
     if not (path.is_dir() or path.is_file()):

@@ -67,28 +67,13 @@ def read_table(
 ) -> Measured:
     """Read a CSV table, or one in any other layout.
 
-    Parameters
-    ----------
-    path : Path or str
-        The file.
-    joints : int
-        Number of joints.
-    sessions : sequence of str
-        Sessions to read; each after the first gets its own base and tool frames.
-    sigmas : (float, float)
-        Standard deviations [m, rad] of poses seen by a camera on the flange.
-    eye_in_hand : bool
-        All poses are of a fixed target in a camera on the flange.
-    foreign : Foreign, optional
-        How to read a table from another system.
-    progress : Notify
-        Receives the share read.
+    Of several `sessions`, each after the first gets its own base and tool frames. `sigmas` are the
+    standard deviations [m, rad] of poses seen by a camera on the flange; with `eye_in_hand` all
+    poses are of a fixed target in such a camera. `foreign` tells how to read a table from another
+    system; `progress` receives the share read.
 
-    Raises
-    ------
-    InputError
-        For a missing column, a value that is not a number, an ambiguous session, or measurements
-        of one device in different frames. The message names the line.
+    Raises InputError for a missing column, a value that is not a number, an ambiguous session, or
+    measurements of one device in different frames. The message names the line.
     """
     path, journal = Path(path), None
     if foreign is None and path.is_file():  # a pipe can be read once only

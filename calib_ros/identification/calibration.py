@@ -265,11 +265,8 @@ def parse_calibration(
     Without a nominal chain the recorded one is used; without recorded frames, those closest to the
     corrected arm.
 
-    Raises
-    ------
-    ConfigError
-        If the text is no chain file, has no record, was not accepted, or was identified from
-        another nominal chain.
+    Raises ConfigError if the text is no chain file, has no record, was not accepted, or was
+    identified from another nominal chain.
     """
     chain = parse_chain(text, where)
     if nominal is not None:

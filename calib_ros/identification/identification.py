@@ -54,12 +54,8 @@ def identify(
     With the result of a `simpler` model, without effects, samples that it explains are no gross
     errors: otherwise a rich model could leave out what contradicts it.
 
-    Raises
-    ------
-    TooFewObservationsError
-        With fewer equations than parameters.
-    InputError
-        If the fit diverges; the message names the mistake that explains it, if any.
+    Raises TooFewObservationsError with fewer equations than parameters. Raises InputError if the
+    fit diverges; the message names the mistake that explains it, if any.
     """
     try:
         return _identified(problem, simpler, progress)
