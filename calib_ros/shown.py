@@ -15,10 +15,8 @@ import numpy as np
 
 from calib_ros.errors import ConfigError
 
-NAMED = 5
-"""Items named in a sentence; a convention."""
-LISTED = 4 * NAMED
-"""Items listed in a table or longer text."""
+NAMED = 5  # items named in a sentence; a convention
+LISTED = 4 * NAMED  # items listed in a table or longer text
 
 
 def some(words: Sequence[str], most: int = NAMED) -> list[str]:

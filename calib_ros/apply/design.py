@@ -36,16 +36,13 @@ class Design(Shown):
 
     chain: Chain
     """The point of linearisation. The base frame has no influence, the tool has."""
-    names: tuple[str, ...]
-    """P parameters to identify, without gauge freedoms."""
+    names: tuple[str, ...]  # P parameters to identify, without gauge freedoms
     sigma_position: float
     sigma_orientation: float | None
     """Of a measured pose [m, rad]; None if only positions are measured."""
-    known: FloatArray
-    """(R, P) rows of existing information, in sigma: priors, poses taken."""
+    known: FloatArray  # (R, P) rows of existing information, in sigma: priors, poses taken
     base: str = 'base'
-    tool: str = 'tool'
-    """Frames of the chain for further poses."""
+    tool: str = 'tool'  # frames of the chain for further poses
 
     @classmethod
     def of(cls, problem: Problem, result: Identification | Estimate | None = None) -> Design:

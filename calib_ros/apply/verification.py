@@ -54,8 +54,7 @@ HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None
 NEEDED = 1 + len(TILTED)
 """Configurations needed for a verdict, besides those for fitted frames: the test poses of ISO
 9283."""
-DECIDING = 10 * MOST_ENTRIES
-"""Largest number of configurations reported as deciding."""
+DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
 @dataclass(frozen=True)

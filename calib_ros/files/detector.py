@@ -23,8 +23,7 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
 
-Corners = tuple[Index, FloatArray]
-"""Numbers (K,) and pixels (K, 2) of a board's corners."""
+Corners = tuple[Index, FloatArray]  # numbers (K,) and pixels (K, 2) of a board's corners
 Markers = tuple[FloatArray, Index]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
@@ -33,10 +32,8 @@ FEWEST = IN_A_FRAME
 WINDOW = 0.6
 """Half window of corner refinement, relative to the nearest marker; measured, as WIDEST, by
 benchmarks/images.py."""
-WIDEST = 10
-"""Largest half window [px]."""
-SMALLEST_SIDE = 700
-"""Longer side [px] of the smallest image searched for markers."""
+WIDEST = 10  # largest half window [px]
+SMALLEST_SIDE = 700  # longer side [px] of the smallest image searched for markers
 
 
 def dictionaries() -> tuple[str, ...]:

@@ -35,20 +35,17 @@ from calib_ros.values import LONGEST_NAME, MOST_NAMES, parse_mapping
 
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""
-ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}
-"""Radians in units of angle."""
+ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
 SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
 POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
 UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
 COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
 TURNS = ('rx', 'ry', 'rz')
 """Angles about x, y, z of three different letters, or a rotation vector."""
-IN_TURN = ('r1', 'r2', 'r3')
-"""Euler angles in the order of the letters."""
+IN_TURN = ('r1', 'r2', 'r3')  # Euler angles in the order of the letters
 SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 """Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
-WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')
-"""Text columns."""
+WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')  # text columns
 NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
 UNREADABLE = (
     '"{}" is not an expression of columns: give names, {{names with blanks}} or column '

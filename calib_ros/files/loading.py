@@ -26,8 +26,7 @@ from calib_ros.sampling.sample import Measured, named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
-TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')
-"""Suffixes of tables, lower case."""
+TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')  # suffixes of tables, lower case
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,8 +19,7 @@ from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.texts import parse_yaml, read_text
 from calib_ros.values import parse_like, parse_mapping, parse_number
 
-COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
-"""Keys of a group or a robot."""
+COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')  # keys of a group or a robot
 KEYS = {
     'the plant': ('groups', 'robots'),
     'a group': COMMON,

@@ -144,8 +144,7 @@ class Identifying:
         self._configuration, self._accepted = configuration, accepted
         self._residuals = node.create_publisher(MarkerArray, '~/residuals', to_ros.LATCHED)
         self.progress = Progress('identifying')
-        self.last = 'nothing identified yet'
-        """Result of the last identification or ~/load."""
+        self.last = 'nothing identified yet'  # result of the last identification or ~/load
         self.observability = ''
         self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused

@@ -36,12 +36,10 @@ from calib_ros.sampling.stops import SAMPLED, Known, Plan, Rests, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 
-REST_S = 0.5 * Settings.shortest_stop
-"""Time [s] without motion after which joints stand."""
+REST_S = 0.5 * Settings.shortest_stop  # time [s] without motion after which joints stand
 TWICE = 'same stamp twice'
 CONTRARY = 'different values with the same stamp (two publishers, or stamps too coarse?)'
-ADVANCE_NS = round(5e9 * REST_S)
-"""Time between two rounds of sampling, by joint stamps."""
+ADVANCE_NS = round(5e9 * REST_S)  # time between two rounds of sampling, by joint stamps
 
 
 class Collector:
@@ -64,13 +62,11 @@ class Collector:
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
         """Delay of measurement stamps after joint stamps."""
-        self.holding = False
-        """True while the delay is estimated and nothing is sampled."""
+        self.holding = False  # true while the delay is estimated and nothing is sampled
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
         self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
-        self.unused: Counter[str] = Counter()
-        """Measurements normally not used, by cause."""
+        self.unused: Counter[str] = Counter()  # measurements normally not used, by cause
         self.notes: Counter[str] = Counter()
 
     def known(self, now_ns: int | None) -> tuple[Series, list[Series]]:

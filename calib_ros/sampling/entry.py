@@ -128,8 +128,7 @@ class Entry:
         self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unused: Counter[str] = Counter()
-        self.refused: dict[str, str] = {}
-        """Why the last messages of a kind cannot be used."""
+        self.refused: dict[str, str] = {}  # why the last messages of a kind cannot be used
         self.latest: tuple[int, Sequence[float]] | None = None
 
     def pieces(self, parts: Sequence[Part], recording: bool, wanted: str) -> list[Piece]:

@@ -77,8 +77,7 @@ class Frames:
     def __init__(self, owners: Mapping[str, Owner] | None = None) -> None:
         self._sessions: list[str] = []
         self._ends: dict[tuple[str, str], list[tuple[bool, str]]] = {}
-        self.owners = dict(owners or {})
-        """Session, device or target of each frame."""
+        self.owners = dict(owners or {})  # session, device or target of each frame
         for name, (session, eye, socket, label) in self.owners.items():
             if session not in self._sessions:
                 self._sessions.append(session)

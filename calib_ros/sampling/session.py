@@ -68,8 +68,7 @@ class CalibrationSession:
         check_joint_names(chain, self.joint_names)
         check_settings(chain, self.settings)
         self.recording = True
-        self.calibration: Calibration | None = None
-        """The last one accepted or loaded."""
+        self.calibration: Calibration | None = None  # the last one accepted or loaded
         self._known: frozenset[Sample] = frozenset()  # those it must not be judged by
         self.clear()
 
