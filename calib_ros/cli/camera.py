@@ -14,9 +14,8 @@ from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.cameras import image_of
-from calib_ros.files.detector import black_of, detect
-from calib_ros.files.photographs import SUFFIXES, Image, files_of, read_image
+from calib_ros.files.cameras import SUFFIXES, files_of, image_of, read_image
+from calib_ros.files.detector import Image, black_of, detect
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.texts import dump_yaml
 
