@@ -246,12 +246,10 @@ def calibration_file(path: str | os.PathLike[str]) -> Path:
     return file / 'calibration.yaml' if file.is_dir() else file
 
 
-def load_calibration(
-    path: str | os.PathLike[str], nominal: Chain | None = None, settings: Settings | None = None
-) -> Calibration:
+def load_calibration(path: str | os.PathLike[str], nominal: Chain | None = None) -> Calibration:
     """Read a calibration from its file or an identification's folder (`parse_calibration`)."""
     file = calibration_file(path)
-    return parse_calibration(read_text(file), str(file), nominal, settings)
+    return parse_calibration(read_text(file), str(file), nominal)
 
 
 def parse_calibration(
