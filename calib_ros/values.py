@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import (
-    LONGEST_NAME as LONGEST_NAME,
+    LONGEST_NAME,
     MOST_ENTRIES,
     CalibrationError,
     ConfigError,

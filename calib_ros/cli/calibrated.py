@@ -9,7 +9,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import options as common
+from calib_ros.cli import common
 from calib_ros.cli.given import calibration_of, refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError

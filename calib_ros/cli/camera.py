@@ -8,7 +8,7 @@ import argparse
 from collections.abc import Iterator
 
 from calib_ros.atomic import write_file, write_together
-from calib_ros.cli import options as common
+from calib_ros.cli import common
 from calib_ros.cli.given import refuse_others
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError

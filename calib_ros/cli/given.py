@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import NamedTuple
 
-from calib_ros.cli.options import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
+from calib_ros.cli.common import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calib_ros.cli import given, options as common
+from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.reasons import Reason, Rule

@@ -15,7 +15,7 @@ from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_together
-from calib_ros.cli import given, options as common
+from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.apply import workspace
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions, task_of
-from calib_ros.cli import given, options as common
+from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.programs import check_limits, csv_of, joints_csv, read_poses

@@ -24,14 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
+from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import MadeColumns, check_quaternions
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import TWO_TURNS, shared_files
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import LONGEST_NAME, MOST_NAMES, parse_mapping
+from calib_ros.values import MOST_NAMES, parse_mapping
 
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""

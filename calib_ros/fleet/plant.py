@@ -30,7 +30,7 @@ KEYS = {
 
 
 @dataclass(frozen=True)
-class Measured:
+class Pattern:
     """Files by a glob pattern, local or at a URL; of tables one session, if named."""
 
     files: str
@@ -43,7 +43,7 @@ class Robot:
 
     serial: str
     chain: Chain
-    measured: tuple[Measured, ...]
+    measured: tuple[Pattern, ...]
     settings: Settings = field(default_factory=Settings)
     tolerance: float | None = None  # wanted RMS position error [mm]
     largest_loss: float = EXCEPTION  # share of a bag's messages that may be lost
@@ -138,7 +138,7 @@ def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> 
     return chains[name]
 
 
-def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
+def _measured(value: object, folder: Path, where: str) -> tuple[Pattern, ...]:
     entries = value if isinstance(value, list) and value else [value]
     found = []
     for entry in entries:
@@ -152,7 +152,7 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
                 f'{where}: measured must be a pattern of bags or tables, a file or URL with *, '
                 f'or a list of them, not {files!r:.100}'
             )
-        found.append(Measured(files if '://' in files else str(folder / files), session))
+        found.append(Pattern(files if '://' in files else str(folder / files), session))
     return tuple(found)
 
 

@@ -32,7 +32,7 @@ from calib_ros.sampling.slices import (
     StreamKey,
     Waiting,
 )
-from calib_ros.sampling.stops import SAMPLED, Known, Plan, Rests, seen_stops
+from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 
@@ -245,7 +245,7 @@ class Collector:
             return 1, ''
         self._round(begin)  # end earlier stops
         before, dropped = len(self.maker.fresh), self.dropped.copy()
-        plan = Plan(self._settled_ns, self._sampled_ns)
+        plan = Schedule(self._settled_ns, self._sampled_ns)
         plan.sample(begin, newest)
         self._carry_out(plan)
         count = len(self.maker.fresh) - before
@@ -269,7 +269,7 @@ class Collector:
         self._sort()
         if until <= self._settled_ns:
             return
-        plan = Plan(self._settled_ns, self._sampled_ns)
+        plan = Schedule(self._settled_ns, self._sampled_ns)
         if self.settings.mode == 'continuous':
             for end in (*(each - self._late_ns for each in rounds[:-1]), until):
                 plan.add(min(end, until), '')
@@ -291,7 +291,9 @@ class Collector:
                 if count:
                     self.dropped[f'{kind}: {cause}'] += count
 
-    def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
+    def _plan_stops(
+        self, plan: Schedule, until: int, rounds: Sequence[int], ends_here: bool
+    ) -> None:
         settings = self.settings
         stands = self.track.standing(settings.still, REST_S)
         shortest = round(settings.shortest_stop * 1e9)
@@ -306,7 +308,7 @@ class Collector:
                 if self._known.meets(*span, joints, 2.0 * settings.still):
                     plan.why[k] = SAMPLED
 
-    def _carry_out(self, plan: Plan) -> None:
+    def _carry_out(self, plan: Schedule) -> None:
         self.rests.sampled += len(plan.stops)
         moving = self.settings.mode == 'continuous'
         settle = 0 if moving else round(self.settings.settle * 1e9)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics.se3 import Flags, FloatArray
-from calib_ros.values import LARGEST as LARGEST, ROUNDED, covariance_fault
+from calib_ros.values import LARGEST, ROUNDED, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'

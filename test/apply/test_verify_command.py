@@ -10,7 +10,7 @@ from verified import UR, in_words, measured
 
 from calib_ros.apply.candidates import Visibility
 from calib_ros.apply.verification import verify
-from calib_ros.cli.options import Status
+from calib_ros.cli.common import Status
 from calib_ros.files.programs import joints_csv, read_joints
 
 
