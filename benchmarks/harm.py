@@ -46,8 +46,7 @@ from harm_designs import DESIGNS, GOOD, session
 
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.errors import CalibrationError
-from calib_ros.identification.identification import identify
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.identification import identify, identify_model
 
 FLOOR = 1e-5
 """Errors [m] below which nothing is harm."""

@@ -14,8 +14,7 @@ if TYPE_CHECKING:
 
 LONGEST = 400
 """Characters of a message; quotes from files may have any length. A convention."""
-LONGEST_NAME = LONGEST // 2
-"""Characters of a name, number or expression, to fit a message."""
+LONGEST_NAME = LONGEST // 2  # characters of a name, number or expression, to fit a message
 MOST_ENTRIES = 1000
 """Entries of a list, columns, and characters of an entry in input: a convention; other limits are
 multiples."""

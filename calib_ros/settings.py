@@ -20,15 +20,12 @@ STORAGES = ('mcap', 'sqlite3')
 EXCEPTION = 0.1
 """Share of a whole that is an exception. So many samples fewer, at random, make standard
 deviations 5 % larger, less than their own uncertainty; more may be a part of the workspace."""
-LEVER = 0.3
-"""Length [m] at which a turn counts as much as a shift; a convention."""
+LEVER = 0.3  # length [m] at which a turn counts as much as a shift; a convention
 LEVER_IN_PART, TURN_IN_PART = 1e-3, 0.02
 """The same of arms that cannot reach every orientation, and the error [rad] that may remain of
 theirs; conventions."""
-EXACT = 1e-6
-"""Negligible error [m or rad], invisible to any device."""
-GROWTH = 2e-5
-"""Default growth of a length [m] per root of a year."""
+EXACT = 1e-6  # negligible error [m or rad], invisible to any device
+GROWTH = 2e-5  # default growth of a length [m] per root of a year
 MODES = ('dwell', 'continuous', 'triggered')
 STARTUP = (
     *('max_gap', 'joint_buffer', 'pose_buffer', 'mode', 'lateness', 'delay', 'sources'),

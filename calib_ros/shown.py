@@ -15,10 +15,8 @@ import numpy as np
 
 from calib_ros.errors import ConfigError
 
-NAMED = 5
-"""Items named in a sentence; a convention."""
-LISTED = 4 * NAMED
-"""Items listed in a table or longer text."""
+NAMED = 5  # items named in a sentence; a convention
+LISTED = 4 * NAMED  # items listed in a table or longer text
 
 
 def some(words: Sequence[str], most: int = NAMED) -> list[str]:
@@ -27,10 +25,10 @@ def some(words: Sequence[str], most: int = NAMED) -> list[str]:
     return [*words[:most], f'and {more} more'] if more > 0 else list(words)
 
 
-def rounded(value: float, decimals: int = 3) -> str:
-    """Return a value with so many decimals, or as many more as two digits of it need."""
+def rounded(value: float) -> str:
+    """Return a value with three decimals, or as many more as two digits of it need."""
     digits = 1 - math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
-    return f'{value:.{max(decimals, digits)}f}'
+    return f'{value:.{max(3, digits)}f}'
 
 
 def of_them(count: int, what: str) -> str:

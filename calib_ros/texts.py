@@ -30,12 +30,10 @@ from calib_ros.errors import (
 
 LARGEST_TEXT = 10 * MOST_ENTRIES**2
 """Bytes of a chain file, calibration, URDF or YAML program."""
-LARGEST_TABLE = 10 * LARGEST_TEXT
-"""Bytes of a table."""
+LARGEST_TABLE = 10 * LARGEST_TEXT  # bytes of a table
 MOST_ROWS = LARGEST_TABLE // 500
 """Rows of a table with quotes, which takes more memory; a journal row has 500 bytes."""
-DEEPEST = MOST_ENTRIES // 50
-"""Levels of nested YAML."""
+DEEPEST = MOST_ENTRIES // 50  # levels of nested YAML
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
 """Values in a YAML document with expanded aliases; 20 characters count as one."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import (
-    LONGEST_NAME as LONGEST_NAME,
+    LONGEST_NAME,
     MOST_ENTRIES,
     CalibrationError,
     ConfigError,
@@ -24,14 +24,12 @@ from calib_ros.errors import (
 ROUNDED = 1e-3
 """Relative rounding of numbers with three digits: of the length of a quaternion, of a step of
 joint values."""
-SAME = 1e-9
-"""Lengths [m] and angles [rad] that differ by less are equal; a convention."""
+SAME = 1e-9  # lengths [m] and angles [rad] that differ by less are equal; a convention
 LARGEST = 1e6
 """Largest measured or set number [m or rad]; some devices send the largest float for none."""
 LARGEST_RATE = LARGEST**2
 """Largest velocity and acceleration [SI], computed and stored in journals."""
-LARGEST_SETTING = float(np.iinfo(np.int32).max)
-"""Largest setting: that of 32-bit integers."""
+LARGEST_SETTING = float(np.iinfo(np.int32).max)  # largest setting: that of 32-bit integers
 MOST_NAMES = MOST_ENTRIES // 20
 """Joints of a chain, frames, targets, or sets of joint names in a cell."""
 

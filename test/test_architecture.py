@@ -31,7 +31,7 @@ ONLY = {
     'matplotlib': ('report.plots',),
     **dict.fromkeys(('jinja2', 'plotly'), ('report.page',)),
     'weasyprint': ('report.page',),
-    'cv2': ('files.photographs',),
+    'cv2': ('files.detector',),
     'pyarrow': ('files.history',),
     'fsspec': ('files.history', 'fleet.'),
     **dict.fromkeys(('dask', 'distributed'), ('fleet.',)),

@@ -8,6 +8,7 @@ from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.report.verdicts import each_in_words, likely, remarks
 
 UR = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)
@@ -24,3 +25,9 @@ def cell():
 def measured(true, joints, repeats=3, noise=NOISE, seed=1):
     rng = np.random.default_rng(seed)
     return simulation.measure(true, np.repeat(joints, repeats, axis=0), rng, *noise)
+
+
+def in_words(found):
+    """Return what screen and report say of a verification, a line each."""
+    rms = f'the RMS error over poses like these is {likely(found)}'
+    return '\n'.join([*each_in_words(found), rms, *remarks(found)])

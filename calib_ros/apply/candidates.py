@@ -69,20 +69,16 @@ class Visibility:
 
 
 def draw_candidates(
-    design: Design,
-    count: int,
-    rng: np.random.Generator,
-    visibility: Visibility | None = None,
-    tries: int = 1000,
+    design: Design, count: int, rng: np.random.Generator, visibility: Visibility | None = None
 ) -> FloatArray:
     """Draw joint values (count, n) within the limits at which the target can be measured.
 
-    The region counts as out of reach after `tries` for each.
+    The region counts as out of reach after a thousand tries for each.
     """
     found = np.zeros((0, len(design.chain.joints)))
     drawn = 0
     while len(found) < count:
-        if drawn > tries * count:
+        if drawn > 1000 * count:
             raise InputError(
                 f'the target can be measured at {len(found)} of {drawn} random poses only; '
                 f'{count} candidates are needed: widen what the device sees (--box, --cone), or '

@@ -36,25 +36,17 @@ BESIDE = LEVER / 3.0
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensator(Shown, Limits):
-    """The arm the controller assumes, the real arm, and the limits of a correction (`Limits`).
-
-    Parameters
-    ----------
-    nominal : Chain
-        The arm the controller assumes, with its joint limits.
-    calibrated : Chain
-        The identified arm. Base and tool frames of both are ignored.
-    tool : three floats
-        Tool point [m] in the flange frame. It matters for arms that cannot reach every
-        orientation, and for the reported errors.
-    region : Region, optional
-        Where the calibration may be used; samples elsewhere are refused.
-    """
+    """The arm the controller assumes, the real arm, and the limits of a correction (`Limits`)."""
 
     nominal: Chain
+    """The arm the controller assumes, with its joint limits."""
     calibrated: Chain
+    """The identified arm. Base and tool frames of both are ignored."""
     tool: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Tool point [m] in the flange frame. It matters for arms that cannot reach every
+    orientation, and for the reported errors."""
     region: Region | None = None
+    """Where the calibration may be used; samples elsewhere are refused."""
 
     def __post_init__(self) -> None:
         """Refuse chains of different robots and invalid limits."""
@@ -91,21 +83,14 @@ class Refusal:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Compensation(Solution):
-    """Corrected joint commands, their remaining errors (`Solution`), and refusals.
-
-    Attributes
-    ----------
-    command : (N, n)
-        Joint values [rad or m] before correction.
-    joints : (N, n)
-        The corrected ones; NaN in refused samples.
-    refusals : tuple of Refusal
-        In the order of the samples.
-    """
+    """Corrected joint commands, their remaining errors (`Solution`), and refusals."""
 
     command: FloatArray
+    """(N, n) joint values [rad or m] before correction."""
     joints: FloatArray
+    """(N, n) the corrected ones; NaN in refused samples."""
     refusals: tuple[Refusal, ...] = ()
+    """In the order of the samples."""
 
     @property
     def correction(self) -> FloatArray:
@@ -124,10 +109,7 @@ def compensate(
     `approach` (N, n) holds the signs of the preceding velocities, for backlash; `progress`
     receives the share done.
 
-    Raises
-    ------
-    InputError
-        For joint values of the wrong shape, or not finite.
+    Raises InputError for joint values of the wrong shape, or not finite.
     """
     command = np.array(joints, dtype=np.float64)
     count = len(compensator.nominal.joints)

@@ -32,29 +32,17 @@ ASSUMED_TOOL = 3 * (LEVER / 3.0,)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(Shown):
-    """What to identify, how it will be measured, and what is already known.
-
-    Parameters
-    ----------
-    chain : Chain
-        The point of linearisation. The base frame has no influence, the tool has.
-    names : tuple of str
-        P parameters to identify, without gauge freedoms.
-    sigma_position, sigma_orientation : float, float or None
-        Of a measured pose [m, rad]; None if only positions are measured.
-    known : (R, P)
-        Rows of existing information, in sigma: priors, poses taken.
-    base, tool : str
-        Frames of the chain for further poses.
-    """
+    """What to identify, how it will be measured, and what is already known."""
 
     chain: Chain
-    names: tuple[str, ...]
+    """The point of linearisation. The base frame has no influence, the tool has."""
+    names: tuple[str, ...]  # P parameters to identify, without gauge freedoms
     sigma_position: float
     sigma_orientation: float | None
-    known: FloatArray
+    """Of a measured pose [m, rad]; None if only positions are measured."""
+    known: FloatArray  # (R, P) rows of existing information, in sigma: priors, poses taken
     base: str = 'base'
-    tool: str = 'tool'
+    tool: str = 'tool'  # frames of the chain for further poses
 
     @classmethod
     def of(cls, problem: Problem, result: Identification | Estimate | None = None) -> Design:

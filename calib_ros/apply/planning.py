@@ -219,35 +219,23 @@ def efficiency(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Plan(Shown):
-    """Poses to measure, and the accuracy to expect.
-
-    Attributes
-    ----------
-    joints : (K, n)
-        Joint values [rad or m], the most informative first.
-    visit : (K,)
-        Visiting order.
-    travel : float
-        Time of all moves [s].
-    accuracy : (K,)
-        Predicted RMS position error [m] with the first 1, 2, ... K of them.
-    at_random : (K,)
-        The same with candidates taken at random (median of draws).
-    efficiency : float or None
-        Lower bound relative to the best choice of as many candidates; None for o2 to o5 and for
-        too few poses to determine all parameters.
-    lacking : tuple of str
-        Parameters that no choice of these candidates would determine; they are ignored.
-
-    """
+    """Poses to measure, and the accuracy to expect."""
 
     joints: FloatArray
+    """(K, n) joint values [rad or m], the most informative first."""
     visit: Index
+    """(K,) visiting order."""
     travel: float
+    """Time of all moves [s]."""
     accuracy: FloatArray
+    """(K,) predicted RMS position error [m] with the first 1, 2, ... K of them."""
     at_random: FloatArray
+    """(K,) the same with candidates taken at random (median of draws)."""
     efficiency: float | None
+    """Lower bound relative to the best choice of as many candidates; None for o2 to o5 and for
+    too few poses to determine all parameters."""
     lacking: tuple[str, ...]
+    """Parameters that no choice of these candidates would determine; they are ignored."""
 
     def to_frame(self) -> Any:
         """Return the joint values [rad or m] in visiting order as a pandas.DataFrame.
@@ -349,8 +337,8 @@ def fewest(
     return found[:reached]
 
 
-def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> str:
-    """Return the expected accuracy by number of poses, and the efficiency of the plan."""
+def accuracy_in_words(plan: Plan) -> list[str]:
+    """Return the lines of a table: the expected accuracy by number of poses."""
     count = len(plan.joints)
     first = int(np.isfinite(plan.accuracy).sum())
     shown = np.unique(np.linspace(count - first + 1, count, min(first, 12)).round().astype(int))
@@ -362,10 +350,15 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
         lines.append(f'{number:6} {planned:9.4f} {by_chance}')
     if not first:
         lines.append(f'{count:6}         - too few poses to determine all parameters')
-    text = f'{count} of {candidates} candidates'
+    return lines
+
+
+def remarks(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> list[str]:
+    """Return the efficiency of a plan, how many poses are needed, and what it leaves open."""
+    text = f'{len(plan.joints)} of {candidates} candidates'
     if plan.efficiency is not None:
         text += f', at least {100.0 * plan.efficiency:.0f} % as good as the best choice'
-    lines.append(f'{text}; moves take {plan.travel:.0f} s')
+    lines = [f'{text}; moves take {plan.travel:.0f} s']
     if needed is not None:
         lines.append(f'{needed} poses reach {wanted_mm:g} mm')
     if plan.lacking:
@@ -374,4 +367,4 @@ def in_words(plan: Plan, candidates: int, wanted_mm: float | None, needed: int |
             'further and in more combinations, or fix these parameters. The figures ignore these '
             'parameters, and hold only where the joints move as in the candidates'
         )
-    return '\n'.join(lines)
+    return lines

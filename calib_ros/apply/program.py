@@ -30,25 +30,17 @@ values accurate to half the digits."""
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Program(Shown):
-    """A robot's program as joint values by name.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Columns of the arrays; they may include joints outside the arm.
-    positions : (N, m)
-        Joint values [rad or m], in their order of execution.
-    velocities, accelerations : (N, m), optional
-    approach : (N, n), optional
-        Signs of the velocities with which the arm's joints reach their values, for backlash. By
-        default from the order of the positions.
-    """
+    """A robot's program as joint values by name."""
 
     names: tuple[str, ...]
+    """Columns of the arrays; they may include joints outside the arm."""
     positions: FloatArray
+    """(N, m) joint values [rad or m], in their order of execution."""
     velocities: FloatArray | None = None
     accelerations: FloatArray | None = None
     approach: FloatArray | None = None
+    """(N, n) signs of the velocities with which the arm's joints reach their values, for backlash.
+    By default from the order of the positions."""
 
 
 def compensate_program(
@@ -59,10 +51,8 @@ def compensate_program(
     Velocities and accelerations follow the corrected path; times and other joints do not change.
     Refused points are NaN; `progress` receives the share done.
 
-    Raises
-    ------
-    InputError, UnknownNameError
-        For a missing joint of the arm, and arrays that do not match the names.
+    Raises InputError or UnknownNameError for a missing joint of the arm, and arrays that do not
+    match the names.
     """
     columns = _columns(compensator.nominal.joint_names, program)
     positions = program.positions[:, columns]

@@ -26,9 +26,10 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from calib_ros.apply.candidates import TILTED
-from calib_ros.apply.commanded import meant
+from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.decision.validation import Comparison, compare
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
@@ -53,8 +54,7 @@ HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None
 NEEDED = 1 + len(TILTED)
 """Configurations needed for a verdict, besides those for fitted frames: the test poses of ISO
 9283."""
-DECIDING = 10 * MOST_ENTRIES
-"""Largest number of configurations reported as deciding."""
+DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
 @dataclass(frozen=True)
@@ -77,58 +77,40 @@ class Attained:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Verification(Shown):
-    """Errors before and after a correction, and the verdict.
-
-    Attributes
-    ----------
-    comparison : Comparison
-        Residuals by the nominal and by the calibrated arm.
-    tolerance : float or None
-        Wanted RMS position error [m].
-    confidence : float
-        Of the interval.
-    group : (N,)
-        Configuration of each measurement; `configurations` counts them.
-    rms, lower, upper : float
-        RMS position error [m] over poses like these, and its interval.
-    freedom : float
-        Degrees of freedom of that error.
-    verdict : str
-        'PASS', 'FAIL' or 'UNDECIDED'; without a tolerance 'holds', 'does not hold', or
-        'no verdict' if unknown. No verdict either if fitted measurements look good.
-    needed : int or None
-        Number of configurations that would decide with the same RMS error, if undecided; None if
-        even DECIDING would not.
-    common : float
-        Share of the RMS error that remains without one common shift and turn of all positions.
-    by_program : bool
-        Whether the wanted poses are those of the uncorrected program.
-    fitted : tuple of str
-        Frames fitted to the new measurements.
-    holds : bool or None
-        Whether the error agrees with that of the calibration (`Calibration.holds`), if known.
-    reused : float
-        Share of the measurements that the calibration was fitted to (`Calibration.reused`).
-    uncorrected : bool
-        Whether all measurements were taken at the joint values of the program as it was given.
-    """
+    """Errors before and after a correction, and the verdict."""
 
     comparison: Comparison
+    """Residuals by the nominal and by the calibrated arm."""
     tolerance: float | None
+    """Wanted RMS position error [m]."""
     confidence: float
+    """Of the interval."""
     group: Index
+    """(N,) configuration of each measurement; `configurations` counts them."""
     rms: float
     lower: float
     upper: float
+    """RMS position error [m] over poses like these, and its interval."""
     freedom: float
+    """Degrees of freedom of that error."""
     verdict: Verdict
+    """Without a tolerance 'holds', 'does not hold', or 'no verdict' if unknown; no verdict either
+    if fitted measurements look good."""
     needed: int | None
+    """Number of configurations that would decide with the same RMS error, if undecided; None if
+    even DECIDING would not."""
     common: float
+    """Share of the RMS error that remains without one common shift and turn of all positions."""
     by_program: bool
+    """Whether the wanted poses are those of the uncorrected program."""
     fitted: tuple[str, ...] = ()
+    """Frames fitted to the new measurements."""
     holds: bool | None = None
+    """Whether the error agrees with that of the calibration (`Calibration.holds`), if known."""
     reused: float = 0.0
+    """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     uncorrected: bool = False
+    """Whether all measurements were taken at the joint values of the program as it was given."""
 
     @property
     def configurations(self) -> int:
@@ -159,31 +141,19 @@ def verify(
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
-    Parameters
-    ----------
-    arm : Calibration
-        Before and after.
-    sets : sequence of Observations
-        New measurements of poses or positions, in the frames of the calibration.
-    tolerance : float, optional
-        Largest acceptable RMS position error [m]; without it the verdict is whether the
-        calibration holds.
-    confidence : float
-        Of the interval.
-    new_base, new_tool : bool
-        The measuring device was moved; the target was replaced or remounted. Their frames are
-        fitted, and absorb the errors of as many configurations, of three freedoms each, as they
-        have freedoms.
-    commanded : (M, n), optional
-        Joint values [rad or m] of the uncorrected program: the nominal arm defines the wanted
-        poses there. Each measurement belongs to one of them (`commanded.py`).
-    progress : Notify
-        Receives the share done.
+    `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
+    `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
+    calibration holds. `confidence` is that of the interval; `progress` receives the share done.
 
-    Raises
-    ------
-    InputError
-        For too few poses, distances, unknown devices or targets, or poses far from all commands.
+    With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
+    remounted. Their frames are fitted, and absorb the errors of as many configurations, of three
+    freedoms each, as they have freedoms.
+
+    `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
+    defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.
+
+    Raises InputError for too few poses, distances, unknown devices or targets, or poses far from
+    all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     _check(arm.chain, sets, tolerance, confidence, fitted)
@@ -227,7 +197,7 @@ def _compared(
             raise InputError('the commanded joint values are not all finite numbers')
         after = replace(before, base=after.base, tool=after.tool, frames=after.frames)
         arms = arm.before, arm.chain
-        found = [meant(*arms, each.joints, commanded) for each in sets]
+        found = [_meant(*arms, each.joints, commanded) for each in sets]
         wanted = [replace(s, joints=q) for s, (q, _) in zip(sets, found, strict=True)]
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
@@ -330,3 +300,27 @@ def _rebased(chain: Chain, sets: Sequence[Observations]) -> Chain:
         frame = chain.frame(base)
         chain = chain.with_frame(base, replace(frame, matrix=motion @ frame.matrix))
     return chain
+
+
+def _meant(
+    nominal: Chain, calibrated: Chain, joints: FloatArray, commanded: FloatArray
+) -> tuple[FloatArray, Index]:
+    """Return the commanded joint values (N, n) [rad or m] that belong to measured ones (N, n).
+
+    The nearest of the program (M, n), as it is or corrected by the calibration, and which (N,)
+    were nearer to it corrected (1) or as it is (0). If points of a path are closer than the
+    correction, corrected ones are nearer to other points than to their own. Measurements further
+    from the program than any correction raise an InputError.
+    """
+    far, _ = cKDTree(commanded).query(joints, p=np.inf)
+    lost = np.flatnonzero(far > Compensator.largest_turn)
+    if lost.size:
+        raise InputError(
+            f'measurement {lost[0] + 1} was taken {far[lost[0]]:.3g} rad or m from '
+            'the nearest commanded joint values: does it belong to that program?'
+        )
+    change = Compensator(nominal, calibrated).follower.solve(commanded).change
+    both = np.concatenate([commanded, commanded + change])
+    _, nearest = cKDTree(both).query(joints, p=np.inf)
+    corrected, point = np.divmod(nearest, len(commanded))
+    return commanded[point], corrected

@@ -308,19 +308,3 @@ def _features(poses: FloatArray) -> FloatArray:
     """Return (N, 12) features: position, and orientation times LEVER."""
     columns = LEVER / np.sqrt(2.0) * poses[:, :3, :3].reshape(-1, 9)
     return np.concatenate([poses[:, :3, 3], columns], axis=1)
-
-
-def in_words(placements: Placements, aim: str, model: str) -> str:
-    """Return where to place a task, compared with the centre of all places."""
-    reached = placements.errors[~np.isnan(placements.errors)]
-    best, centre = (
-        f'{1e3 * placements.errors[k]:.4f} mm at '
-        f'{" ".join(f"{x:.3f}" for x in placements.positions[k])} m in the base '
-        f'frame, turned by {np.degrees(placements.turns[k]):.0f} degrees'
-        for k in (placements.best, placements.centre)
-    )
-    return (
-        f'expected {aim} error of the task, {model} model; the arm reaches it at '
-        f'{len(reached)} of {len(placements.errors)} placements\n'
-        f'best:   {best}\ncentre: {centre}\nworst:  {1e3 * reached.max():.4f} mm\n'
-    )

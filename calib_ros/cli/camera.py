@@ -8,15 +8,14 @@ import argparse
 from collections.abc import Iterator
 
 from calib_ros.atomic import write_file, write_together
-from calib_ros.cli import options as common
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli import common
+from calib_ros.cli.given import refuse_others
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.cameras import image_of
-from calib_ros.files.detector import black_of, detect
-from calib_ros.files.photographs import SUFFIXES, Image, files_of, read_image
+from calib_ros.files.cameras import SUFFIXES, files_of, image_of, read_image
+from calib_ros.files.detector import Image, black_of, detect
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.texts import dump_yaml
 

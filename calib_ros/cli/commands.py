@@ -16,7 +16,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from calib_ros.cli.options import OF_BAGS, Group, add_fields, add_settings, complete_robots
+from calib_ros.cli.common import OF_BAGS, Group, add_fields, add_settings, complete_robots
 from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, STORAGES, Limits
 
 TYPES = {

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import options as common
+from calib_ros.cli import common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History

@@ -15,7 +15,7 @@ from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_together
-from calib_ros.cli import given, options as common
+from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
@@ -47,18 +47,19 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     with screen.work('choosing poses') as work:
         if options.iso9283:
             tests = iso_9283_poses(design, rng, visibility)
-            words = TESTS.format(tests.edge, ORIENTED[tests.oriented])
+            remarks = [TESTS.format(tests.edge, ORIENTED[tests.oriented])]
             joints, plan = tests.joints, None
         else:
-            joints, words, plan = _measurement(options, design, visibility, rng, work)
-    screen.say(words)
+            joints, remarks, plan = _measurement(options, design, visibility, rng, work)
+    table = [] if plan is None else planning.accuracy_in_words(plan)
+    screen.say('\n'.join([*table, *remarks]))
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
         screen.say(f'the tool is unknown: the target is assumed at {place} m from the flange')
     if options.out is not None:
         page = _page_beside(options.out)
         origin = given.origin_of(options, (options.candidates, options.task, options.taken))
-        report = plan_report(design.chain, joints, words, origin, plan, options.accuracy)
+        report = plan_report(design.chain, joints, remarks, origin, plan, options.accuracy)
         pages = given.page_of(report, screen, page.name)
         beside = {options.out.with_name(name): text for name, text in pages.items()}
         write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
@@ -72,7 +73,7 @@ def _measurement(
     visibility: Visibility,
     rng: np.random.Generator,
     progress: Notify,
-) -> tuple[FloatArray, str, Plan]:
+) -> tuple[FloatArray, list[str], Plan]:
     size = len(design.chain.joints)
     if len(options.velocity) not in (1, size):
         raise InputError(f'--velocity: give one value, or {size}, not {len(options.velocity)}')
@@ -98,8 +99,8 @@ def _measurement(
     count = options.poses or needed or ENOUGH
     choice |= {'velocities': np.broadcast_to(options.velocity, size), 'chosen': chosen}
     plan = planning.plan(design, candidates, task, count, **choice)
-    words = planning.in_words(plan, len(candidates), options.accuracy, needed)
-    return plan.joints[plan.visit], words, plan
+    remarks = planning.remarks(plan, len(candidates), options.accuracy, needed)
+    return plan.joints[plan.visit], remarks, plan
 
 
 def _check(options: argparse.Namespace) -> None:

@@ -19,12 +19,10 @@ from typing import Any, TextIO
 
 from calib_ros.progress import Progress
 
-WIDTH = 80
-"""Columns of help and of non-terminals, by convention."""
+WIDTH = 80  # columns of help and of non-terminals, by convention
 EVERY_S = 2.0
 """Time between two progress lines, doubled each time if they stay, as in a log. A convention."""
-FIRST_S = EVERY_S / 4.0
-"""Time before a bar appears on a terminal."""
+FIRST_S = EVERY_S / 4.0  # time before a bar appears on a terminal
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 

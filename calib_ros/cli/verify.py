@@ -5,27 +5,27 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 from calib_ros.apply.verification import Verification, verify
-from calib_ros.cli import given, options as common
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.history import verified
 from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import Calibration, calibration_file
-from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.applied import standing, verification_report
+from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, in_words, likely, remarks
-from calib_ros.sampling.sample import Frames, collect
+from calib_ros.report.verdicts import each_in_words, likely, remarks
+from calib_ros.sampling.sample import gathered
 
-VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'verification.txt')
+VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -65,7 +65,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
         origin = given.origin_of(options, read)
         report = verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
-        contents['verification.txt'] = f'{in_words(found)}\n'
+        contents['report.md'] = markdown(report, {})
         contents |= given.page_of(report, screen, pdf=options.pdf)
     return status
 
@@ -100,25 +100,17 @@ def show(found: Verification, screen: Screen) -> None:
 def _sets(
     options: argparse.Namespace, nominal: Chain, arm: Calibration, screen: Screen
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
+    """Return the sets between the calibration's frames of their devices and targets."""
     settings = common.settings_of(options)
-    if refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
+    if given.refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)
-        sets, owners = (*found.fitted, *found.held_out), found.owners
-        return _between(arm, sets, owners), found.warnings, found.by_line
-
-    session, read = given.replayed(options.measured, nominal, settings, screen)
-    screen.say(f'{read}; {session.account()}')
-    sigmas = (settings.sigma_position, settings.sigma_orientation)
-    frames = Frames()
-    fitted, held_out = collect(session.usable, sigmas, frames)
-    if not (fitted or held_out):
-        raise InputError(f'{options.measured} gives no poses: {session.account()}')
-    return _between(arm, (*fitted, *held_out), frames.owners), read.warnings, False
-
-
-def _between(
-    arm: Calibration, sets: Sequence[Observations], owners: Mapping[str, Owner]
-) -> Sequence[Observations]:
-    """Return sets between the calibration's frames of their devices and targets."""
-    names = arm.frames_of(owners)
-    return [each.between(names) for each in sets]
+    else:
+        session, read = given.replayed(options.measured, nominal, settings, screen)
+        screen.say(f'{read}; {session.account()}')
+        if not session.usable:
+            raise InputError(f'{options.measured} gives no poses: {session.account()}')
+        found = gathered(session.usable, (settings.sigma_position, settings.sigma_orientation))
+        found = replace(found, warnings=read.warnings)
+    names = arm.frames_of(found.owners)
+    sets = [each.between(names) for each in (*found.fitted, *found.held_out)]
+    return sets, found.warnings, found.by_line

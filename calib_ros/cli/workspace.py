@@ -10,14 +10,14 @@ import numpy as np
 
 from calib_ros.apply import workspace
 from calib_ros.apply.workspace import Spread, Survey, in_base, regions, task_of
-from calib_ros.cli import given, options as common
+from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.programs import check_limits, csv_of, joints_csv, read_poses
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.report.applied import workspace_report
+from calib_ros.report.applied import placed_in_words, workspace_report
 from calib_ros.report.page import markdown
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
@@ -53,7 +53,8 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         with screen.work('placing the task') as work:
             where = (region, options.cells, options.turns)
             found = workspace.place(arm, task, options.aim, options.model, *where, progress=work)
-        screen.say(workspace.in_words(found, options.aim, options.model))
+        screen.bullet(f'Expected {options.aim} error of the task, {options.model} model')
+        screen.bullet(placed_in_words(found))
         table = np.column_stack([found.positions, found.turns, found.errors])
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)

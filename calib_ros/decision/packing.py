@@ -23,10 +23,7 @@ def packed(square: FloatArray) -> list[str]:
 def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
     """Return the matrix (P, K) of rows of numbers, up to the diagonal if `triangular`.
 
-    Raises
-    ------
-    ValueError
-        If the number or length of the rows is wrong, or a value is not finite.
+    Raises ValueError if the number or length of the rows is wrong, or a value is not finite.
     """
     numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
     widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count

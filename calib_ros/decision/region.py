@@ -137,10 +137,7 @@ def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:
     """Return the region in the record of a calibration, or None.
 
-    Raises
-    ------
-    ConfigError
-        If it is not as `Region.document` writes it; `where` names it.
+    Raises ConfigError if it is not as `Region.document` writes it; `where` names it.
     """
     document = record.get('region')
     if document is None:

@@ -75,46 +75,31 @@ def with_unmodelled(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Posterior(Shown):
-    """Posterior of a fitted arm, given the data and the sizes of its errors.
-
-    Attributes
-    ----------
-    chain : Chain
-        The fitted arm, with considered effects of size zero.
-    names : tuple of str
-        Fitted parameters and considered effects, (P,) in all.
-    offsets : (P,)
-        Fitted minus nominal values; zero for frames.
-    shift : (P,)
-        Posterior mean minus fitted values.
-    covariance : (P, P)
-        For the measuring device; averaged over plausible sizes if used to judge.
-    device : (P, K)
-        Square root of the covariance that smooth errors of that device add.
-    priors : mapping of str to float
-        Standard deviation [m or rad] of parameters with a prior.
-    sizes : mapping of str to float
-        Size of the errors by group.
-    doubted : tuple of Mixed
-        The posterior of the offsets for each plausible set of sizes, if the device may have a
-        scale error and rounded joint values may be off.
-    rival : (float, float, (P,), (P, P)), optional
-        The same for a device out of scale: log odds, scale minus one, mean and covariance.
-    unmodelled : (float, float)
-        Sizes [rad] of turns and tilts of the joints beyond all names (`unmodelled.py`).
-    """
+    """Posterior of a fitted arm, given the data and the sizes of its errors."""
 
     chain: Chain
+    """The fitted arm, with considered effects of size zero."""
     names: tuple[str, ...]
+    """Fitted parameters and considered effects, (P,) in all."""
     offsets: FloatArray
+    """(P,) fitted minus nominal values; zero for frames."""
     shift: FloatArray
+    """(P,) posterior mean minus fitted values."""
     covariance: FloatArray
+    """(P, P) for the measuring device; averaged over plausible sizes if used to judge."""
     device: FloatArray
+    """(P, K), square root of the covariance that smooth errors of that device add."""
     priors: Mapping[str, float]
+    """Standard deviation [m or rad] of parameters with a prior."""
     sizes: Mapping[str, float]
+    """Size of the errors by group."""
     doubted: tuple[Mixed, ...]
+    """The posterior of the offsets for each plausible set of sizes, if the device may have a
+    scale error and rounded joint values may be off."""
     rival: tuple[float, float, FloatArray, FloatArray] | None = None
+    """The same for a device out of scale: log odds, scale minus one, mean (P,) and covariance."""
     unmodelled: tuple[float, float] = (0.0, 0.0)
+    """Sizes [rad] of turns and tilts of the joints beyond all names (`unmodelled.py`)."""
 
     @cached_property
     def square(self) -> FloatArray:

@@ -36,65 +36,47 @@ Other counts are multiples."""
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Observations(Shown):
-    """N matched pairs of joint values and measured poses, in stamp order.
-
-    Parameters
-    ----------
-    stamps_ns : (N,) int64
-    joints : (N, n) [rad or m]
-    positions, rotations : (N, 3) [m], (N, 3, 3)
-        Of the target in the measuring device's frame, the world.
-    oriented : (N,) bool
-        True where the orientation was measured; elsewhere the rotation is the identity.
-    covariance : (N, 6, 6), optional
-        Of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
-        PoseWithCovariance; NaN rows where unknown.
-    approach : (N, n), optional
-        Signs of the velocities with which the joints reached their values, for backlash.
-    distances : (N,), optional
-        Distances [m] from the origin of the world to the target, for draw-wires and ball-bars.
-        Positions and rotations are then ignored.
-    plane : bool
-        The distances are heights over the plane z = 0 of the world, zero where touched.
-    velocity, acceleration : (N, n), optional
-        Of the joints, if the arm was moving when measured.
-    delay : (N,), optional
-        Time [s] before the stamps at which the joints had these values.
-    base, tool : str
-        Frames of the chain for these pairs.
-    socket : bool
-        The target is a ball in a socket at an unknown place: the origin of the world, whose axes
-        are parallel to the arm's base.
-    inverse : bool
-        The poses are inverted: a fixed target was measured by a camera on the flange.
-    pixels, points : (N, 2), (N, 3), optional
-        Points of a board in images: one row per point, with its place in the image and in the
-        board frame [m]. Rows of one image are consecutive and share stamp and joint values.
-        Positions and rotations are then ignored.
-    on_flange : bool
-        The camera is on the flange, at `tool`, and the board is the world. Otherwise the camera is
-        the world and the board is at `tool`.
-    """
+    """N matched pairs of joint values and measured poses, in stamp order."""
 
     stamps_ns: NDArray[np.int64]
     joints: FloatArray
+    """(N, n) [rad or m]."""
     positions: FloatArray
     rotations: FloatArray
+    """(N, 3) [m] and (N, 3, 3) of the target in the measuring device's frame, the world."""
     oriented: Flags
+    """(N,) where the orientation was measured; elsewhere the rotation is the identity."""
     covariance: FloatArray | None = None
+    """(N, 6, 6) of x, y, z [m] and the rotation about the world's x, y, z axes [rad], as in
+    PoseWithCovariance; NaN rows where unknown."""
     approach: FloatArray | None = None
+    """(N, n) signs of the velocities with which the joints reached their values, for backlash."""
     distances: FloatArray | None = None
+    """(N,) [m] from the origin of the world to the target, for draw-wires and ball-bars.
+    Positions and rotations are then ignored."""
     velocity: FloatArray | None = None
     acceleration: FloatArray | None = None
+    """(N, n) of the joints, if the arm was moving when measured."""
     delay: FloatArray | None = None
+    """(N,) [s] before the stamps at which the joints had these values."""
     base: str = 'base'
     tool: str = 'tool'
+    """Frames of the chain for these pairs."""
     socket: bool = False
+    """The target is a ball in a socket at an unknown place: the origin of the world, whose axes
+    are parallel to the arm's base."""
     inverse: bool = False
+    """The poses are inverted: a fixed target was measured by a camera on the flange."""
     pixels: FloatArray | None = None
     points: FloatArray | None = None
+    """(N, 2) [px] and (N, 3) [m]: points of a board in images, one a row, with the place in the
+    image and in the board frame. Rows of one image are consecutive and share stamp and joint
+    values. Positions and rotations are then ignored."""
     on_flange: bool = False
+    """The camera is on the flange, at `tool`, and the board is the world. Otherwise the camera is
+    the world and the board is at `tool`."""
     plane: bool = False
+    """The distances are heights over the plane z = 0 of the world, zero where touched."""
 
     def __post_init__(self) -> None:
         """Check that the arrays match and are finite."""
@@ -128,10 +110,8 @@ class Observations(Shown):
 
         With `rotations` (N, 3, 3) they are poses. Masked values count as missing.
 
-        Raises
-        ------
-        InputError
-            For arrays that are not numeric, have another shape, or are not rotations.
+        Raises InputError for arrays that are not numeric, have another shape, or are not
+        rotations.
         """
         joints, positions = _numbers('joints', joints), _numbers('positions', positions)
         if joints.ndim != 2:

@@ -41,74 +41,54 @@ class Learned:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Problem(Shown):
-    """The input of an identification.
-
-    Parameters
-    ----------
-    chain : Chain
-        The nominal chain. Frames that it does not fix are fitted.
-    observations, more : Observations, sequence of Observations
-        Pairs to fit; further sets in the same fit: other sessions or targets with their own
-        frames, other kinds of measurement.
-    separations : sequence of (str, str, float)
-        Pairs of base frames whose origins are a known distance [m] apart: sockets of a ball on the
-        flange. Their worlds are parallel to the arm's base.
-    world_frame : str
-        Frame of the measured poses, for the record.
-    held_out : Observations or several, optional
-        Pairs that judge the result and are never fitted. Without them it is judged by
-        cross-validation over whole configurations.
-    sigma_position, sigma_orientation : float
-        Standard deviations [m, rad] of measurements without a covariance. Their ratio weights
-        position against orientation; the size of the noise is estimated.
-    sigma_pixel, sigma_touch : float
-        Standard deviations [px] of image coordinates of a board point, and [m] of heights over a
-        plane.
-    sigma_scale : float
-        Standard deviation of the scale of the measuring device [1], if checked with a known
-        length; otherwise 0.
-    loss : 'redescending', 'huber' or 'none'
-        Treatment of gross errors (`robust.py`).
-    priors : mapping of str to float
-        Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
-        such as `*.a`; the first match applies.
-    effects : sequence of str
-        Non-geometric effects to fit, by name or by group (`effects.py`).
-    fixed : sequence of str
-        Parameters to hold at their nominal values; `*` and `?` match as in file names.
-    folds : int
-        Number of cross-validation folds.
-    largest_length, largest_angle : float
-        Largest accepted offsets [m, rad], beyond any fault of the right robot.
-    largest_error : float
-        Largest accepted RMS position error [m] on held-out poses.
-    learned : Learned, optional
-        Priors estimated from the data, for parameters without one (`evidence.py`).
-    of_messages : bool
-        True if the samples were messages, to which table options do not apply.
-    """
+    """The input of an identification."""
 
     chain: Chain
+    """The nominal chain. Frames that it does not fix are fitted."""
     observations: Observations
+    """Pairs to fit."""
     held_out: Observations | Sequence[Observations] | None = None
+    """Pairs that judge the result and are never fitted. Without them it is judged by
+    cross-validation over whole configurations."""
     sigma_position: float = Settings.sigma_position
     sigma_orientation: float = Settings.sigma_orientation
+    """Standard deviations [m, rad] of measurements without a covariance. Their ratio weights
+    position against orientation; the size of the noise is estimated."""
     fixed: Sequence[str] = ()
+    """Parameters to hold at their nominal values; `*` and `?` match as in file names."""
     folds: int = Settings.folds
+    """Number of cross-validation folds."""
     largest_length: float = Settings.largest_length
     largest_angle: float = Settings.largest_angle
+    """Largest accepted offsets [m, rad], beyond any fault of the right robot."""
     largest_error: float = Settings.largest_error
+    """Largest accepted RMS position error [m] on held-out poses."""
     loss: str = Settings.loss
+    """Treatment of gross errors (`robust.py`): redescending, huber or none."""
     priors: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations [m, rad] of parameters about their nominal values, by name or pattern
+    such as `*.a`; the first match applies."""
     effects: Sequence[str] = ()
+    """Non-geometric effects to fit, by name or by group (`effects.py`)."""
     more: Sequence[Observations] = ()
+    """Further sets in the same fit: other sessions or targets with their own frames, other kinds
+    of measurement."""
     world_frame: str = ''
+    """Frame of the measured poses, for the record."""
     separations: Sequence[tuple[str, str, float]] = ()
+    """Pairs of base frames whose origins are a known distance [m] apart: sockets of a ball on the
+    flange. Their worlds are parallel to the arm's base."""
     learned: Learned | None = None
+    """Priors estimated from the data, for parameters without one (`evidence.py`)."""
     sigma_pixel: float = Settings.sigma_pixel
     sigma_touch: float = Settings.sigma_position
+    """Standard deviations [px] of image coordinates of a board point, and [m] of heights over a
+    plane."""
     sigma_scale: float = 0.0
+    """Standard deviation of the scale of the measuring device [1], if checked with a known
+    length; otherwise 0."""
     of_messages: bool = False
+    """True if the samples were messages, to which table options do not apply."""
 
     def __post_init__(self) -> None:
         """Check the arguments."""

@@ -27,10 +27,8 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 def board_poses(observations: Observations, lens: Lens) -> Observations:
     """Return pixels as poses, one for each image that determines one.
 
-    Raises
-    ------
-    InputError
-        If no image shows enough points, or half of those that do fit no pose of the board.
+    Raises InputError if no image shows enough points, or half of those that do fit no pose of the
+    board.
     """
     usable = _determine_a_pose(observations, observations.images)
     if not usable.any():

@@ -128,8 +128,7 @@ class Archive:
         self, folder: Path, robot: str, joints: int, configuration: Callable[[], str]
     ) -> None:
         self.folder = folder
-        self.error = ''
-        """Why poses are in memory only; empty if all are in the journal."""
+        self.error = ''  # why poses are in memory only; empty if all are in the journal
         words = (
             re.sub(r'[^\w.-]', lambda m: quote(m[0], safe=''), x) for x in robot.split('/', 1)
         )

@@ -43,12 +43,10 @@ from calib_ros.values import parse_like, parse_mapping, parse_number
 TYPES = ('charuco', 'markers')
 KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
 HEADER = ('image', 'corner', 'u', 'v')
-SIZE = ('width', 'height')
-"""Optional columns: size of the images [px]."""
+SIZE = ('width', 'height')  # optional columns: size of the images [px]
 DISTORTION = ('distortion_model', 'distortion_coefficients')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
-POSED = 'flange_pose'
-"""Name of the virtual arm."""
+POSED = 'flange_pose'  # name of the virtual arm
 
 
 @dataclass(frozen=True)

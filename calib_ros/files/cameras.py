@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras as measurement sources: from image and CameraInfo messages to corners."""
+"""Images of files and messages, and cameras as measurement sources: from images to corners."""
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,13 +15,14 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import lens_of, read_board
-from calib_ros.files.detector import Detector
-from calib_ros.files.photographs import Image, decoded, opencv
+from calib_ros.files.detector import Detector, Image, opencv
+from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.messages import Source, parse_sources
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
 
+SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}
 ENCODINGS |= {'8UC3': (3, 'BGR'), 'rgba8': (4, 'RGBA'), 'bgra8': (4, 'BGRA')}
 ENCODINGS |= {'bayer_rggb8': (1, 'BayerBG'), 'bayer_bggr8': (1, 'BayerRG')}
@@ -113,3 +115,43 @@ def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: 
     shape = (height, width) if channels == 1 else (height, width, channels)
     code = getattr(opencv(), f'COLOR_{kind}2GRAY')
     return np.asarray(opencv().cvtColor(np.ascontiguousarray(rows).reshape(shape), code))
+
+
+def files_of(folder: Path) -> list[Path]:
+    """Return the images of a folder by name, shorter names first."""
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
+    for path in paths:
+        if not path.name.isprintable():
+            raise InputError(f'the name of {path} cannot stand in a table: rename it')
+    return sorted(paths, key=lambda path: (len(path.name), path.name))
+
+
+def read_image(path: Path) -> Image | Refusal:
+    """Return an image in grey, empty if it is none, or why it cannot be read."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
+            return Refusal('that cannot be read', 'it is not a file')
+        if path.stat().st_size > LARGEST_IMAGE:
+            return Refusal('that cannot be read', f'it has more than {LARGEST_IMAGE / 1e6:.0f} MB')
+        return decoded(np.frombuffer(path.read_bytes(), dtype=np.uint8))
+    except OSError as err:
+        return Refusal('that cannot be read', f'it cannot be read: {err.strerror}')
+
+
+def decoded(data: NDArray[np.uint8]) -> Image:
+    """Return a compressed image of bytes (B,) in grey (H, W); (0, 0) if it is none.
+
+    EXIF rotation is ignored, because the lens is that of the sensor image. Of 10 to 16 bits the
+    eight highest used ones are kept.
+    """
+    cv2 = opencv()
+    kind = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(data, kind)
+    except cv2.error:
+        image = None
+    if image is None:
+        return np.zeros((0, 0), dtype=np.uint8)
+    if image.dtype == np.uint16:
+        image = image >> max(int(image.max()).bit_length() - 8, 0)
+    return np.asarray(image, dtype=np.uint8)

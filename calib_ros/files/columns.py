@@ -22,8 +22,7 @@ from calib_ros.texts import from_cell
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
-Row = tuple[int, Sequence[str]]
-"""Line number and cells."""
+Row = tuple[int, Sequence[str]]  # line number and cells
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 

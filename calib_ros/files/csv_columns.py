@@ -23,8 +23,7 @@ from calib_ros.progress import Notify, quiet
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
 from calib_ros.values import MOST_NAMES
 
-IRREGULAR = (b'"', b'\r', b'\0')
-"""Characters that need the csv module."""
+IRREGULAR = (b'"', b'\r', b'\0')  # characters that need the csv module
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
-from calib_ros.files.photographs import Image, opencv
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.settings import EXCEPTION
 
-Corners = tuple[Index, FloatArray]
-"""Numbers (K,) and pixels (K, 2) of a board's corners."""
+Image = NDArray[np.uint8]  # grey
+Corners = tuple[Index, FloatArray]  # numbers (K,) and pixels (K, 2) of a board's corners
 Markers = tuple[FloatArray, Index]
 """Corners (K, 4, 2) [px], clockwise from the upper left, and numbers (K,) of markers."""
 
@@ -33,10 +32,22 @@ FEWEST = IN_A_FRAME
 WINDOW = 0.6
 """Half window of corner refinement, relative to the nearest marker; measured, as WIDEST, by
 benchmarks/images.py."""
-WIDEST = 10
-"""Largest half window [px]."""
-SMALLEST_SIDE = 700
-"""Longer side [px] of the smallest image searched for markers."""
+WIDEST = 10  # largest half window [px]
+SMALLEST_SIDE = 700  # longer side [px] of the smallest image searched for markers
+
+
+def opencv() -> Any:
+    """Return OpenCV with its ArUco module."""
+    try:
+        import cv2
+    except ImportError as err:
+        raise ConfigError(
+            'boards need OpenCV: sudo apt install python3-opencv, or pip install '
+            '"calib_ros[camera]"'
+        ) from err
+    if not hasattr(cv2, 'aruco'):
+        raise ConfigError('this OpenCV has no ArUco module: before 4.7 it is in opencv-contrib')
+    return cv2
 
 
 def dictionaries() -> tuple[str, ...]:

@@ -51,8 +51,7 @@ FILES = (
     *('dh_standard.csv', 'dh_modified.csv', 'dh_standard.yaml', 'dh_modified.yaml'),
     *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
 )
-CORRECTED_URDF = '_corrected.urdf'
-"""Suffix of a corrected URDF beside these files."""
+CORRECTED_URDF = '_corrected.urdf'  # suffix of a corrected URDF beside these files
 TAIL = ('a', 'alpha', 'beta')
 """End of a joint's row in one convention, start of the next joint's in the other."""
 ROW = ('joint', 'type', 'sign', *DH_KINDS)

@@ -27,10 +27,10 @@ from calib_ros.files.layouts import (
     WORDS,
     Expression,
     Layout,
+    finished,
     joint_columns,
 )
 from calib_ros.files.sheets import Sheet, read_sheet
-from calib_ros.files.turns import finished
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import csv_text

@@ -31,14 +31,14 @@ from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import ErrorFigures
-from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.errors import LONGEST_NAME, CalibrationError, ConfigError, InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_document, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
-from calib_ros.values import LONGEST_NAME, parse_name
+from calib_ros.values import parse_name
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'

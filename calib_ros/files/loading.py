@@ -17,17 +17,16 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
-from calib_ros.files.tables import Table, read_table
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.files.tables import read_table
+from calib_ros.identification.identification import identify_model
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.sample import named
+from calib_ros.sampling.sample import Measured, named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
-TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')
-"""Suffixes of tables, lower case."""
+TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')  # suffixes of tables, lower case
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +94,7 @@ def table(
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,
-) -> Table:
+) -> Measured:
     """Return a table of measurements of a chain.
 
     Without a given layout, a table with other columns is read with the joints' names and another
@@ -110,7 +109,7 @@ def table(
     return read_table(*given, foreign, progress)
 
 
-def of_table(found: Table, chain: Chain, settings: Settings, **given: float) -> Loaded:
+def of_table(found: Measured, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return the problem of a table, with `given` arguments."""
     problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))

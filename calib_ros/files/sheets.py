@@ -24,8 +24,7 @@ from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
-LARGEST_SHEET = 3 * LARGEST_TABLE
-"""Bytes of an unpacked workbook."""
+LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 SHEETS = ('.xlsx', '.xlsm')
 
 

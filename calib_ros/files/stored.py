@@ -39,8 +39,7 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 """Attributes that rosbags does not promise: without them, its own reading is used."""
 LARGEST_MESSAGE = 64 * MOST_ENTRIES
 """Bytes of a message: a joint state with a name and three numbers per joint."""
-LARGEST_IMAGE = 2 * LARGEST_TABLE
-"""Bytes of an image, as a message or a file."""
+LARGEST_IMAGE = 2 * LARGEST_TABLE  # bytes of an image, as a message or a file
 NOT_CLOSED = 'the recording was not closed'
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',

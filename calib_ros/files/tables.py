@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,29 +42,18 @@ from calib_ros.files.measurements import (
     joined,
     measurements,
 )
-from calib_ros.identification.records import Owner
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.problems import Measured
-from calib_ros.sampling.sample import Frames, Sample, View, collect, lenses, sets_of, socket_pairs
+from calib_ros.sampling.sample import Measured, Sample, View, gathered
 from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
 
 USUAL_SIGMAS = (Settings.sigma_position, Settings.sigma_orientation)
 """Default standard deviations [m, rad]."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Table(Measured):
-    """Content of a table; with `by_line` stamps are lines, in seconds."""
-
-    warnings: tuple[str, ...] = ()
-    by_line: bool = False
-    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is
 
 
 def read_table(
@@ -75,45 +64,34 @@ def read_table(
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,
-) -> Table:
+) -> Measured:
     """Read a CSV table, or one in any other layout.
 
-    Parameters
-    ----------
-    path : Path or str
-        The file.
-    joints : int
-        Number of joints.
-    sessions : sequence of str
-        Sessions to read; each after the first gets its own base and tool frames.
-    sigmas : (float, float)
-        Standard deviations [m, rad] of poses seen by a camera on the flange.
-    eye_in_hand : bool
-        All poses are of a fixed target in a camera on the flange.
-    foreign : Foreign, optional
-        How to read a table from another system.
-    progress : Notify
-        Receives the share read.
+    Of several `sessions`, each after the first gets its own base and tool frames. `sigmas` are the
+    standard deviations [m, rad] of poses seen by a camera on the flange; with `eye_in_hand` all
+    poses are of a fixed target in such a camera. `foreign` tells how to read a table from another
+    system; `progress` receives the share read.
 
-    Raises
-    ------
-    InputError
-        For a missing column, a value that is not a number, an ambiguous session, or measurements
-        of one device in different frames. The message names the line.
+    Raises InputError for a missing column, a value that is not a number, an ambiguous session, or
+    measurements of one device in different frames. The message names the line.
     """
-    path = Path(path)
+    path, journal = Path(path), None
+    if foreign is None and path.is_file():  # a pipe can be read once only
+        journal = _of_journal(path, joints, progress)
+    if journal is not None:
+        rows, warnings = journal
+        if rows is None:
+            raise InputError(f'{path} has no rows')
+        rows = rows.select(_rows_of(path, rows.session, sessions))
+        return _table(rows, sigmas, eye_in_hand, warnings)
+    found: Columns
     if foreign is not None:
-        made, warnings = foreign.convert(path)
-        return table_of(made, joints, sessions, sigmas, eye_in_hand, warnings)
-    if path.is_file() and path.stat().st_size > LARGEST_TABLE:
-        rows, warnings = _of_journal(path, joints, progress) or (None, ())
-        if rows is not None:
-            chosen = rows.select(_rows_of(path, rows.session, sessions))
-            return _table(chosen, sigmas, eye_in_hand, warnings)
-    data, warnings = _read(path, columns(joints))
-    found = columns_of(path, data, progress)
-    warnings = (*warnings, *_unread(found, joints))
-    return table_of(found, joints, sessions, sigmas, eye_in_hand, warnings)
+        found, warnings = foreign.convert(path)
+    else:
+        found = columns_of(path, read_bytes(path, LARGEST_TABLE, InputError), progress)
+        warnings = tuple(_unread(found, joints))
+    rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
+    return _table(rows, sigmas, eye_in_hand, warnings, by_line)
 
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
@@ -123,15 +101,8 @@ def _unread(found: Columns, joints: int) -> Iterator[str]:
         yield f'{found.path}: {turns} are left out: give --euler or --rotation-vector to use them'
 
 
-def table_of(
-    found: Columns,
-    joints: int,
-    sessions: Sequence[str] = (),
-    sigmas: tuple[float, float] = USUAL_SIGMAS,
-    eye_in_hand: bool = False,
-    warnings: tuple[str, ...] = (),
-) -> Table:
-    """Return the table of columns; arguments as in `read_table`."""
+def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
+    """Return the measurements of some sessions."""
     if not len(found.lines):
         measurements(found, joints)  # names missing columns first
         raise InputError(f'{found.path} has no rows')
@@ -139,42 +110,37 @@ def table_of(
         names = ', '.join(sessions)
         raise InputError(f'{found.path} has no column "session" to choose "{names}" from')
     rows = _rows_of(found.path, found.labels('session'), sessions)
-    chosen = found if np.array_equal(rows, np.arange(len(found.lines))) else found.select(rows)
-    made = measurements(chosen, joints)
-    return _table(made, sigmas, eye_in_hand, warnings, 'stamp_ns' not in found.header)
+    every = np.array_equal(rows, np.arange(len(found.lines)))
+    return measurements(found if every else found.select(rows), joints)
 
 
 def _table(
     made: Measurements,
-    sigmas: tuple[float, float],
-    eye_in_hand: bool,
-    warnings: tuple[str, ...],
+    sigmas: tuple[float, float] = USUAL_SIGMAS,
+    eye_in_hand: bool = False,
+    warnings: tuple[str, ...] = (),
     by_line: bool = False,
-) -> Table:
+) -> Measured:
     made = made.kept()
     made.check_frames()
     if made.test.all():
         raise InputError(f'{made.path} has no rows to fit, only rows marked test')
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
-    frames = Frames()
     if made.view[1] != ['']:
-        samples = [*_samples(made)]
-        fitted, held_out = collect(samples, sigmas, frames)
+        found = gathered([*_samples(made)], sigmas)
     else:  # arrays, with one example of each kind
         _, number = distinct(made.codes)
-        samples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
+        examples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
 
         def observed(members: Sequence[int]) -> Observations:
             rows = np.isin(number, members)
             return (made if rows.all() else made.select(rows)).observations()
 
-        fitted, held_out = sets_of(samples, observed, sigmas, frames)
-    pairs, cameras = tuple(socket_pairs(samples, frames)), lenses(samples, frames)
+        found = gathered(examples, sigmas, observed=observed)
     place, names = made.frame_id
     world_frame = next((names[k] for k in place.tolist() if names[k]), '')
-    more = warnings, by_line, frames.owners
-    return Table(fitted, held_out, pairs, world_frame, cameras, *more)
+    return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)
 
 
 def check_table(made: MadeColumns) -> None:
@@ -185,17 +151,16 @@ def check_table(made: MadeColumns) -> None:
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
-    table_of(made, joints, tuple(dict.fromkeys(made.words.get('session', ()))))
+    _table(_chosen(made, joints, tuple(dict.fromkeys(made.words.get('session', ())))))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
     """Return the samples of a journal, possibly none, and warnings; leave out damaged rows."""
     damaged: list[int] = []
-    found = _of_journal(path, joints, damaged=damaged)
-    if found is None:  # cut off, or a table
-        data, warnings = _read(path, columns(joints))
-        found = measurements(columns_of(path, data), joints), warnings
-    made, warnings = found
+    made, warnings = _of_journal(path, joints, damaged=damaged) or (
+        measurements(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), joints),
+        (),
+    )
     if damaged:
         words = f'{path}: {lines_in_words(damaged)} cannot be read: left out, but kept in the file'
         warnings = (*warnings, words)
@@ -207,17 +172,16 @@ def _of_journal(
 ) -> tuple[Measurements | None, tuple[str, ...]] | None:
     """Return the rows of a journal, None if empty, and warnings; None for other files.
 
-    A node's journal may have any length, since its samples were in memory: it is read in parts,
-    and other files are refused at the first part. The lines of damaged rows go into a list;
-    without one they are refused.
+    It may have any length, since its samples were in memory: it is read in parts. The lines of
+    damaged rows go into a list; without one they are refused.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
     parts: list[Measurements] = []
     lines, rest = 1, b''
     try:
         with path.open('rb') as file:
-            if file.read(len(header)) != header:
-                return None
+            if (begin := file.read(len(header))) != header:
+                return (None, ()) if begin and header.startswith(begin) else None
             size = path.stat().st_size
             while data := file.read(LARGEST_TEXT):
                 whole, end, rest = (rest + data).rpartition(b'\n')
@@ -232,8 +196,8 @@ def _of_journal(
                 progress(min(file.tell() / size, 1.0))
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
-    made = joined(parts) if parts else None
-    return made, (_cut_off(path, lines + 1),) if rest else ()
+    cut_off = f'{path}: line {lines + 1} was cut off and is ignored'
+    return joined(parts) if parts else None, (cut_off,) if rest else ()
 
 
 def _rows(
@@ -359,23 +323,6 @@ def table_text(samples: Sequence[Sample], joints: int) -> str:
     rows = [cells(sample) for sample in samples]
     used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
     return csv_text([row[k] for k in used] for row in (names, *rows))
-
-
-def _read(path: Path, journal: Sequence[str]) -> tuple[bytes, tuple[str, ...]]:
-    """Return the content of a table, and warnings; `journal` is the header of a journal."""
-    data = read_bytes(path, LARGEST_TABLE, InputError)
-    header = ','.join(journal).encode() + b'\n'
-    if data and header.startswith(data):
-        return header, ()
-    begin = data.rfind(b'\n') + 1
-    cut = data.startswith(header) and not is_whole(data[begin:], len(journal))
-    whole = data[:begin] if cut else data
-    warnings = (_cut_off(path, whole.count(b'\n') + 1),) if len(whole) < len(data) else ()
-    return whole, warnings
-
-
-def _cut_off(path: Path, line: int) -> str:
-    return f'{path}: line {line} was cut off and is ignored'
 
 
 def _rows_of(path: Path, labels: Codes, sessions: Sequence[str]) -> Index:

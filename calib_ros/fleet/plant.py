@@ -19,8 +19,7 @@ from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.texts import parse_yaml, read_text
 from calib_ros.values import parse_like, parse_mapping, parse_number
 
-COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')
-"""Keys of a group or a robot."""
+COMMON = ('chain', 'settings', 'tolerance', 'largest_loss')  # keys of a group or a robot
 KEYS = {
     'the plant': ('groups', 'robots'),
     'a group': COMMON,
@@ -31,7 +30,7 @@ KEYS = {
 
 
 @dataclass(frozen=True)
-class Measured:
+class Pattern:
     """Files by a glob pattern, local or at a URL; of tables one session, if named."""
 
     files: str
@@ -44,7 +43,7 @@ class Robot:
 
     serial: str
     chain: Chain
-    measured: tuple[Measured, ...]
+    measured: tuple[Pattern, ...]
     settings: Settings = field(default_factory=Settings)
     tolerance: float | None = None  # wanted RMS position error [mm]
     largest_loss: float = EXCEPTION  # share of a bag's messages that may be lost
@@ -139,7 +138,7 @@ def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> 
     return chains[name]
 
 
-def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
+def _measured(value: object, folder: Path, where: str) -> tuple[Pattern, ...]:
     entries = value if isinstance(value, list) and value else [value]
     found = []
     for entry in entries:
@@ -153,7 +152,7 @@ def _measured(value: object, folder: Path, where: str) -> tuple[Measured, ...]:
                 f'{where}: measured must be a pattern of bags or tables, a file or URL with *, '
                 f'or a list of them, not {files!r:.100}'
             )
-        found.append(Measured(files if '://' in files else str(folder / files), session))
+        found.append(Pattern(files if '://' in files else str(folder / files), session))
     return tuple(found)
 
 

@@ -26,8 +26,7 @@ from calib_ros.fleet.work import Outcome, Task, sources, work
 from calib_ros.progress import Notify, quiet
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
-ANSWER_S = 60.0
-"""Time [s] for a scheduler and its first worker to answer; a convention."""
+ANSWER_S = 60.0  # time [s] for a scheduler and its first worker to answer; a convention
 DASK = {
     'distributed.worker.profile.enabled': False,
     'distributed.admin.tick.interval': '1s',

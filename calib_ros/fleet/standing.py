@@ -33,8 +33,7 @@ STATES: Mapping[str, tuple[State, str]] = {
     'fine': ('good', 'nothing to do'),
 }
 """States from worst to best, with their looks and meanings."""
-MOST_NIGHTS = MOST_ENTRIES // 10
-"""Nights of a robot on the page; the history lists all."""
+MOST_NIGHTS = MOST_ENTRIES // 10  # nights of a robot on the page; the history lists all
 ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 """Escapes in Prometheus labels."""
 

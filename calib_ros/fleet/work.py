@@ -31,10 +31,8 @@ from calib_ros.report.reports import identification_report
 from calib_ros.report.words import configuration_yaml
 
 DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
-SUMS = ('ETag', 'etag', 'CRC')
-"""Names of checksums in file systems."""
-PLOTLY = 'plotly.min.js'
-"""The script shared by all pages of a report."""
+SUMS = ('ETag', 'etag', 'CRC')  # names of checksums in file systems
+PLOTLY = 'plotly.min.js'  # the script shared by all pages of a report
 
 
 class Source(NamedTuple):

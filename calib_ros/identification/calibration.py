@@ -246,12 +246,10 @@ def calibration_file(path: str | os.PathLike[str]) -> Path:
     return file / 'calibration.yaml' if file.is_dir() else file
 
 
-def load_calibration(
-    path: str | os.PathLike[str], nominal: Chain | None = None, settings: Settings | None = None
-) -> Calibration:
+def load_calibration(path: str | os.PathLike[str], nominal: Chain | None = None) -> Calibration:
     """Read a calibration from its file or an identification's folder (`parse_calibration`)."""
     file = calibration_file(path)
-    return parse_calibration(read_text(file), str(file), nominal, settings)
+    return parse_calibration(read_text(file), str(file), nominal)
 
 
 def parse_calibration(
@@ -265,11 +263,8 @@ def parse_calibration(
     Without a nominal chain the recorded one is used; without recorded frames, those closest to the
     corrected arm.
 
-    Raises
-    ------
-    ConfigError
-        If the text is no chain file, has no record, was not accepted, or was identified from
-        another nominal chain.
+    Raises ConfigError if the text is no chain file, has no record, was not accepted, or was
+    identified from another nominal chain.
     """
     chain = parse_chain(text, where)
     if nominal is not None:

@@ -118,11 +118,7 @@ def _rows_in_words(chain: Chain) -> str:
 def difference(first: Calibration, second: Calibration) -> Difference:
     """Compare two calibrations of one robot.
 
-    Raises
-    ------
-    InputError
-        If they have different joints, or no covariance.
-
+    Raises InputError if they have different joints, or no covariance.
     """
     arms = first.chain, second.chain
     ours, theirs = map(_rows_in_words, arms)

@@ -5,11 +5,13 @@
 The steps of `identify` are those of Vacarescu et al., section 3: measure, linearise the pose
 errors in the parameter errors, solve by least squares, correct the parameters, and repeat until
 the step vanishes. The rest makes the result trustworthy: frames without an initial guess, gauge
-freedoms found and named, and a test on held-out poses.
+freedoms found and named, and a test on held-out poses. `identify_model` chooses non-geometric
+effects by cross-validation (docs/model.md, Non-geometric errors).
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -29,21 +31,17 @@ from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Posterior
-from calib_ros.estimation.fitting import (
-    SOME,
-    Fitted,
-    ParameterRow,
-    Simpler,
-    fit,
-    parameter_rows,
-)
+from calib_ros.estimation.fitting import SOME, Fitted, ParameterRow, Simpler, fit, parameter_rows
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
-from calib_ros.estimation.levels import SCALE
+from calib_ros.estimation.levels import SCALE, SEVERAL
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
 from calib_ros.estimation.unmodelled import unmodelled_errors
+from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.progress import Notify, quiet
+from calib_ros.kinematics.effects import Verdict
+from calib_ros.progress import Notify, quiet, share_of
 from calib_ros.settings import EXCEPTION
 
 
@@ -56,12 +54,8 @@ def identify(
     With the result of a `simpler` model, without effects, samples that it explains are no gross
     errors: otherwise a rich model could leave out what contradicts it.
 
-    Raises
-    ------
-    TooFewObservationsError
-        With fewer equations than parameters.
-    InputError
-        If the fit diverges; the message names the mistake that explains it, if any.
+    Raises TooFewObservationsError with fewer equations than parameters. Raises InputError if the
+    fit diverges; the message names the mistake that explains it, if any.
     """
     try:
         return _identified(problem, simpler, progress)
@@ -207,3 +201,117 @@ def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, l
     few = problem.system([each.spread(SOME) for each in problem.sets])
     normal = normal_equations(chain, free, System(few.sets))
     return identifiability.trades(normal.matrix, free, names)
+
+
+def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Identification:
+    """Identify with the errors named by `model`; `auto` chooses them by cross-validation.
+
+    If the chosen model cannot be fitted, or is refused although the geometric one is not, the
+    geometric result is returned with the verdicts and a remark. An exception from `progress` ends
+    the work.
+    """
+    progress(f'model {"geometric" if model == "auto" else model}')
+    if model != 'auto':
+        return identify(problem, progress=progress)
+    poses = max(1, sum(map(len, problem.sets)))
+    columns = 2 * len(HARMONICS) * len(problem.chain.joints)
+    fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)
+    first, second = np.array([fit, fit + tried]) / (2 * fit + tried)  # entries of all columns
+    result = identify(problem, progress=share_of(progress, 0.0, first))
+    chosen, verdicts = _chosen(problem, result, share_of(progress, first, second))
+    if chosen:
+        progress(f'model with {len(chosen)} effects')
+        rest = share_of(progress, second, 1.0)
+        richer = identify(replace(problem, effects=chosen), result, rest)
+        reasons: tuple[str, ...] = ()
+        if not richer.converged:
+            reasons = ('its fit has not converged',)
+        if result.accepted:
+            reasons = reasons or richer.refusals
+        if reasons:
+            remark = f'the richer model is not used, because {"; ".join(reasons)}'
+            result = replace(result, remarks=(*result.remarks, remark))
+        else:
+            result = richer
+    return replace(result, verdicts=verdicts)
+
+
+def _chosen(
+    problem: Problem, geometric: Identification, progress: Notify
+) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
+    progress('effects')
+    model = LinearModel(problem, geometric)
+    groups = model.useful({name: effects.members(problem.chain, name) for name in effects.GROUPS})
+    groups = {group: names for group, names in groups.items() if names}
+    chosen: list[str] = []
+    verdicts: dict[str, Verdict] = {}
+    while True:
+        _choose_groups(model, groups, chosen, verdicts, progress)
+        if not _choose_harmonics(model, chosen, verdicts, progress):
+            return tuple(chosen), tuple(verdicts.values())
+
+
+def _choose_groups(
+    model: LinearModel,
+    groups: Mapping[str, Sequence[str]],
+    chosen: list[str],
+    verdicts: dict[str, Verdict],
+    progress: Notify,
+) -> None:
+    """Choose the best group as long as one pays; then what is left together, where that pays.
+
+    Alone, a group may vanish in the errors that the others leave.
+    """
+    left = [group for group, names in groups.items() if not set(names) <= set(chosen)]
+    while True:
+        for group in left:
+            progress(f'effects: {group}')
+            verdicts[group] = model.judge(chosen, groups[group], group)
+        paying = [group for group in left if verdicts[group].pays]
+        if not paying:
+            break
+        best = min(paying, key=lambda group: verdicts[group].rms_mm_after)
+        left.remove(best)
+        chosen += groups[best]
+        model.quieten(verdicts[best])
+    every = [name for group in left for name in groups[group]]
+    together = model.judge(chosen, every, 'all')
+    if not together.pays:
+        return
+    for group in left:
+        others = [name for name in every if name not in groups[group]]
+        verdict = model.judge([*chosen, *others], groups[group], group)
+        if verdict.pays:
+            verdicts[group] = verdict
+        else:
+            every = others
+    if every:
+        chosen += every
+        model.quieten(together)
+
+
+def _choose_harmonics(
+    model: LinearModel, chosen: list[str], verdicts: dict[str, Verdict], progress: Notify
+) -> bool:
+    """Choose the strongest harmonics, or all, as long as they pay; tell whether any did."""
+
+    def added(verdict: Verdict, names: Sequence[str]) -> bool:
+        verdicts[verdict.what] = verdict
+        if verdict.pays:
+            chosen.extend(name for name in names if name not in chosen)
+            model.quieten(verdict)
+        return verdict.pays
+
+    before = len(chosen)
+    for count in itertools.count(1):
+        pair, several = model.strongest_harmonic(chosen, progress)
+        more = False
+        if pair:
+            what = f'{pair[0].owner}, {pair[0].effect[1]} per turn'
+            more = added(model.judge(chosen, pair, what), pair)
+        if several and (count == SEVERAL or (count < SEVERAL and not more)):
+            progress('effects: all harmonics')
+            more = not added(model.judge_all_harmonics(chosen), model.harmonics) and more
+        if not more:
+            break
+    return len(chosen) > before

@@ -61,23 +61,11 @@ def recalibrate(
 ) -> Recalibration:
     """Update a calibration with the poses of a problem.
 
-    Parameters
-    ----------
-    previous : Calibration
-        With its covariance.
-    problem : Problem
-        The new poses, between frames of the calibration, and their noise.
-    years : float
-        Time since then.
-    growth : float
-        Standard deviation [m] of the drift of lengths in a year; of angles twice that [rad].
-    new : sequence of str
-        Frames of moved devices and of remounted targets.
+    The poses are new, between frames of the calibration; the problem has their noise. Since then
+    `years` have passed. `growth` is the standard deviation [m] of the drift of lengths in a year;
+    of angles twice that [rad]. `new` are frames of moved devices and of remounted targets.
 
-    Raises
-    ------
-    InputError
-        If the calibration has no covariance, or does not know a frame.
+    Raises InputError if the calibration has no covariance, or does not know a frame.
     """
     found, arm = _recalibrated(previous, problem, years, growth, new)
     if found.accepted or found.reused or found.scale is not None:

@@ -71,10 +71,7 @@ class Record:
     def parse(cls, text: str, where: str) -> Record:
         """Return the record in the text of a calibration.
 
-        Raises
-        ------
-        ConfigError
-            If it is missing, was not accepted, or is incomplete.
+        Raises ConfigError if it is missing, was not accepted, or is incomplete.
         """
         record = calibration_record(text)
         if not record:

@@ -68,35 +68,23 @@ def nearly_parallel(tilt: float, apart: float) -> bool:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Chain(Shown):
-    """A serial chain; immutable: offsets return a new one.
-
-    Parameters
-    ----------
-    name : str
-    convention : 'standard' or 'modified'
-    joints : tuple of Joint
-    parallel : tuple of str, optional
-        Joints whose row joins two parallel axes, where beta is fitted instead of d. By default
-        found from the nominal table.
-    base, tool : Frame, optional
-        T_world_base and T_flange_target; None if unknown.
-    frames : tuple of (str, Frame or None)
-        Further bases (`base_...`) and tools (`tool_...`), for several sessions or targets.
-    effects : tuple of (str, float)
-        Non-geometric effects by name, with their values.
-    gravity : three floats
-        Acceleration of gravity [m/s^2] in the base frame, for compliance.
-    """
+    """A serial chain; immutable: offsets return a new one."""
 
     name: str
     convention: Convention
     joints: tuple[Joint, ...]
     parallel: tuple[str, ...] | None = None
+    """Joints whose row joins two parallel axes, where beta is fitted instead of d. By default
+    found from the nominal table."""
     base: Frame | None = None
     tool: Frame | None = None
+    """T_world_base and T_flange_target; None if unknown."""
     frames: tuple[tuple[str, Frame | None], ...] = ()
+    """Further bases (`base_...`) and tools (`tool_...`), for several sessions or targets."""
     effects: tuple[tuple[str, float], ...] = ()
+    """Non-geometric effects by name, with their values."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    """Acceleration of gravity [m/s^2] in the base frame, for compliance."""
 
     def __post_init__(self) -> None:
         """Check the names, and find parallel axes if not given."""

@@ -62,7 +62,7 @@ class Verdict:
 
 GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 'backlash')
 """Groups of effects that can be fitted together. `gear` has the harmonics at the gear ratio and
-twice that; others are found from data (`model_choice.py`). `coupling` is that of the wrist, the
+twice that; others are found from data (`identify_model`). `coupling` is that of the wrist, the
 last three joints."""
 EXPECTED = dict.fromkeys(GROUPS, 1e-4) | dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
 """Typical size [rad] of an effect by group: a third of an arc minute for drives, an arc minute for

@@ -60,20 +60,10 @@ def chain_from_urdf(
     kept, and the masses of everything attached to a link; moving side branches count in their zero
     position. Gravity points along -z of base_link.
 
-    Parameters
-    ----------
-    text : str
-        The URDF.
-    base_link, tip_link : str, optional
-        By default the root, and `tool0`, `flange` or the only end behind a moving joint.
-    convention : 'standard' or 'modified', optional
-        Of the table.
+    The links are by default the root, and `tool0`, `flange` or the only end behind a moving joint.
+    The table gets the given convention.
 
-    Raises
-    ------
-    ConfigError
-        If the text is not a URDF, or no serial chain connects the links.
-
+    Raises ConfigError if the text is not a URDF, or no serial chain connects the links.
     """
     robot = parse_urdf(text)
     path = robot.path(base_link, tip_link)
@@ -118,20 +108,11 @@ def corrected_urdf(
     the first axis and behind the last frame are kept. Errors of theta and d go into the origin of
     their joint; everything behind it follows.
 
-    Parameters
-    ----------
-    text : str
-        The nominal URDF.
-    chain : Chain
-        The corrected chain, identified from this URDF and these links or from an equal chain.
-    base_link, tip_link : str, optional
-        As for `chain_from_urdf`.
+    The chain is the corrected one, identified from this nominal URDF and these links (as for
+    `chain_from_urdf`) or from an equal chain.
 
-    Raises
-    ------
-    ConfigError
-        If the chain is not of this arm, or has effects, which a URDF cannot represent.
-
+    Raises ConfigError if the chain is not of this arm, or has effects, which a URDF cannot
+    represent.
     """
     nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
     arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())

@@ -65,10 +65,7 @@ class Description:
     def path(self, base: str | None, tip: str | None) -> tuple[DescribedJoint, ...]:
         """Return the joints from one link to another: by default from the root to the arm's end.
 
-        Raises
-        ------
-        ConfigError
-            If no serial chain of joints connects them.
+        Raises ConfigError if no serial chain of joints connects them.
         """
         base = self.root if base is None else base
         for link in (base, tip):

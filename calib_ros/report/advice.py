@@ -34,8 +34,7 @@ class Advice:
     again: str = AGAIN  # what to identify next
 
 
-ENOUGH = 25
-"""Poses worth judging, and the default of `calib_ros plan`: a convention."""
+ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a convention
 SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'
 
 

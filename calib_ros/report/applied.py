@@ -132,35 +132,42 @@ def _region(found: Sector) -> tuple[str, ...]:
     return (found.words, str(found.poses), f'{1e3 * found.rms:.4f}', *spans)
 
 
+def placed_in_words(placed: Placements) -> str:
+    """Return where to put a task, compared with the centre of all places and the worst."""
+    errors = 1e3 * placed.errors
+    reached = ~np.isnan(errors)
+    where = ', '.join(f'{value:.3f}' for value in placed.positions[placed.best])
+    return (
+        f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
+        f'vertical: {errors[placed.best]:.4f} mm; in the centre of the region '
+        f'{errors[placed.centre]:.4f} mm, at the worst place {errors[reached].max():.4f} mm. '
+        f'{int(reached.sum())} of {len(reached)} places can be reached.'
+    )
+
+
 def _placed(placed: Placements) -> Section:
     reached = ~np.isnan(placed.errors)
-    best = placed.positions[placed.best]
-    where = ', '.join(f'{value:.3f}' for value in best)
     values = numbers(1e3 * placed.errors[reached])
     colours = {'size': 4, 'color': values, **figures.scale_of('expected error [mm]')}
     cloud = figures.in_space(
         placed.positions[reached], 'expected error [mm]', marker=colours, showlegend=False
     )
     mark = {'size': 8, 'color': '#b3261e', 'symbol': 'diamond'}
-    place = figures.in_space(best[np.newaxis], 'best place', marker=mark, showlegend=True)
+    best = placed.positions[placed.best][np.newaxis]
+    place = figures.in_space(best, 'best place', marker=mark, showlegend=True)
     return section(
         'placements',
         'Where to put the task',
         figure=figures.space(cloud, place),
         height=560,
-        said=(
-            f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
-            f'vertical: {1e3 * placed.errors[placed.best]:.4f} mm; in the centre of the region '
-            f'{1e3 * placed.errors[placed.centre]:.4f} mm. '
-            f'{int(reached.sum())} of {len(reached)} places can be reached.',
-        ),
+        said=(placed_in_words(placed),),
     )
 
 
 def plan_report(
     chain: Chain,
     joints: FloatArray,
-    words: str,
+    remarks: Sequence[str],
     origin: Origin,
     found: Plan | None = None,
     wanted_mm: float | None = None,
@@ -198,7 +205,7 @@ def plan_report(
         kind='Measurement plan',
         robot=chain.name,
         verdict=verdict,
-        remarks=tuple(x for x in words.splitlines() if not x.startswith((' ', 'predicted'))),
+        remarks=tuple(remarks),
         steps=steps,
         identity=sections.identity_of(chain, origin),
         sections=tuple(shown),

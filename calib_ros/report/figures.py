@@ -24,12 +24,10 @@ Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
 DOTTED = {'color': LIMIT, 'dash': 'dot'}
-QUANTILES = 2 * SOME_POSES
-"""Points of a curve for any number of poses."""
+QUANTILES = 2 * SOME_POSES  # points of a curve for any number of poses
 REVERSED = {'autorange': 'reversed', 'automargin': True}
 """Vertical axis with the first row on top."""
-ROUND = ('eccentricity', 'gear')
-"""Periodic groups of effects."""
+ROUND = ('eccentricity', 'gear')  # periodic groups of effects
 
 
 def label(name: str) -> str:

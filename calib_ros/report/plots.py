@@ -21,8 +21,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.figures import AFTER, BEFORE
 from calib_ros.texts import one_line
 
-MARGIN = 0.01
-"""Free margin around a board [m]; a convention."""
+MARGIN = 0.01  # free margin around a board [m]; a convention
 
 
 def before_after_png(result: Identification) -> bytes:

@@ -38,10 +38,8 @@ FITTED, JUDGED, REPEATED = 'fitted', 'judged', 'repeated'
 """Roles: fitted; left out to judge; left out at a fitted configuration, not judged."""
 SINGLE = MANY
 """Poses shown one by one; of more, this many evenly spread ones give the quantiles."""
-WORST = 2 * SOME_POSES
-"""Poses with the largest errors, and outliers, listed of more."""
-BANDS = 60
-"""Parts of the session, and of each joint's values, with quantiles; a convention."""
+WORST = 2 * SOME_POSES  # poses with the largest errors, and outliers, listed of more
+BANDS = 60  # parts of the session, and of each joint's values, with quantiles; a convention
 CELLS = round(SINGLE ** (1 / 3))
 """Cells along the longest edge of the workspace: in total no more than single poses."""
 SHARES = (1.0 - CONFIDENT, 0.5, CONFIDENT)

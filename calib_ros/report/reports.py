@@ -42,8 +42,7 @@ BRING = (
 UNPROVEN = (
     'All these poses were used to compute the correction: a small error "after" proves nothing.'
 )
-SURVEYED = 20 * SOME_POSES
-"""Random poses of the error map: several per cell."""
+SURVEYED = 20 * SOME_POSES  # random poses of the error map: several per cell
 
 
 def identification_report(

@@ -10,26 +10,6 @@ from calib_ros.identification.records import reused_in_words
 from calib_ros.settings import Settings
 
 
-def in_words(found: Verification) -> str:
-    """Return the verdict and its basis."""
-    before, after = found.comparison.figures
-    lines = [
-        f'position error [mm] of {after.count} measurements at {found.configurations} poses',
-        '              RMS     mean      max   mean + 3 sigma',
-    ]
-    for label, figures in (('before', before), ('after', after)):
-        turn = '' if figures.rms_mrad is None else f'   (RMS {figures.rms_mrad:.3f} mrad)'
-        lines.append(
-            f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
-            f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
-        )
-    lines += each_in_words(found)
-    verdict = '' if found.tolerance is None else f'{found.verdict}: '
-    wanted = '' if found.tolerance is None else f'; wanted: {1e3 * found.tolerance:g} mm'
-    lines.append(f'{verdict}the RMS error over poses like these is {likely(found)}{wanted}')
-    return '\n'.join([*lines, *remarks(found)])
-
-
 def likely(found: Verification) -> str:
     """Return the RMS error over poses like these, with its interval."""
     rms, lower, upper = (f'{1e3 * x:.4f}' for x in (found.rms, found.lower, found.upper))

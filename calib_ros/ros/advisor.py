@@ -49,10 +49,8 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 
-CLOUD = 10 * MOST_ENTRIES
-"""Points of the error cloud (60 ms)."""
-MOST_POINTS = Settings.pose_buffer
-"""Points of a trajectory; longer ones are refused."""
+CLOUD = 10 * MOST_ENTRIES  # points of the error cloud (60 ms)
+MOST_POINTS = Settings.pose_buffer  # points of a trajectory; longer ones are refused
 MOST_SIZE = 400 * MOST_POINTS
 """Bytes of a serialised trajectory: ten joints with all rates take 352 a point."""
 MOST_QUEUED = qos_profile_services_default.depth

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import textwrap
+from ast import literal_eval
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
@@ -35,78 +36,47 @@ class Parameter:
     lower: float | None = None
 
 
-BESIDE_SETTINGS = (
-    Parameter(
-        'chain',
-        '',
-        'chain file, URDF or name (calib_ros robots) of the robot, or robot_description: the '
-        'URDF on that topic',
-    ),
-    Parameter('base_link', '', 'first link of the arm in a URDF; default: its root'),
-    Parameter(
-        'tip_link', '', 'last link of the arm in a URDF; default: tool0, flange or its only end'
-    ),
-    Parameter('serial', '', 'serial number of the robot'),
-    Parameter('data_dir', '', 'folder of journals and calibrations; default: one under ROS_HOME'),
-    Parameter(
-        'history',
-        '',
-        'folder or URL for the results of ~/identify and ~/validate, by serial; default: none',
-    ),
-    Parameter('resume', False, 'continue the newest journal of this robot'),
-    Parameter(
-        'allowed_folders',
-        (),
-        'folders besides data_dir that ~/save and ~/load may use; default: none',
-    ),
-    Parameter('autoload', False, 'publish the newest saved calibration of this robot at startup'),
-    Parameter(
-        'target_filename', '', 'file in data_dir that ~/save writes; default: a new one', False
-    ),
-    Parameter(
-        'calibration_filename',
-        '',
-        'file in data_dir to publish at startup and on ~/load; default: the newest, by autoload '
-        'or ~/load',
-        False,
-    ),
-    Parameter(
-        'socket',
-        '',
-        'LOCATION/SOCKET, such as A/1, that holds the ball when ~/capture is called; default: '
-        'none, a measurement is taken',
-        False,
-    ),
-    Parameter(
-        'largest_loss',
-        EXCEPTION,
-        'largest share of joint states or measurements dropped because of stamps or full buffers',
-        False,
-        0.0,
-    ),
-    Parameter('marker_scale', 200.0, 'enlargement of the residual vectors', False, 0.0),
-    Parameter(
-        'candidates',
-        '',
-        'table of poses (q1 ... qn) that ~/next_pose chooses from; default: any pose',
-    ),
-    Parameter(
-        'base_frame',
-        '',
-        "name under which the arm's base is published on /tf_static, in the frame of the "
-        'measurements; default: not published',
-    ),
-    Parameter(
-        'flange_frame',
-        '',
-        'flange frame in which the target is published on /tf_static; default: not published',
-    ),
-    Parameter('target_frame', 'target', 'frame name of the target on /tf_static'),
-)
+BESIDE_SETTINGS = f"""
+chain ''  chain file, URDF or name (calib_ros robots) of the robot, or robot_description: the \
+URDF on that topic
+base_link ''  first link of the arm in a URDF; default: its root
+tip_link ''  last link of the arm in a URDF; default: tool0, flange or its only end
+serial ''  serial number of the robot
+data_dir ''  folder of journals and calibrations; default: one under ROS_HOME
+history ''  folder or URL for the results of ~/identify and ~/validate, by serial; default: none
+resume False  continue the newest journal of this robot
+allowed_folders ()  folders besides data_dir that ~/save and ~/load may use; default: none
+autoload False  publish the newest saved calibration of this robot at startup
+target_filename* ''  file in data_dir that ~/save writes; default: a new one
+calibration_filename* ''  file in data_dir to publish at startup and on ~/load; default: the \
+newest, by autoload or ~/load
+socket* ''  LOCATION/SOCKET, such as A/1, that holds the ball when ~/capture is called; default: \
+none, a measurement is taken
+largest_loss* {EXCEPTION}  largest share of joint states or measurements dropped because of \
+stamps or full buffers
+marker_scale* 200.0  enlargement of the residual vectors
+candidates ''  table of poses (q1 ... qn) that ~/next_pose chooses from; default: any pose
+base_frame ''  name under which the arm's base is published on /tf_static, in the frame of the \
+measurements; default: not published
+flange_frame ''  flange frame in which the target is published on /tf_static; default: not \
+published
+target_frame 'target'  frame name of the target on /tf_static
+"""
+"""Name, `*` if it can change, default, description; numbers are not negative."""
+
+
+def _written(line: str) -> Parameter:
+    head, text = line.split('  ', 1)
+    name, default = head.split(' ')
+    value = literal_eval(default)
+    lower = 0.0 if isinstance(value, float) else None
+    return Parameter(name.rstrip('*'), value, text, not name.endswith('*'), lower)
+
+
 PARAMETERS = {
     each.name: each
     for each in (
-        *BESIDE_SETTINGS,
+        *map(_written, BESIDE_SETTINGS.strip().splitlines()),
         *(
             Parameter(each.name, each.default, fixed=each.name in STARTUP, **each.metadata)
             for each in fields(Settings)

@@ -37,8 +37,7 @@ class Boundary:
     def __init__(self, logger: Any) -> None:
         self._logger = logger
         self._logged: dict[str, str] = {}
-        self.failed: dict[str, str] = {}
-        """Failures since it was last emptied."""
+        self.failed: dict[str, str] = {}  # failures since it was last emptied
 
     def guarded(self, callback: Callable[..., None]) -> Callable[..., None]:
         """Return a callback that logs its exceptions."""

@@ -38,7 +38,7 @@ from calib_ros.files.history import (
     settings_hash,
 )
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.progress import Progress
@@ -144,8 +144,7 @@ class Identifying:
         self._configuration, self._accepted = configuration, accepted
         self._residuals = node.create_publisher(MarkerArray, '~/residuals', to_ros.LATCHED)
         self.progress = Progress('identifying')
-        self.last = 'nothing identified yet'
-        """Result of the last identification or ~/load."""
+        self.last = 'nothing identified yet'  # result of the last identification or ~/load
         self.observability = ''
         self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused

@@ -41,19 +41,13 @@ class Hearing:
     before: int = 0
     rate: float = 0.0
     last: float | None = None
-    deaf: str = ''
-    """The publisher's QoS that does not match the requested one."""
-    latched: bool = False
-    """True if it is published only once."""
-    lost: int = 0
-    """Messages lost in transit, by DDS."""
-    reported: int = 0
-    """The last total reported by DDS."""
-    full: int = 0
-    """How often the queue was full."""
+    deaf: str = ''  # the publisher's QoS that does not match the requested one
+    latched: bool = False  # true if it is published only once
+    lost: int = 0  # messages lost in transit, by DDS
+    reported: int = 0  # the last total reported by DDS
+    full: int = 0  # how often the queue was full
     lost_before: int = 0
-    losing: bool = False
-    """True if either grew between the last two looks."""
+    losing: bool = False  # true if either grew between the last two looks
 
     def note_lost(self, total: int) -> None:
         """Count up to a total of lost messages; its change omits some.

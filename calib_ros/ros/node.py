@@ -46,19 +46,15 @@ from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_un
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.problems import check_settings
-from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sample import Sample, check_settings
 from calib_ros.sampling.session import CalibrationSession
 
-DIAGNOSTICS_PERIOD = 1.0
-"""Time [s] between two reports on /diagnostics, the usual one."""
+DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
 TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0
 """Time [s] between two batches of messages: taken one by one, each in a cold cache, they cost
 three times as much."""
-JOIN_TIMEOUT = DIAGNOSTICS_PERIOD
-"""Time [s] for which the shutdown waits for running work."""
-STATUS_LENGTH = 120
-"""Characters of the status: `ros2 topic echo` cuts texts at 128."""
+JOIN_TIMEOUT = DIAGNOSTICS_PERIOD  # time [s] for which the shutdown waits for running work
+STATUS_LENGTH = 120  # characters of the status: `ros2 topic echo` cuts texts at 128
 
 
 class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml

@@ -85,8 +85,7 @@ class Broadcast:
         return message
 
 
-FILENAMES = ('target_filename', 'calibration_filename')
-"""Parameters that name files."""
+FILENAMES = ('target_filename', 'calibration_filename')  # parameters that name files
 
 
 class Published(NamedTuple):

@@ -30,10 +30,8 @@ from calib_ros.settings import Settings
 from calib_ros.values import LARGEST_SETTING, parse_like
 
 QOS = 'qos_overrides.'
-OF_ROS = ('use_sim_time', 'start_type_description_service')
-"""Parameters declared by rclpy."""
-DESCRIPTION_WAIT = 2.0 * SILENCE
-"""Time [s] to wait for the robot's description."""
+OF_ROS = ('use_sim_time', 'start_type_description_service')  # parameters declared by rclpy
+DESCRIPTION_WAIT = 2.0 * SILENCE  # time [s] to wait for the robot's description
 
 
 class Given(SimpleNamespace):

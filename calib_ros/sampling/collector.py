@@ -32,16 +32,14 @@ from calib_ros.sampling.slices import (
     StreamKey,
     Waiting,
 )
-from calib_ros.sampling.stops import SAMPLED, Known, Plan, Rests, seen_stops
+from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 
-REST_S = 0.5 * Settings.shortest_stop
-"""Time [s] without motion after which joints stand."""
+REST_S = 0.5 * Settings.shortest_stop  # time [s] without motion after which joints stand
 TWICE = 'same stamp twice'
 CONTRARY = 'different values with the same stamp (two publishers, or stamps too coarse?)'
-ADVANCE_NS = round(5e9 * REST_S)
-"""Time between two rounds of sampling, by joint stamps."""
+ADVANCE_NS = round(5e9 * REST_S)  # time between two rounds of sampling, by joint stamps
 
 
 class Collector:
@@ -64,13 +62,11 @@ class Collector:
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
         """Delay of measurement stamps after joint stamps."""
-        self.holding = False
-        """True while the delay is estimated and nothing is sampled."""
+        self.holding = False  # true while the delay is estimated and nothing is sampled
         self.maker = Maker(self._revolute, settings.pose_buffer)
         self.dropped = self.maker.dropped
         self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
-        self.unused: Counter[str] = Counter()
-        """Measurements normally not used, by cause."""
+        self.unused: Counter[str] = Counter()  # measurements normally not used, by cause
         self.notes: Counter[str] = Counter()
 
     def known(self, now_ns: int | None) -> tuple[Series, list[Series]]:
@@ -249,7 +245,7 @@ class Collector:
             return 1, ''
         self._round(begin)  # end earlier stops
         before, dropped = len(self.maker.fresh), self.dropped.copy()
-        plan = Plan(self._settled_ns, self._sampled_ns)
+        plan = Schedule(self._settled_ns, self._sampled_ns)
         plan.sample(begin, newest)
         self._carry_out(plan)
         count = len(self.maker.fresh) - before
@@ -273,7 +269,7 @@ class Collector:
         self._sort()
         if until <= self._settled_ns:
             return
-        plan = Plan(self._settled_ns, self._sampled_ns)
+        plan = Schedule(self._settled_ns, self._sampled_ns)
         if self.settings.mode == 'continuous':
             for end in (*(each - self._late_ns for each in rounds[:-1]), until):
                 plan.add(min(end, until), '')
@@ -295,7 +291,9 @@ class Collector:
                 if count:
                     self.dropped[f'{kind}: {cause}'] += count
 
-    def _plan_stops(self, plan: Plan, until: int, rounds: Sequence[int], ends_here: bool) -> None:
+    def _plan_stops(
+        self, plan: Schedule, until: int, rounds: Sequence[int], ends_here: bool
+    ) -> None:
         settings = self.settings
         stands = self.track.standing(settings.still, REST_S)
         shortest = round(settings.shortest_stop * 1e9)
@@ -310,7 +308,7 @@ class Collector:
                 if self._known.meets(*span, joints, 2.0 * settings.still):
                     plan.why[k] = SAMPLED
 
-    def _carry_out(self, plan: Plan) -> None:
+    def _carry_out(self, plan: Schedule) -> None:
         self.rests.sampled += len(plan.stops)
         moving = self.settings.mode == 'continuous'
         settle = 0 if moving else round(self.settings.settle * 1e9)

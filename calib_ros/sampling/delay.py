@@ -30,8 +30,7 @@ from calib_ros.values import MOST_NAMES
 
 SMOOTHING = 0.5 * Settings.max_gap
 """Time over which speeds are computed [s]; short compared with moves, long with the noise."""
-STEP = SMOOTHING / 10.0
-"""Sampling time of the speeds [s]."""
+STEP = SMOOTHING / 10.0  # sampling time of the speeds [s]
 LEAST_MOTION = 3.0 * Settings.lateness
 """Motion needed [s], so that most of it is compared at every delay."""
 ALIKE_ENOUGH = float(np.sqrt(1.0 - MOST_OUTLIERS))
@@ -177,8 +176,7 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
     return np.where(good, products / np.sqrt(np.where(good, squares, 1.0)), -1.0)
 
 
-WATCH_NS = round(5e9 * LEAST_MOTION)
-"""Time between two evaluations of the motion."""
+WATCH_NS = round(5e9 * LEAST_MOTION)  # time between two evaluations of the motion
 DENSE_NS = round(0.8e9 * STEP)
 """Interval in which one sample is kept; more add nothing to speeds."""
 EARLY = SMOOTHING / 2.0**0.5

@@ -11,11 +11,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.messages import LARGEST, Readings, Source
+from calib_ros.sampling.messages import Readings, Source
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
 from calib_ros.settings import EXCEPTION
-from calib_ros.values import MOST_NAMES
+from calib_ros.values import LARGEST, MOST_NAMES
 
 Layout: TypeAlias = tuple[Columns, Index]
 OTHERS = 'none of the joints in the message'
@@ -128,8 +128,7 @@ class Entry:
         self.received: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.unused: Counter[str] = Counter()
-        self.refused: dict[str, str] = {}
-        """Why the last messages of a kind cannot be used."""
+        self.refused: dict[str, str] = {}  # why the last messages of a kind cannot be used
         self.latest: tuple[int, Sequence[float]] | None = None
 
     def pieces(self, parts: Sequence[Part], recording: bool, wanted: str) -> list[Piece]:

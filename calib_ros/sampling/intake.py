@@ -42,15 +42,12 @@ from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.transforms import STATIC, Linked, Links
 from calib_ros.texts import LARGEST_TABLE
 
-BATCH = 2000
-"""Messages taken at once (benchmarks/bags.py, benchmarks/soak.py)."""
+BATCH = 2000  # messages taken at once (benchmarks/bags.py, benchmarks/soak.py)
 OF_CAMERAS = (*PICTURES, CAMERA_INFO)
-Deserialise: TypeAlias = Callable[[Any, str], Any]
-"""Converts bytes and a type to a message."""
+Deserialise: TypeAlias = Callable[[Any, str], Any]  # converts bytes and a type to a message
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and their messages, serialised or not, in order of arrival."""
-Row: TypeAlias = tuple[int, int, FloatArray]
-"""Place, stamp [ns] and numbers of one message."""
+Row: TypeAlias = tuple[int, int, FloatArray]  # place, stamp [ns] and numbers of one message
 Found: TypeAlias = 'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
 """Messages with the same names: places (N,), names, first and last stamp, reader."""
 

@@ -10,8 +10,7 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.slices import Rows, Stamps
 
-MOVED = STILL
-"""Change of a value [rad or m] that counts as a move."""
+MOVED = STILL  # change of a value [rad or m] that counts as a move
 
 
 def interpolated(

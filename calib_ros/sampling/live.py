@@ -56,8 +56,7 @@ MOST_THOROUGH = 60
 GROWN = (1.0 - EXCEPTION) ** -2
 """Growth of the number of samples at which all are judged again: it shrinks standard deviations by
 EXCEPTION."""
-MOST_AT_ONCE = 4 * SOME
-"""Samples per update at most."""
+MOST_AT_ONCE = 4 * SOME  # samples per update at most
 LITTLE = 0.35
 """Range [rad] of a joint over all samples that is too little: 20 degrees (or 0.035 m). A
 convention."""
@@ -104,8 +103,7 @@ class LiveEstimate:
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
         """Samples too far from the prediction of the others, ignored here."""
-        self.refused = ''
-        """Why the samples make no valid problem; empty if they do."""
+        self.refused = ''  # why the samples make no valid problem; empty if they do
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
         """Add the samples that are new since the last call, or restart with another list.

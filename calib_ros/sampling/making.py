@@ -23,8 +23,7 @@ from calib_ros.sampling.track import Motion
 DISTANCE, POSITION = slice(0, 1), slice(0, 3)
 QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
 ROW_WIDTH = COVARIANCE.stop
-Numbered: TypeAlias = tuple[int, Sample]
-"""A sample with the number of its round or stop."""
+Numbered: TypeAlias = tuple[int, Sample]  # A sample with the number of its round or stop
 VIBRATING = 'measurements: still vibrating, or a spike'
 RESTLESS = 'measurements: a stop with more spread than noise'
 
@@ -35,8 +34,7 @@ class Maker:
     def __init__(self, revolute: Flags, capacity: int) -> None:
         self._revolute, self._capacity = revolute, capacity
         self._taken: dict[StreamKey, set[int]] = {}
-        self.fresh: list[Sample] = []
-        """Samples not taken yet."""
+        self.fresh: list[Sample] = []  # samples not taken yet
         self._calm: int | None = None  # fresh samples before the first stop not at rest
         self._shaken = math.inf  # the number of that stop
         self.dropped: Counter[str] = Counter()

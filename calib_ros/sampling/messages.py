@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics.se3 import Flags, FloatArray
-from calib_ros.values import LARGEST as LARGEST, ROUNDED, covariance_fault
+from calib_ros.values import LARGEST, ROUNDED, covariance_fault
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
@@ -32,8 +32,7 @@ BODIES = {
     'motion_capture_tracking_interfaces/msg/NamedPoseArray': ('poses', 'name'),
 }
 """Message types of named poses in one frame (motion capture): fields of poses and names."""
-LINKS = (TRANSFORMS, *BODIES)
-"""Message types that link several frames at once."""
+LINKS = (TRANSFORMS, *BODIES)  # message types that link several frames at once
 PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
@@ -184,8 +183,7 @@ MARKERS = {
     'dh_parameters': 'std_msgs/msg/Float64MultiArray',
 }
 """Topics that together identify a calibration node."""
-DISTANCE = 'distance'
-"""Default device of distances: their origin is not that of a tracker."""
+DISTANCE = 'distance'  # default device of distances: their origin is not that of a tracker
 
 
 @dataclass(frozen=True)
@@ -237,8 +235,7 @@ class Source:
 
 
 LENSES = ('given', 'fitted')
-TYPES = (*DECODERS, *LINKS, *PICTURES)
-"""Message types of measurements."""
+TYPES = (*DECODERS, *LINKS, *PICTURES)  # message types of measurements
 
 STANDARD = (
     Source('measured_pose', 'geometry_msgs/msg/PoseStamped'),

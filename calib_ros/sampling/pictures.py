@@ -27,8 +27,7 @@ from calib_ros.texts import LARGEST_TABLE
 
 MOST_BYTES = 5 * LARGEST_TABLE
 """Memory for images: six seconds of 30 Hz at 2 megapixels in grey."""
-MOST_WAITING = 4
-"""Images that may wait for processing; further ones are dropped."""
+MOST_WAITING = 4  # images that may wait for processing; further ones are dropped
 
 
 class Refusal(NamedTuple):
@@ -53,8 +52,7 @@ class Pictures:
 
     def __init__(self, sigma: Callable[[], float]) -> None:
         self._sigma = sigma
-        self.cameras: Mapping[str, Camera] = {}
-        """Detectors by topic."""
+        self.cameras: Mapping[str, Camera] = {}  # detectors by topic
         self._pool = ThreadPoolExecutor(1, 'images')
         self._last = 0
         self.patient = False
@@ -65,10 +63,8 @@ class Pictures:
         """Forget all images and counts."""
         self._kept: dict[int, tuple[str, int, Callable[[], Any]]] = {}
         self._queue: deque[tuple[Sample, Future[Sample | Refusal] | None]] = deque()
-        self.dropped: Counter[str] = Counter()
-        """Unused images by cause."""
-        self.refused = ''
-        """Why the last image is not used; empty if it is."""
+        self.dropped: Counter[str] = Counter()  # unused images by cause
+        self.refused = ''  # why the last image is not used; empty if it is
 
     def keep(self, topic: str, size: int, message: Callable[[], Any]) -> int:
         """Keep an image of some bytes; return its number. `message` decodes it."""

@@ -32,8 +32,7 @@ class Gate:
         self._far_ns = round(far * 1e9)
         self._last: dict[str, int] = {}
         self._held: list[tuple[str, int, Slice]] = []
-        self.dropped: Counter[str] = Counter()
-        """Messages with stray stamps."""
+        self.dropped: Counter[str] = Counter()  # messages with stray stamps
 
     def held(self, kind: str) -> int:
         """Return the number of held messages of a kind."""

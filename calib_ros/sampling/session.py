@@ -17,22 +17,24 @@ from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
 from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
-from calib_ros.sampling.problems import (
+from calib_ros.sampling.road import Road
+from calib_ros.sampling.sample import (
+    Sample,
     check_joint_names,
     check_settings,
     in_frames_of,
+    named,
     problem_of,
     problem_since,
+    socket_place,
 )
-from calib_ros.sampling.road import Road
-from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
 
@@ -66,8 +68,7 @@ class CalibrationSession:
         check_joint_names(chain, self.joint_names)
         check_settings(chain, self.settings)
         self.recording = True
-        self.calibration: Calibration | None = None
-        """The last one accepted or loaded."""
+        self.calibration: Calibration | None = None  # the last one accepted or loaded
         self._known: frozenset[Sample] = frozenset()  # those it must not be judged by
         self.clear()
 

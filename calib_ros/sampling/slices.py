@@ -119,8 +119,7 @@ class StreamKey(NamedTuple):
         return not (self.distance or self.eye_in_hand or self.images)
 
 
-Columns: TypeAlias = tuple[int, ...]
-"""Indices of the chain's joints that a message names."""
+Columns: TypeAlias = tuple[int, ...]  # indices of the chain's joints that a message names
 
 
 class Piece(NamedTuple):

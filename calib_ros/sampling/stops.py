@@ -91,7 +91,7 @@ SAMPLED = 'of a stop that already has its pose'
 
 
 @dataclass
-class Plan:
+class Schedule:
     """What to do with measurements up to successive stamps.
 
     Those up to each of the `ends` are unused because of `why`; if that is empty they are used from
@@ -129,7 +129,7 @@ class Plan:
 
     def of_stands(
         self, stands: Stamps, until: int, newest: int | None, settings: Settings
-    ) -> Plan:
+    ) -> Schedule:
         """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there."""
         shortest, longest = (
             round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)

@@ -19,8 +19,7 @@ from calib_ros.sampling.interpolation import continuous, interpolated, last_move
 from calib_ros.sampling.slices import Rows, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
-LOOKS_BACK = FEW
-"""Samples in the window that the present one is compared with."""
+LOOKS_BACK = FEW  # samples in the window that the present one is compared with
 
 
 def standing(
@@ -104,10 +103,8 @@ class Track:
         self._capacity = capacity
         self._parts: dict[tuple[int, ...], Rows] = {}
         self._earlier = np.zeros(len(revolute))  # signs of last moves before the samples
-        self.contrary = 0
-        """Samples dropped for different values of the same stamp."""
-        self.horizon_ns = 0
-        """Samples before this stamp have been dropped."""
+        self.contrary = 0  # samples dropped for different values of the same stamp
+        self.horizon_ns = 0  # samples before this stamp have been dropped
 
     @property
     def newest_ns(self) -> int:

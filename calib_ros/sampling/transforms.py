@@ -28,11 +28,9 @@ from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
 from calib_ros.values import SAME
 
-Pair: TypeAlias = tuple[str, str]
-"""Parent and child frame of a link."""
+Pair: TypeAlias = tuple[str, str]  # parent and child frame of a link
 
-STATIC = '_static'
-"""Suffix of the topic of static links."""
+STATIC = '_static'  # suffix of the topic of static links
 
 
 class Linked(NamedTuple):
@@ -90,8 +88,7 @@ class Links:
         self._known = False  # whether the routes are up to date
         self._wanted: set[Pair] = set()
         self._open = True  # whether a source's frames are not linked yet
-        self.layouts: dict[int, list[Layout]] = {}
-        """Layouts by message length."""
+        self.layouts: dict[int, list[Layout]] = {}  # layouts by message length
         self._held: deque[tuple[Pair, Readings]] = deque()
         self._let_go: Counter[Pair] = Counter()
 

@@ -12,8 +12,8 @@ from commanded import UR, UR_TRUE, regular
 
 from calib_ros.apply.compensation import Compensator, compensate
 from calib_ros.apply.simulation import measure
+from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
-from calib_ros.cli.options import Status
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.programs import joints_csv, program_of, read_program

@@ -15,9 +15,9 @@ import yaml
 from measured import FIGURES, TEST, TRAIN, TRUE, UR, measured, rows_of, write_csv
 
 from calib_ros.apply.simulation import random_frame
+from calib_ros.cli.common import SETTINGS, Status
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
-from calib_ros.cli.options import SETTINGS, Status
 from calib_ros.identification.calibration import load_calibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import Settings

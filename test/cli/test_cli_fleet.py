@@ -12,8 +12,8 @@ import pytest
 from distributed import LocalCluster
 
 from calib_ros.cli import identify
+from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
-from calib_ros.cli.options import Status
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 

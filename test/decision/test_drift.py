@@ -18,8 +18,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import start_frames
-from calib_ros.identification.identification import identify
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.identification import identify, identify_model
 from calib_ros.report.words import as_document, chance_in_words
 
 DRIFTS = ('fading', 'walk', 'swing', 'ramp')

@@ -13,8 +13,7 @@ from calib_ros.decision.rounding import rounded, rounding_errors
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.identification.model_choice import identify_model
+from calib_ros.identification.identification import identify, identify_model
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 

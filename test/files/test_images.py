@@ -17,8 +17,8 @@ from robots import DATA, needs_data
 from calib_ros.cli.main import main
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files import boards
+from calib_ros.files.cameras import decoded, read_image
 from calib_ros.files.detector import Detector, detect
-from calib_ros.files.photographs import decoded, read_image
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens

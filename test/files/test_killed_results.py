@@ -21,9 +21,8 @@ from calib_ros.cli import given, identify, main
 from calib_ros.cli.identify import Identified
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.bags import replay
+from calib_ros.files.bags import Recording, replay, write_bag
 from calib_ros.files.loading import Loaded
-from calib_ros.files.recording import Recording, write_bag
 from calib_ros.identification import calibration
 from calib_ros.identification.identification import identify as identified_from
 from calib_ros.kinematics.chain_file import load_chain

@@ -11,7 +11,7 @@ import plants
 from calib_ros.apply.confidence import drift
 from calib_ros.decision.changes import Explanation
 from calib_ros.files.history import Row
-from calib_ros.fleet.plant import Measured, Robot
+from calib_ros.fleet.plant import Pattern, Robot
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.standing import STATES, Standing, counts, page_of
 from calib_ros.fleet.watch import Change, Night, Watched
@@ -28,7 +28,7 @@ def standing(serial, errors=None, changes=(), errors_mm=(0.1, 0.1, 0.1), **more)
     rows = [Row(serial, 'identify', plants.when(k), 'accepted', '', '') for k in range(3)]
     rows = [replace(row, rms_mm=0.1 + 0.01 * k, **more) for k, row in enumerate(rows)]
     nights = [Night(row, {'a': 0.5, '<b>': 6.0}) for row in rows]
-    robot = Robot(serial, load_chain('ur10e'), (Measured('*'),), tolerance=0.11)
+    robot = Robot(serial, load_chain('ur10e'), (Pattern('*'),), tolerance=0.11)
     watched = Watched(tuple(nights), changes)
     verified = tuple(replace(row, rms_mm=rms) for row, rms in zip(rows, errors_mm, strict=True))
     return Standing(

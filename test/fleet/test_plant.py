@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.fleet.plant import Measured, parse_plant, read_plant
+from calib_ros.fleet.plant import Pattern, parse_plant, read_plant
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.settings import Settings
 
@@ -35,13 +35,13 @@ def test_robots_with_what_their_group_says(tmp_path):
     first, second = read_plant(tmp_path / 'plant.yaml')
     assert (first.serial, first.chain.name, first.tolerance) == ('0042', 'ur10e', 0.3)
     assert first.settings == Settings(sigma_position=5e-5, folds=6)
-    assert first.measured == (Measured(str(tmp_path / 'nights/0042/*.csv')),)
+    assert first.measured == (Pattern(str(tmp_path / 'nights/0042/*.csv')),)
     assert first.since == datetime(2026, 11, 20, tzinfo=timezone.utc)
     assert second.chain.name == 'ur5e'
     assert second.settings == Settings()
     assert second.measured == (
-        Measured('s3://bags/B/*'),
-        Measured(str(tmp_path / 'both.csv'), 'A'),
+        Pattern('s3://bags/B/*'),
+        Pattern(str(tmp_path / 'both.csv'), 'A'),
     )
     assert (second.tolerance, second.largest_loss, second.since) == (None, 0.2, None)
     assert first.settings_hash != second.settings_hash

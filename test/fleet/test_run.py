@@ -12,7 +12,7 @@ from distributed import LocalCluster
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.history import History, Row
 from calib_ros.fleet import run as running
-from calib_ros.fleet.plant import Measured, read_plant
+from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
 from calib_ros.fleet.standing import standings
 from calib_ros.fleet.work import Outcome, Source, Task, sources
@@ -198,7 +198,7 @@ def test_nights_by_other_settings_are_told_of(plant, cluster, tmp_path):
 
 def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path):
     first, second = plant
-    missing = Measured(str(tmp_path / 'archive/*.csv'))
+    missing = Pattern(str(tmp_path / 'archive/*.csv'))
     first = replace(first, measured=(missing, *first.measured))
     found = run((first, second), History(tmp_path / 'history'), cluster)
     assert found.filed == 4
@@ -208,17 +208,17 @@ def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path)
 def test_hidden_files_are_no_nights(plant, tmp_path):
     """As rsync has them until a copy is whole, and calib_ros until a bag is."""
     nights = tmp_path / 'nights/A'
-    pattern = Measured(str(nights / '*'))
+    pattern = Pattern(str(nights / '*'))
     expected = [str(path) for path in sorted(nights.iterdir())]
     (nights / '.002.csv').write_text('half a night')
     (nights / '.002.csv.Xy12Za').write_text('half a night')
     (nights / '.bag.partial/bag').mkdir(parents=True)
     (nights / '.bag.partial/bag/001.csv').write_text('half a night')
-    for each in (pattern, Measured(str(nights / '**/*.csv'))):
+    for each in (pattern, Pattern(str(nights / '**/*.csv'))):
         found, wrong = sources(replace(plant[0], measured=(each,)))
         assert [source.name for source in found] == expected
         assert wrong == {}
-    (own,), _ = sources(replace(plant[0], measured=(Measured(str(nights / '.002.csv')),)))
+    (own,), _ = sources(replace(plant[0], measured=(Pattern(str(nights / '.002.csv')),)))
     assert own.name == str(nights / '.002.csv')
 
 

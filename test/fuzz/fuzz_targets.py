@@ -274,7 +274,7 @@ TARGETS['message'] = message
 def settings(data):
     """Options of identify, one in a line."""
     from calib_ros.cli import main
-    from calib_ros.cli.options import settings_of
+    from calib_ros.cli.common import settings_of
     from calib_ros.sampling.session import CalibrationSession
 
     lines = data.decode(errors='replace').replace('\0', '').split('\n')

@@ -6,6 +6,7 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 from pages import problem_of
+from verified import in_words
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
@@ -19,7 +20,6 @@ from calib_ros.report import words
 from calib_ros.report.applied import verification_report
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import in_words
 from calib_ros.report.words import between, checked, verdict
 from calib_ros.shown import rounded
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from calib_ros.sampling.slices import Piece, Slice, StreamKey, Waiting
-from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Plan, Rests, seen_stops
+from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
 from calib_ros.settings import Settings
 
 S = 10**9
@@ -44,7 +44,7 @@ MOVING, SHORT = 'the arm was moving', 'the stop was too short'
 def test_stands_become_stops(stands, until, newest, expected, more):
     done, settings = more.get('done', 0), Settings(longest_stop=3.0)
     settings = replace(settings, shortest_stop=more.get('shortest', 1.0))
-    plan = Plan(done * S, more.get('sampled', 0) * S)
+    plan = Schedule(done * S, more.get('sampled', 0) * S)
     stands = np.array(stands, dtype=np.int64).reshape(-1, 2) * S
     plan.of_stands(stands, until * S, None if newest is None else newest * S, settings)
     assert plan.done_ns == (plan.ends[-1] if plan.ends else done * S)

@@ -17,8 +17,7 @@ from calib_ros.errors import InputError
 from calib_ros.settings import Settings
 
 Group: TypeAlias = 'argparse.ArgumentParser | argparse._ArgumentGroup'
-Contents: TypeAlias = dict[str, str | bytes]
-"""Content of files by name."""
+Contents: TypeAlias = dict[str, str | bytes]  # content of files by name
 SETTINGS = {
     'the fit': ('model', 'fixed', 'priors', 'loss', 'folds', 'socket_distance'),
     'how the device measures': (
