@@ -217,10 +217,10 @@ def random_arm(rng):
 
 def random_offsets(chain, rng, size=1e-3):
     """Return offsets of all parameters but those that only a fixed joint at the end can take."""
-    kinds = ['a', 'alpha', 'beta', 'd', 'theta']
+    kinds = ['a', 'alpha', 'beta', 'b', 'd', 'theta']
     names = [f'{name}.{kind}' for name in chain.joint_names for kind in kinds]
     if chain.convention == 'standard':
-        names = [n for n in names if n not in [f'{chain.joint_names[-1]}.{k}' for k in kinds[:3]]]
+        names = [n for n in names if n not in [f'{chain.joint_names[-1]}.{k}' for k in kinds[:4]]]
     return dict(zip(names, rng.normal(scale=size, size=len(names)), strict=True))
 
 

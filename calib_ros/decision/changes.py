@@ -49,7 +49,7 @@ SIZES = {'m': 1e-3, 'rad': 2e-3}
 way costs half a unit of log evidence."""
 SCALE_OF_DEVICE = Parameter('device', 'ratio')
 """Scale of all measured lengths: of the arm, and of the distance to it."""
-ORDER = ('theta', 'd', 'a', 'alpha', 'beta')
+ORDER = ('theta', 'd', 'a', 'b', 'alpha', 'beta')
 """Order in which a joint's parameters are named if two have the same effect."""
 
 

@@ -2,16 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A corrected chain in formats for controllers and other software.
 
-    dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta; exact
+    dh_standard.csv, dh_modified.csv   tables of a, alpha, d, theta, beta, perhaps b; exact
     dh_standard.yaml, dh_modified.yaml the same as chain files, with base and tool; exact
     kinematics.yaml                    x y z roll pitch yaw from joint to joint; exact
     dh_without_beta.csv                the best table for controllers without beta
     joint_offsets.csv                  the best correction by joint offsets alone
 
-The conventions differ only in where a row is cut: Tx(a) Rx(alpha) Ry(beta) ends the row of a joint
-in the one and begins that of the next joint in the other. Every file is read back and compared
-with the chain on random poses; an exact one that differs is refused, others state their error in
-the first line.
+The conventions differ only in where a row is cut: Tx(a) Ty(b) Rx(alpha) Ry(beta) ends the row of a
+joint in the one and begins that of the next joint in the other. Every file is read back and
+compared with the chain on random poses; an exact one that differs is refused, others state their
+error in the first line.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ FILES = (
     *('kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv'),
 )
 CORRECTED_URDF = '_corrected.urdf'  # suffix of a corrected URDF beside these files
-TAIL = ('a', 'alpha', 'beta')
+TAIL = ('a', 'alpha', 'beta', 'b')
 """End of a joint's row in one convention, start of the next joint's in the other."""
-ROW = ('joint', 'type', 'sign', *DH_KINDS)
+ROW = ('joint', 'type', 'sign')
 
 
 class ExportError(CalibrationError):
@@ -152,9 +152,9 @@ def cut_off(chain: Chain, convention: Convention) -> str:
     return ', '.join(found)
 
 
-def _tail(a: float, alpha: float, beta: float) -> FloatArray:
+def _tail(a: float, alpha: float, beta: float, b: float) -> FloatArray:
     about_x, about_y = se3.exp_rotation(np.array([[alpha, 0.0, 0.0], [0.0, beta, 0.0]]))
-    return se3.transform(about_x @ about_y, np.array([a, 0.0, 0.0]))
+    return se3.transform(about_x @ about_y, np.array([a, b, 0.0]))
 
 
 def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> str:
@@ -240,10 +240,10 @@ def urdf_foot(chain: Chain) -> str:
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
     rows = [
-        (to_cell(each.name), each.type, each.sign, *(getattr(each, kind) for kind in DH_KINDS))
-        for each in chain.joints
+        (to_cell(each.name), each.type, each.sign, *row)
+        for each, row in zip(chain.joints, chain.table.tolist(), strict=True)
     ]
-    return head(chain, what, error, digest) + csv_text([ROW, *rows])
+    return head(chain, what, error, digest) + csv_text([(*ROW, *chain.columns), *rows])
 
 
 def _read_csv(text: str, form: Chain) -> Chain:
@@ -251,8 +251,8 @@ def _read_csv(text: str, form: Chain) -> Chain:
     for row in csv.DictReader(io.StringIO(text.partition('\n')[2], newline='')):
         kind: JointType = 'prismatic' if row['type'] == 'prismatic' else 'revolute'
         a, alpha, d, theta, beta = (float(row[name]) for name in DH_KINDS)
-        name = from_cell(row['joint'])
-        joints.append(Joint(name, kind, a, alpha, d, theta, beta, int(row['sign'])))
+        name, b = from_cell(row['joint']), float(row.get('b', 0.0))
+        joints.append(Joint(name, kind, a, alpha, d, theta, beta, int(row['sign']), b=b))
     return replace(form, joints=tuple(joints))
 
 
@@ -284,7 +284,7 @@ def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: Fl
         names = {joint.driven for joint in start.joints}
     else:
         form = with_common_normals(start)
-        plain = tuple(replace(joint, beta=0.0) for joint in form.joints)
+        plain = tuple(replace(joint, beta=0.0, b=0.0) for joint in form.joints)
         close = {each.name for each in plain if each.tilt < np.sin(PARALLEL_TOLERANCE)}
         start = replace(start, joints=plain)
         names = {name for name in start.parameter_names if Parameter(name).kind in kinds}

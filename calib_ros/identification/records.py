@@ -29,7 +29,7 @@ from calib_ros.kinematics.chain_file import (
     parse_frames,
     table_hash,
 )
-from calib_ros.kinematics.parameter import DH_KINDS
+from calib_ros.kinematics.parameter import DH_KINDS, ROW_KINDS
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import Settings
 from calib_ros.values import parse_like, parse_number, parse_numbers
@@ -109,8 +109,10 @@ class Record:
         rows = dictionary(self._part('nominal').get('joints'), where)
         found = {}
         for name in chain.joint_names:
-            row = parse_numbers(rows.get(name), len(DH_KINDS), f'{self.where}: nominal {name}')
-            found[name] = dict(zip(DH_KINDS, row.tolist(), strict=True))
+            row = rows.get(name)
+            kinds = ROW_KINDS if isinstance(row, list) and len(row) > len(DH_KINDS) else DH_KINDS
+            numbers = parse_numbers(row, len(kinds), f'{self.where}: nominal {name}')
+            found[name] = dict(zip(kinds, numbers.tolist(), strict=True))
         return found
 
     def nominal(self, chain: Chain) -> Chain:

@@ -4,8 +4,9 @@
 
     T_world_target(q) = T_world_base A_1(q_1) ... A_n(q_n) T_flange_target
 
-    standard   A = Rz(theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)    Vacarescu et al., eq. (2), with beta
-    modified   A = Rx(alpha) Tx(a) Ry(beta) Rz(theta) Tz(d)    Craig
+    standard   A = Rz(theta) Tz(d) L    Vacarescu et al., eq. (2), with beta
+    modified   A = L Rz(theta) Tz(d)    Craig
+               L = Tx(a) Ty(b) Rx(alpha) Ry(beta)
 
     revolute   theta = joint.theta + sign q        prismatic   d = joint.d + sign q
 
@@ -16,13 +17,14 @@ walk along it (`walk.py`) ends in the pose, and the axes met on the way are all 
 model (`jacobian.py`) needs.
 
 beta is Hayati's parameter (Hayati and Mirmirani 1985; Vacarescu et al., section 2). It replaces d
-at consecutive parallel revolute axes, where a tiny tilt moves the common normal arbitrarily far.
+at consecutive parallel axes, where a tiny tilt moves the common normal arbitrarily far. b replaces
+theta where they coincide as well: a turn about the first axis does not shift the second.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias, TypeVar, get_args
@@ -42,6 +44,7 @@ from calib_ros.kinematics.parameter import (
     DH_KINDS,
     FRAME_KINDS,
     LENS_KINDS,
+    ROW_KINDS,
     Parameter,
     parameters_of,
 )
@@ -62,8 +65,16 @@ def nearly_parallel(tilt: float, apart: float) -> bool:
     mm, 1 mrad, so 0.5 m) turn the common normal 1 / sin f times as much, and the line to where the
     next axis pierces the plane across this one (0.5 m / apart) / cos f times.
     """
-    across = min(2.0 * abs(apart), 1.0) * math.sqrt(max(1.0 - tilt**2, 0.0))
-    return tilt < max(math.sin(PARALLEL_TOLERANCE), across)
+    return tilt < max(math.sin(PARALLEL_TOLERANCE), _across(tilt, apart))
+
+
+def nearly_coincident(tilt: float, apart: float) -> bool:
+    """Tell whether axes are better described by b, too, than by theta."""
+    return max(tilt, _across(tilt, apart)) < math.sin(PARALLEL_TOLERANCE)
+
+
+def _across(tilt: float, apart: float) -> float:
+    return min(2.0 * apart, 1.0) * math.sqrt(max(1.0 - tilt**2, 0.0))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,25 +110,25 @@ class Chain(Shown):
             if name in ('base', 'tool'):
                 raise ConfigError(f'a joint must not be named "{name}", the name of a frame')
         if self.parallel is None:
-            object.__setattr__(self, 'parallel', self._find_parallel())
+            object.__setattr__(self, 'parallel', self._joining(nearly_parallel))
         for name in self.parallel or ():
             if name not in names:
                 raise UnknownNameError('joint in "parallel"', name, names)
             if (self.parallel or ()).count(name) > 1:
                 raise ConfigError(f'"parallel" names joint "{name}" twice')
 
-    def _find_parallel(self) -> tuple[str, ...]:
-        """Return the joints whose row joins two nearly parallel axes, at least one revolute.
+    def _joining(self, related: Callable[[float, float], bool]) -> tuple[str, ...]:
+        """Return the joints whose row joins two axes that are `related` by tilt and distance.
 
-        At a prismatic axis, too, theta tilts a parallel axis only to second order. Row i leads
-        from axis i to the next in the standard convention, and to axis i in the modified one.
+        Two prismatic axes have no distance. Row i leads from axis i to the next in the standard
+        convention, and to axis i in the modified one.
         """
         first, last = (0, 1) if self.convention == 'standard' else (1, 0)
         rows = self.joints[first : len(self.joints) - last]
         return tuple(
             row.name
             for row, *axes in zip(rows, self.joints, self.joints[1:], strict=False)
-            if any(joint.type == 'revolute' for joint in axes) and nearly_parallel(row.tilt, row.a)
+            if related(row.tilt, row.apart if any(j.type == 'revolute' for j in axes) else 0.0)
         )
 
     @cached_property
@@ -133,9 +144,12 @@ class Chain(Shown):
         names += [Parameter(name, DELAY) for name in frames if frames[name].delay is not None]
         cameras = [name for name in frames if frames[name].lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
+        parallel = frozenset(self.parallel or ())
+        coincident = parallel.intersection(self._joining(nearly_coincident))
         for joint in self.joints:
-            left_out = 'd' if joint.name in (self.parallel or ()) else 'beta'
-            names += [name for name in joint.parameters if name.kind != left_out]
+            left_out = {'d' if joint.name in parallel else 'beta'}
+            left_out |= {'b'} if joint.name not in coincident else set()
+            names += [name for name in joint.parameters if name.kind not in left_out]
         return (*names, *(Parameter(name) for name, _ in self.effects))
 
     @cached_property
@@ -145,21 +159,29 @@ class Chain(Shown):
 
     @property
     def table(self) -> FloatArray:
-        """Return the DH table (n, 5) with columns a, alpha, d, theta, beta."""
-        return np.array([(j.a, j.alpha, j.d, j.theta, j.beta) for j in self.joints])
+        """Return the DH table (n, 5) with columns a, alpha, d, theta, beta; (n, 6) with b."""
+        return self._numbers(self.columns)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Return the columns of the table; b only where it is not zero."""
+        return ROW_KINDS if any(joint.b for joint in self.joints) else DH_KINDS
+
+    def _numbers(self, kinds: Sequence[str]) -> FloatArray:
+        return np.array([[getattr(joint, kind) for kind in kinds] for joint in self.joints])
 
     @cached_property
     def walk(self) -> Walk:
         """Return the link data for the forward kinematics."""
         signs = np.array([float(joint.sign) for joint in self.joints])
         turning = np.array([joint.type == 'revolute' for joint in self.joints])
-        return Walk(self.table, signs, turning, self.convention == 'standard')
+        return Walk(self._numbers(ROW_KINDS), signs, turning, self.convention == 'standard')
 
     def value(self, name: str) -> float:
         """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
         owner, kind = self._split(name)
         if isinstance(owner, Joint):
-            return float(getattr(owner, kind)) if kind in DH_KINDS else self._effect_values[name]
+            return float(getattr(owner, kind)) if kind in ROW_KINDS else self._effect_values[name]
         if kind == DELAY:
             return owner.delay or 0.0
         if kind in LENS_KINDS:
@@ -219,7 +241,7 @@ class Chain(Shown):
         joints = []
         for joint in self.joints:
             own = by_owner.get(joint.name, {})
-            values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in DH_KINDS}
+            values = {kind: getattr(joint, kind) + own[kind] for kind in own if kind in ROW_KINDS}
             joints.append(_with(joint, values, ('parameters', 'driven')) if values else joint)
         frames = {
             key: self.frame(key).moved(by_owner[key]) if key in by_owner else frame
@@ -339,7 +361,7 @@ def _parameters(
     return frozenset(
         (
             *(f'{frame}.{kind}' for frame in frames for kind in placed),
-            *(f'{joint}.{kind}' for joint in joints for kind in DH_KINDS),
+            *(f'{joint}.{kind}' for joint in joints for kind in ROW_KINDS),
             *fitted,
         )
     )

@@ -25,7 +25,7 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.lens import Lens
-from calib_ros.kinematics.parameter import DH_KINDS, IN_PIXELS, LENS_KINDS
+from calib_ros.kinematics.parameter import IN_PIXELS, LENS_KINDS, ROW_KINDS
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.texts import dump_yaml, parse_yaml
 from calib_ros.values import (
@@ -44,7 +44,7 @@ CHAIN_KEYS = (
     'calibration',
 )
 FRAME_KEYS = ('xyz', 'quat_xyzw', 'fixed', 'delay', 'lens')
-JOINT_KEYS = ('name', 'type', *DH_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
+JOINT_KEYS = ('name', 'type', *ROW_KINDS, 'sign', 'lower', 'upper', 'mass', 'com', 'gear_ratio')
 TWO_TURNS = 4.0 * math.pi
 """Largest angle of a table [rad]; tables in degrees exceed it."""
 URDF_SUFFIXES = ('.urdf', '.xml', '.xacro')
@@ -186,8 +186,8 @@ def table_hash(chain: Chain) -> str:
     Existing files hold it, so its input must never change.
     """
     rows = [
-        [joint.name, joint.type, joint.sign, *(float(getattr(joint, kind)) for kind in DH_KINDS)]
-        for joint in chain.joints
+        [joint.name, joint.type, joint.sign, *row]
+        for joint, row in zip(chain.joints, chain.table.tolist(), strict=True)
     ]
     content = [str(chain.convention), rows, [[name, float(x)] for name, x in chain.effects]]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
@@ -198,7 +198,7 @@ def chain_document(chain: Chain) -> dict[str, Any]:
     joints = []
     for joint in chain.joints:
         row: dict[str, Any] = {'name': joint.name, 'type': joint.type}
-        row |= {kind: float(getattr(joint, kind)) for kind in DH_KINDS} | {'sign': joint.sign}
+        row |= {kind: float(getattr(joint, kind)) for kind in chain.columns} | {'sign': joint.sign}
         ends = {'lower': joint.lower, 'upper': joint.upper}
         row |= {key: float(end) for key, end in ends.items() if end is not None}
         if joint.mass or any(joint.com):
@@ -270,7 +270,7 @@ def _joint(row: object, where: str) -> Joint:
     content = parse_mapping(row, JOINT_KEYS, where, ('name', 'a', 'alpha', 'd', 'theta'))
     numbers = {
         key: parse_number(content[key], f'{where}: {key}')
-        for key in (*DH_KINDS, 'sign', 'mass', 'gear_ratio')
+        for key in (*ROW_KINDS, 'sign', 'mass', 'gear_ratio')
         if content.get(key) is not None
     }
     for key in ('alpha', 'theta', 'beta'):

@@ -11,7 +11,7 @@ i - 1 (their eq. 3 and 4). Moved to the world, the link errors add up to the pos
 Denavit-Hartenberg parameter is one elementary motion along or about one axis u through a point c,
 both met by a walk along the chain. So the twist needs no table, for either convention:
 
-    translation (a, d)              dp = u              domega = 0
+    translation (a, b, d)           dp = u              domega = 0
     rotation (alpha, theta, beta)   dp = u x (p - c)    domega = u
 
 with p the target's position, all in world coordinates. For the standard convention this is the
@@ -34,8 +34,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import (
     ANGLES,
     DELAY,
-    DH_KINDS,
     LENS_KINDS,
+    ROW_KINDS,
     Parameter,
     parameters_of,
 )
@@ -112,23 +112,26 @@ class ErrorModel:
         return target[:3], target[3], shift, turn
 
     def _frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return frames (n + 3, 4, 3, B) along the chain and the target's (4, 3, B).
+        """Return frames (F, 4, 3, B) along the chain and the target's (4, 3, B).
 
-        Those before the joints, of the flange, of the world at the base, and the flange's axes
-        without an origin; q (n, B) holds effective joint values.
+        Those before the joints, of the flange, of the world at the base, the flange's axes without
+        an origin, and the y axes that b shifts along; q (n, B) holds effective joint values.
         """
         count, samples = q.shape
         base, walk = self.chain.frame(self._ends[0]).matrix, self.chain.walk
-        frames = np.empty((count + 3, 4, 3, samples))
+        behind = self._layout.behind
+        frames = np.empty((count + 3 + self._layout.beside * count, 4, 3, samples))
         walk.frames(q, base, frames[: count + 1])
         target = self.chain.at_the_tool(frames[count], self._ends[1])
         frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
         frames[count + 1, 3] += base[:3, 3, np.newaxis]
         frames[count + 2, :3] = frames[count, :3]
+        if self._layout.beside:
+            after = frames[behind, :3]
+            frames[count + 3 :, 1] = np.einsum('jk,jkcb->jcb', walk.beside, after)
         if self._layout.bent and walk.beta.any():  # a and alpha come before beta
-            behind = frames[self._layout.behind]
-            behind[:, 0] *= walk.cos[:, np.newaxis, np.newaxis]
-            behind[:, 0] += walk.sin[:, np.newaxis, np.newaxis] * behind[:, 2]
+            frames[behind, 0] *= walk.cos[:, np.newaxis, np.newaxis]
+            frames[behind, 0] += walk.sin[:, np.newaxis, np.newaxis] * frames[behind, 2]
         return frames, target
 
     def jacobian(
@@ -155,9 +158,9 @@ class _Layout(NamedTuple):
 
     Of the rows of all frames, four each, `axes` and `points` belong to rotations; `levers` (of
     these), `shifts` and `turns` to each parameter; `still` ones move nothing. `behind` are the
-    frames after the constant part of each link, `bent` if something moves along or about x there;
-    `effects` are the last rotations and the last rows of all, `driven`, of the `joints`; `delay`
-    is the row of a delay.
+    frames after the constant part of each link, `bent` if something moves along or about x there,
+    `beside` if b does along y before it. `effects` are the last rotations and the last rows of
+    all, `driven`, of the `joints`; `delay` is the row of a delay.
     """
 
     rotations: int
@@ -170,6 +173,7 @@ class _Layout(NamedTuple):
     still: tuple[int, ...]
     behind: slice
     bent: bool
+    beside: bool
     effects: tuple[str, ...]
     driven: tuple[slice, slice]
     joints: Index
@@ -191,10 +195,11 @@ def _lines(
             found[name] = (at.get(frame), k % 3, k > 2)
         found[Parameter(frame, DELAY)] = (None, 0, True)
         found |= dict.fromkeys(parameters_of(frame, LENS_KINDS), (None, 0, False))
-    along = {'a': 0, 'alpha': 0, 'beta': 1}
+    along = {'a': 0, 'alpha': 0, 'beta': 1, 'b': 1}
     for joint, i in joints.items():
-        for name in parameters_of(joint, DH_KINDS):
+        for name in parameters_of(joint, ROW_KINDS):
             frame_row = i + 1 if standard and name.kind in along else i
+            frame_row = i + 3 + len(joints) if name.kind == 'b' else frame_row
             found[name] = (frame_row, along.get(name.kind, 2), name.kind in ANGLES)
     return found
 
@@ -239,6 +244,7 @@ def _layout(
         tuple(k for k, yes in enumerate(moved) if not yes),
         slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
         any(Parameter(name).kind in ('a', 'alpha') for name in names),
+        any(Parameter(name).kind == 'b' for name in names),
         driving,
         (slice(rotations - about, rotations), slice(len(names) - len(own) + about, len(names))),
         _indices(own[name] for name in driving),

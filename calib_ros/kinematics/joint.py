@@ -17,9 +17,9 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import (
     DELAY,
-    DH_KINDS,
     FRAME_KINDS,
     LENS_KINDS,
+    ROW_KINDS,
     Parameter,
     parameters_of,
 )
@@ -49,6 +49,7 @@ class Joint:
     mass: float = 0.0
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gear_ratio: float = 0.0
+    b: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse an invalid row."""
@@ -58,7 +59,7 @@ class Joint:
             raise UnknownNameError(f'type of joint "{self.name}"', self.type, get_args(JointType))
         if self.sign not in (1, -1):
             raise ConfigError(f'sign of joint "{self.name}" must be 1 or -1, not {self.sign}')
-        for kind in DH_KINDS:
+        for kind in ROW_KINDS:
             if not math.isfinite(getattr(self, kind)):
                 raise ConfigError(f'{kind} of joint "{self.name}" must be a finite number')
         if self.lower is not None and self.upper is not None and not self.lower < self.upper:
@@ -69,8 +70,8 @@ class Joint:
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Return the joint's Denavit-Hartenberg parameters, in the order of DH_KINDS."""
-        return parameters_of(self.name, DH_KINDS)
+        """Return the joint's Denavit-Hartenberg parameters, in the order of ROW_KINDS."""
+        return parameters_of(self.name, ROW_KINDS)
 
     @cached_property
     def driven(self) -> Parameter:
@@ -81,6 +82,11 @@ class Joint:
     def tilt(self) -> float:
         """Return the sine of the angle between the two axes that the row connects."""
         return math.hypot(math.sin(self.alpha) * math.cos(self.beta), math.sin(self.beta))
+
+    @property
+    def apart(self) -> float:
+        """Return how far apart [m] these axes are."""
+        return math.hypot(self.a, self.b)
 
     @property
     def range(self) -> tuple[float, float]:

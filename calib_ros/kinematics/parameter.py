@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from functools import lru_cache
 
 DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
+ROW_KINDS = (*DH_KINDS, 'b')
+"""Parameters of a joint's row; b is zero unless axes coincide."""
 ANGLES = ('alpha', 'theta', 'beta')
 FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 DELAY = 'delay'
@@ -20,7 +22,7 @@ LENS_KINDS = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2', 'k3')
 IN_PIXELS = LENS_KINDS[:4]
 
 _UNITS = {
-    **dict.fromkeys(('a', 'd', 'x', 'y', 'z'), 'm'),
+    **dict.fromkeys(('a', 'd', 'b', 'x', 'y', 'z'), 'm'),
     DELAY: 's',
     **dict.fromkeys(LENS_KINDS, '1'),
     **dict.fromkeys(IN_PIXELS, 'px'),
@@ -64,7 +66,7 @@ class Parameter(str):
     @property
     def of_dh(self) -> bool:
         """Tell whether it is a Denavit-Hartenberg parameter."""
-        return self.kind in DH_KINDS
+        return self.kind in ROW_KINDS
 
     @property
     def of_lens(self) -> bool:

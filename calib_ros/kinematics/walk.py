@@ -2,14 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The walk along a chain: the frames of all joints at many joint values at once.
 
-A link is a joint's motion along and about z, and a constant L = Tx(a) Rx(alpha) Ry(beta):
+A link is a joint's motion along and about z, and a constant L = Tx(a) Ty(b) Rx(alpha) Ry(beta):
 
     standard   A = Rz(theta) Tz(d) L        modified   A = L Rz(theta) Tz(d)
 
 Frames are (4, 3, B): the x, y and z axis and the origin in the world, of B samples, so a constant
 transform is one product of matrices. Every parameter of a joint moves what follows along or about
 an axis of one of these frames: theta and d along z of the frame before the joint's motion, a,
-alpha and beta along x, x and y of the frame after L (before its turn by beta for the first two).
+alpha and beta along x, x and y of the frame after L (before its turn by beta for the first two),
+b along y before L, `beside` in the axes of the frame after it.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ BLOCK = 1024
 class Walk:
     """The parts of a chain's links that do not depend on the joint values.
 
-    From the DH table (n, 5) with columns a, alpha, d, theta, beta [m, rad], `signs` (n,) of the
+    From the DH table (n, 6) with columns a, alpha, d, theta, beta, b [m, rad], `signs` (n,) of the
     joint values, `turning` (n,) for revolute joints, and the convention.
     """
 
     def __init__(
         self, table: FloatArray, signs: FloatArray, turning: Flags, standard: bool
     ) -> None:
-        a, alpha, d, theta, self.beta = table.T
+        a, alpha, d, theta, self.beta, b = table.T
         self._theta = theta[:, np.newaxis]
         self.signs = signs[:, np.newaxis]
         self.turning = turning
@@ -53,7 +54,8 @@ class Walk:
             -sin * self.cos,
             cos * self.cos,
         )
-        links[:, 3, 0], links[:, 3, 3] = a, 1.0
+        links[:, 3, 0], links[:, 3, 1], links[:, 3, 3] = a, b, 1.0
+        self.beside = links[:, :3, 1]
         if standard:  # d moves along z, first or last
             links[:, 3, 2] = d
         self._links = links

@@ -27,7 +27,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import MANY
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.parameter import DH_KINDS
+from calib_ros.kinematics.parameter import ROW_KINDS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK
 from calib_ros.progress import Notify, quiet
@@ -248,7 +248,7 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'show': [list(unit_of(joint)) for joint in chain.joints],
         'convention': str(chain.convention),
         'table': [
-            [float(getattr(j, k)) for k in DH_KINDS] + [j.sign, j.type != 'revolute']
+            [float(getattr(j, k)) for k in ROW_KINDS] + [j.sign, j.type != 'revolute']
             for j in chain.joints
         ],
         'tools': poses.tools.tolist(),

@@ -25,7 +25,6 @@ from calib_ros.decision.validation import residuals
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import DH_KINDS
 from calib_ros.kinematics.se3 import FloatArray, invert, to_quat
 
 LATCHED = QoSProfile(
@@ -40,7 +39,7 @@ def dh_parameters(chain: Chain) -> Float64MultiArray:
     array = Float64MultiArray()
     array.layout.dim = [
         MultiArrayDimension(label='joint', size=rows, stride=rows * columns),
-        MultiArrayDimension(label=','.join(DH_KINDS), size=columns, stride=columns),
+        MultiArrayDimension(label=','.join(chain.columns), size=columns, stride=columns),
     ]
     array.data = chain.table.ravel().tolist()
     return array

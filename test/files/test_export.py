@@ -59,6 +59,19 @@ def test_every_form_says_how_far_it_is_from_the_calibration(name):
 
 
 @pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_axes_that_coincide_are_exact_in_every_form_with_b(convention):
+    rows = (Joint('table', d=0.3), *load_chain('puma560').joints)
+    nominal = replace(converted(Chain('turned', 'standard', rows), convention), tool=None)
+    chain = faulty(nominal, Cell(), np.random.default_rng(0))
+    assert max(abs(joint.b) for joint in chain.joints) > 1e-5
+    by_name = {each.name: each for each in exports(chain, nominal)}
+    exact = [name for name in by_name if name not in ('dh_without_beta.csv', 'joint_offsets.csv')]
+    assert max(by_name[name].error for name in exact) == 0.0
+    assert by_name['dh_standard.csv'].content.splitlines()[1].endswith(',beta,b')
+    assert 1e-5 < by_name['dh_without_beta.csv'].error < 0.02
+
+
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
 def test_axes_six_degrees_from_parallel_need_no_beta(convention):
     rows = load_chain('puma560').with_offsets({'joint_2.beta': 0.1})
     nominal = replace(converted(rows, convention), base=None, tool=None)

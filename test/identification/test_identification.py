@@ -159,6 +159,26 @@ def architectures():
             Joint('j4'),
         ],
     )
+    for convention in ('standard', 'modified'):
+        for name, kind, a in (
+            ('turntable', 'revolute', 0.0),
+            ('turntable 20 mm off', 'revolute', 0.02),
+            ('telescope', 'prismatic', 0.0),
+            ('telescope beside', 'prismatic', 0.3),
+        ):
+            yield (
+                name,
+                convention,
+                [
+                    Joint('j1', kind, a=a),
+                    Joint('j2', kind, a=a, d=0.4),
+                    Joint('j3', alpha=np.pi / 2, **straight),
+                    Joint('j4', alpha=-np.pi / 2, **straight),
+                    Joint('j5'),
+                    Joint('j6'),
+                    Joint('j7', alpha=np.pi / 2, **straight),
+                ],
+            )
     for convention, to_wrist in (('standard', 0.0), ('modified', np.pi / 2)):
         yield (
             'gantry',
@@ -205,7 +225,7 @@ def test_the_model_is_complete_for_every_architecture(convention, joints):
     unseen = nominal.random_joints(100, rng)
     error = result.chain.forward(unseen)[:, :3, 3] - poses(unseen)[:, :3, 3]
     assert np.abs(error).max() < 1e-9
-    lengths = [p.offset for p in result.parameters if p.name.kind in ('a', 'd')]
+    lengths = [p.offset for p in result.parameters if p.name.kind in ('a', 'b', 'd')]
     assert np.abs(lengths).max() < 0.02  # nothing absurd
 
 

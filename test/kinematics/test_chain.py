@@ -29,11 +29,12 @@ def row_of(alphas, convention, types='rrrrrr'):
         ((HALF, np.radians(4.9), np.radians(5.1), HALF), 'standard', 'rrrr', ('j2', 'j3')),
         # Those further apart than tan(f) / 2, with f between them, are known better by beta.
         ((HALF, np.radians(30.0), np.radians(32.0), HALF), 'standard', 'rrrr', ('j2',)),
-        # Axes that are parallel count unless both are prismatic.
+        # Axes that are parallel count, prismatic ones too.
         ((0.0, 0.0, 0.0), 'standard', 'rpr', ('j1', 'j2')),
-        ((0.0, 0.0, 0.0), 'standard', 'rpp', ('j1',)),
+        ((0.0, 0.0, 0.0), 'standard', 'rpp', ('j1', 'j2')),
+        ((0.0, np.radians(30.0), 0.0), 'standard', 'rpp', ('j1',)),
         ((0.0, 0.0, 0.0), 'modified', 'rrp', ('j2', 'j3')),
-        ((0.0, 0.0, 0.0), 'modified', 'rpp', ('j2',)),
+        ((0.0, 0.0, 0.0), 'modified', 'rpp', ('j2', 'j3')),
     ],
 )
 def test_parallel_by_convention_tilt_and_type(alphas, convention, types, parallel):
@@ -43,6 +44,15 @@ def test_parallel_by_convention_tilt_and_type(alphas, convention, types, paralle
 def test_a_nominal_beta_tilts_the_axis():
     rows = tuple(Joint(f'j{k}', a=0.3, beta=beta) for k, beta in enumerate([0.01, 0.6, 0.0]))
     assert Chain('arm', 'standard', rows).parallel == ('j0',)
+
+
+@pytest.mark.parametrize(('a', 'beside'), [(0.0, True), (0.02, True), (0.2, False)])
+def test_axes_that_coincide_may_be_shifted_both_ways(a, beside):
+    chain = Chain('arm', 'standard', (Joint('j1', a=a), Joint('j2')))
+    assert ('j1.b' in chain.parameter_names) == beside
+    assert 'j2.b' not in chain.parameter_names
+    assert chain.table.shape == (2, 5)
+    assert chain.with_offsets({'j1.b': 0.1}).table[0].tolist() == [a, 0.0, 0.0, 0.0, 0.0, 0.1]
 
 
 @pytest.mark.parametrize(

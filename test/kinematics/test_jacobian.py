@@ -10,7 +10,7 @@ from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.parameter import DH_KINDS, FRAME_KINDS
+from calib_ros.kinematics.parameter import FRAME_KINDS, ROW_KINDS
 
 NEAR_SINGULAR = (0.0, np.pi / 2, np.pi, 1e-9, np.pi / 2 + 1e-9)
 
@@ -23,7 +23,7 @@ def chains(draw):
     for k in range(draw(st.integers(1, 8))):
         degenerate = draw(st.booleans())
         angles = rng.choice(NEAR_SINGULAR, 3) if degenerate else rng.uniform(-np.pi, np.pi, 3)
-        lengths = rng.choice([0.0, 0.3, 1e-9], 2) if degenerate else rng.normal(size=2)
+        lengths = rng.choice([0.0, 0.3, 1e-9], 3) if degenerate else rng.normal(size=3)
         joints.append(
             Joint(
                 f'joint_{k}',
@@ -33,6 +33,7 @@ def chains(draw):
                 d=lengths[1],
                 theta=angles[1],
                 beta=angles[2],
+                b=lengths[2],
                 sign=draw(st.sampled_from([1, -1])),
             )
         )
@@ -46,7 +47,7 @@ def chains(draw):
 
 def all_parameters(chain):
     names = [f'{frame}.{kind}' for frame in ('base', 'tool') for kind in FRAME_KINDS]
-    return names + [f'{joint.name}.{kind}' for joint in chain.joints for kind in DH_KINDS]
+    return names + [f'{joint.name}.{kind}' for joint in chain.joints for kind in ROW_KINDS]
 
 
 @given(chains())

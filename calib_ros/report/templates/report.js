@@ -100,13 +100,12 @@
     let T = moved(0, 0);
     const found = [T];
     e.table.forEach((row, k) => {
-      let [a, alpha, d, theta, beta, sign, slides] = row;
+      let [a, alpha, d, theta, beta, b, sign, slides] = row;
       const q = sign * floats.joints[n * i + k];
       if (slides) d += q; else theta += q;
       const drive = product(turned(2, theta), moved(2, d));
-      const link = product(product(moved(0, a), turned(0, alpha)), turned(1, beta));
-      T = product(T, e.convention === 'standard' ? product(drive, link)
-        : product(product(product(turned(0, alpha), moved(0, a)), turned(1, beta)), drive));
+      const link = [moved(1, b), turned(0, alpha), turned(1, beta)].reduce(product, moved(0, a));
+      T = product(T, e.convention === 'standard' ? product(drive, link) : product(link, drive));
       found.push(T);
     });
     found.push(product(T, e.tools[e.set[i]]));
