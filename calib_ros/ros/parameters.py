@@ -8,6 +8,7 @@ Every field of `Settings` is a parameter of the same name, with its description 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -88,7 +89,7 @@ def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
 
 def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     """Return the nominal chain, and its URDF if it comes from one."""
-    name, links = given.chain, given.links
+    name, links = os.path.expanduser(given.chain), given.links
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         topic = node.resolve_topic_name('robot_description')
