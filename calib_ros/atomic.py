@@ -127,6 +127,14 @@ def refuse_to_replace(path: Path, overwrite: bool = False, cure: str = 'move it'
         raise InputError(f'{path} exists already: choose another name or {cure}')
 
 
+def given_path(name: str) -> Path:
+    """Return the absolute path of a file named in a parameter, which no shell expands."""
+    try:
+        return Path(name).expanduser().absolute()
+    except RuntimeError as err:
+        raise InputError(f'{name}: there is no such home folder') from err
+
+
 def confined(name: str, folders: Iterable[Path], allowed_by: str) -> Path:
     """Return the real path of a file named from outside, if it is in one of some folders.
 

@@ -26,6 +26,7 @@ from launch.event_handlers import OnProcessExit
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from calib_ros.atomic import given_path
 from calib_ros.errors import ConfigError
 from calib_ros.ros.arguments import (
     NODE,
@@ -78,7 +79,7 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     measured_pose = given['measured_pose'] or 'measured_pose'
     started: list[LaunchDescriptionEntity] = []
     if given['urdf']:
-        text = Path(given['urdf']).expanduser().read_text(encoding='utf-8')
+        text = given_path(given['urdf']).read_text(encoding='utf-8')
         if not given['chain'] and not given['params_file']:
             given['chain'] = 'robot_description'
         started.append(

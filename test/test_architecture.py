@@ -22,7 +22,7 @@ LEVEL = {name: k for k, names in enumerate(ORDER.split(' < ')) for name in names
 MODULES = {
     '.'.join(path.relative_to(PACKAGE).with_suffix('').parts): path
     for path in sorted(PACKAGE.rglob('*.py'))
-    if path.stem != '__init__'
+    if not path.stem.startswith('__')
 }
 ROS = {'rclpy', 'sensor_msgs', 'tf2_msgs', 'geometry_msgs', 'trajectory_msgs', 'std_srvs'}
 ONLY = {

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,17 @@ from typing import Any
 from calib_ros.cli.common import OF_BAGS, Group, add_fields, add_settings, complete_robots
 from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, STORAGES, Limits
 
-TYPES = {
+
+def _measured(text: str) -> Path:
+    return Path('/dev/stdin' if text == '-' else text)
+
+
+TYPES: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(('N', 'ROWS'), int),
     **dict.fromkeys(('DEG', 'M', 'MM', 'Q', 'SHARE', 'V', 'X', 'X,Y,Z'), float),
-    **dict.fromkeys(('BAG', 'FILE', 'FIRST', 'FOLDER', 'IMAGES', 'MEASURED', 'PLANT'), Path),
-    **dict.fromkeys(('CALIBRATION', 'PROGRAM', 'RESULT', 'SECOND', 'TABLE'), Path),
+    **dict.fromkeys(('BAG', 'FILE', 'FIRST', 'FOLDER', 'IMAGES', 'PLANT'), Path),
+    **dict.fromkeys(('CALIBRATION', 'PROGRAM', 'RESULT', 'SECOND'), Path),
+    **dict.fromkeys(('MEASURED', 'TABLE'), _measured),
 }
 """By placeholder; others are text."""
 FORM = re.compile(r'([^=]*?)([*]\d+|[+?]|)(?:=(.*)|)$')
@@ -147,7 +154,8 @@ what to list
   --robot SERIAL  only this robot
 # identify identify._run
 what to read
-  measured MEASURED?  a table of measured poses, or a bag: folder, .mcap or .db3
+  measured MEASURED?  a table of measured poses (-: standard input), or a bag: folder, .mcap \
+or .db3
   --csv FILE  a table, whatever its file name
   --chain! ROBOT  {CHAIN}
   --session NAME  only rows with this name in the column session; several joined by commas
@@ -244,7 +252,7 @@ a task to place
 # bag2csv convert._bag2csv
 what to convert
   bag BAG  rosbag2 folder, .mcap or .db3 file
-  csv TABLE  CSV to write
+  csv FILE  CSV to write
   --force  {FORCE}
   --chain! ROBOT  {CHAIN}
 @settings {' '.join(OF_BAGS)}

@@ -7,12 +7,12 @@ from __future__ import annotations
 import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.atomic import given_path
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import lens_of, read_board
 from calib_ros.files.detector import Detector, Image, opencv
@@ -35,7 +35,7 @@ class BoardCamera:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._board = read_board(Path(source.board).expanduser())
+        self._board = read_board(given_path(source.board))
         self._detector = Detector(self._board)
         reason = 'no CameraInfo of it has come'
         self._lens: Lens | Refusal = Refusal('before any CameraInfo', reason)

@@ -246,6 +246,8 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
 
 def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
     """Return --columns for the missing columns, with similar names of the header or NAME."""
+    if several := [name for name in missing if header.count(name) > 1]:
+        return f'Several columns are called {", ".join(several)}: rename all but one'
     if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
         numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
         return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'

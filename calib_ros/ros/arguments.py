@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from calib_ros.atomic import given_path
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.settings import EXCEPTION, STARTUP, Settings
 from calib_ros.values import parse_like
@@ -133,7 +134,7 @@ def ros_arguments(given: Mapping[str, str]) -> list[str]:
     """
     words = []
     if given.get('params_file'):
-        path = Path(given['params_file']).expanduser()
+        path = given_path(given['params_file'])
         if not path.is_file():
             raise InputError(f'params_file: there is no file {path}')
         words = ['--params-file', str(path)]

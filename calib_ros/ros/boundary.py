@@ -164,8 +164,14 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
     except rclpy_implementation.RCLInvalidROSArgsError as err:
         parser.error(str(err))
     stop = threading.Event()
-    _handle_signals(lambda number, frame: stop.set())
     node = executor = None
+
+    def on_signal(number: int, frame: Any) -> None:
+        stop.set()
+        if node is None:
+            raise KeyboardInterrupt
+
+    _handle_signals(on_signal)
     status, finished = 0, True
     try:
         rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
@@ -175,7 +181,7 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
         node.announce()
         while not stop.is_set() and rclpy.ok():
             executor.spin_once(timeout_sec=0.1)
-    except ExternalShutdownException:
+    except (ExternalShutdownException, KeyboardInterrupt):
         pass
     except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
         print(f'calibration_node: {err}', file=sys.stderr)

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
 from calib_ros.decision.misfits import Outlier
-from calib_ros.decision.reasons import Reason
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import (
@@ -99,6 +99,8 @@ class Filer:
 
 ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
+TELLING = {Rule.MISTAKE, Rule.ENCODER}
+"""Rules whose advice says nothing without the refusal."""
 
 
 class Snapshot(NamedTuple):
@@ -184,7 +186,9 @@ class Identifying:
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)
         self.last = words.summary(result, numbers, given.warnings, first)
-        self._advice = first or next(iter((*given.warnings, *words.remarks(result))), '')
+        telling = next((each for each in result.refusals if each.rule in TELLING), '')
+        hint = next(iter((*given.warnings, *words.remarks(result))), '')
+        self._advice = telling.rpartition(' (')[0] or telling or first or hint
         self.observability = words.observability_in_words(result)
         self._residuals.publish(
             to_ros.residual_markers(

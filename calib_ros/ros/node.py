@@ -13,7 +13,6 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 # matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
@@ -28,6 +27,7 @@ from rclpy.waitable import Waitable
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from calib_ros.atomic import given_path
 from calib_ros.errors import CalibrationError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
@@ -67,12 +67,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             **node_options,
         )
         given, names = declare_all(self)
-        home = Path(os.environ.get('ROS_HOME', '~/.ros'))
+        home = os.environ.get('ROS_HOME', '~/.ros')
         chain, urdf = load_robot(self, given)
         self._given = given
         self._boundary = Boundary(self.get_logger())
         self._archive = Archive(
-            Path(given.data_dir or home / 'calib_ros').expanduser(),
+            given_path(given.data_dir or f'{home}/calib_ros'),
             f'{chain.name}/{given.serial or self.get_namespace()[1:]}'.rstrip('/'),
             len(chain.joints),
             self._configuration,
@@ -101,7 +101,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         )
         candidates = None
         if given.candidates:
-            candidates = read_joints(Path(given.candidates).expanduser(), chain)
+            candidates = read_joints(given_path(given.candidates), chain)
         self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may stop and jump

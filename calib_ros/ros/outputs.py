@@ -14,7 +14,7 @@ from geometry_msgs.msg import PoseStamped, TransformStamped
 from rclpy.node import Node
 from std_msgs.msg import Float64MultiArray, String
 
-from calib_ros.atomic import confined, write_file
+from calib_ros.atomic import confined, given_path, write_file
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.archive import Archive
 from calib_ros.files.export import exports, urdf_foot
@@ -233,7 +233,7 @@ class Keeper:
         allowed = self._given.allowed_folders
         return confined(
             name,
-            (self._archive.folder, *(Path(each).expanduser() for each in allowed)),
+            (self._archive.folder, *map(given_path, allowed)),
             f'choose {parameter} in data_dir, or start the node with allowed_folders',
         )
 

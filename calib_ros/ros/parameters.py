@@ -8,6 +8,7 @@ Every field of `Settings` is a parameter of the same name, with its description 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -86,15 +87,22 @@ def changed(settings: Settings, changes: Sequence[Any]) -> Settings:
 
 def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     """Return the nominal chain, and its URDF if it comes from one."""
-    name, links = given.chain, given.links
+    name, links = os.path.expanduser(given.chain), given.links
     if name == 'robot_description':
         qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         topic = node.resolve_topic_name('robot_description')
         node.get_logger().info(f'waiting up to {DESCRIPTION_WAIT:g} s for {topic}')
-        found, message = wait_for_message(
-            String, node, 'robot_description', qos_profile=qos, time_to_wait=DESCRIPTION_WAIT
-        )
-        if not found:
+        for _ in range(10):  # between them a signal is heard
+            found, message = wait_for_message(
+                String,
+                node,
+                'robot_description',
+                qos_profile=qos,
+                time_to_wait=DESCRIPTION_WAIT / 10,
+            )
+            if found:
+                break
+        else:
             raise ConfigError(
                 f'no robot_description arrived within {DESCRIPTION_WAIT:g} s: start '
                 'robot_state_publisher first, or set chain to a file'

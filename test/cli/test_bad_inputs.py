@@ -24,6 +24,7 @@ def bad_inputs():
     yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no rows'
     yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'
+    yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
     yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
@@ -98,6 +99,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     write_csv(tmp_path / 'judging.csv', rows[TRAIN:])
     rows[2]['q2'] = 'zero'
     write_csv(tmp_path / 'number.csv', rows)
+    (tmp_path / 'twice.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z,x\n0,0,0,0,0,0,1,2,3,4\n')
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'empty.mcap').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')

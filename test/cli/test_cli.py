@@ -235,6 +235,12 @@ def test_a_command_is_kept_without_what_logs_in(tmp_path, monkeypatch):
     )
 
 
+def test_the_package_is_a_program_that_reads_a_pipe(table, tmp_path):
+    command = [sys.executable, '-m', 'calib_ros', 'import', '-', '--chain', 'ur5e', '--out']
+    subprocess.run([*command, tmp_path / 'own.csv'], input=table.read_bytes(), check=True)
+    assert len((tmp_path / 'own.csv').read_text().splitlines()) == TRAIN + TEST + 1
+
+
 def test_who_reads_no_further_is_no_error():
     command = f'{sys.executable} -m calib_ros.cli.main robots | head -c 1'
     found = subprocess.run(command, shell=True, capture_output=True, text=True, check=True)

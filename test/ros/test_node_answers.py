@@ -76,6 +76,19 @@ def test_a_refusal_keeps_what_to_do_first_and_where_all_of_it_is(cell, tmp_path,
         assert (tmp_path / folder / name).read_text() == f'{text}\n'
 
 
+def test_a_short_answer_names_the_mistake(cell, recording):
+    joints = topics(recording)['joint_states']
+    for message in joints:
+        message.position = np.degrees(message.position).tolist()
+    cell.play(topics(recording, joint_states=joints))
+    answer = cell.refused('identify')
+    assert answer.message.startswith(
+        'NOT accepted, nothing is published: the joint values are in degrees, not radians: '
+        'correct it where it is published ... full text: '
+    )
+    assert 'To do first: Check at the robot' in cell.in_full(answer)
+
+
 def test_what_made_poses_too_few_is_said_with_it(cell, recording):
     """To measure more alone would be in vain."""
     poses = pose_messages(recording.poses)

@@ -171,6 +171,14 @@ def test_ended_while_an_identification_runs(journal):
         assert 'Traceback' not in child.output
 
 
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_ended_while_it_waits_for_the_robot(tmp_path, number):
+    with Child(chain='robot_description', data_dir=tmp_path) as child:
+        child.wait_for('waiting up to')
+        assert child.end(number) == 0, child.output
+        assert 'no robot_description' not in child.output
+
+
 def test_the_last_stop_is_kept_at_the_end(tmp_path, recording):
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         cell.play(topics(recording))

@@ -159,6 +159,27 @@ def test_a_file_elsewhere_is_refused_at_the_start(data, tmp_path, name):
         cell.start(chain='ur10e', data_dir=str(data), **{name: str(tmp_path / 'x.yaml')})
 
 
+def test_files_are_found_at_home_though_no_shell_expands_a_parameter(tmp_path, monkeypatch):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    (tmp_path / 'arm.yaml').write_text(dump_chain(true_arm()))
+    (tmp_path / 'poses.csv').write_text('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n')
+    with Cell(chain='~/arm.yaml', data_dir='~/data', candidates='~/poses.csv') as cell:
+        assert cell.node.session.chain.name == 'ur10e'
+        assert cell.node._archive.folder == tmp_path / 'data'
+
+
+def test_a_folder_is_told_from_the_root(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with Cell(chain='ur10e', data_dir='data') as cell:
+        assert cell.node._archive.folder == tmp_path / 'data'
+
+
+@pytest.mark.parametrize('name', ['data_dir', 'candidates'])
+def test_a_home_that_there_is_not_is_refused_at_the_start(data, name):
+    with Cell() as cell, pytest.raises(InputError, match='no such home folder'):
+        cell.start(**{'chain': 'ur10e', 'data_dir': str(data), name: '~nobody-here/x'})
+
+
 def test_a_history_without_a_serial_number_is_refused_at_the_start(tmp_path):
     with Cell() as cell, pytest.raises(ConfigError, match='set serial as well'):
         cell.start(chain='ur10e', data_dir=str(tmp_path), history=str(tmp_path / 'history'))
