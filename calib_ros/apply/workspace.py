@@ -23,7 +23,7 @@ from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import AIMS, EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Aim, Model
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, rounded
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -314,7 +314,7 @@ def in_words(placements: Placements, aim: str, model: str) -> str:
     """Return where to place a task, compared with the centre of all places."""
     reached = placements.errors[~np.isnan(placements.errors)]
     best, centre = (
-        f'{1e3 * placements.errors[k]:.4f} mm at '
+        f'{rounded(1e3 * placements.errors[k])} mm at '
         f'{" ".join(f"{x:.3f}" for x in placements.positions[k])} m in the base '
         f'frame, turned by {np.degrees(placements.turns[k]):.0f} degrees'
         for k in (placements.best, placements.centre)
@@ -322,5 +322,5 @@ def in_words(placements: Placements, aim: str, model: str) -> str:
     return (
         f'expected {aim} error of the task, {model} model; the arm reaches it at '
         f'{len(reached)} of {len(placements.errors)} placements\n'
-        f'best:   {best}\ncentre: {centre}\nworst:  {1e3 * reached.max():.4f} mm\n'
+        f'best:   {best}\ncentre: {centre}\nworst:  {rounded(1e3 * reached.max())} mm\n'
     )

@@ -51,10 +51,10 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             joints, plan = tests.joints, None
         else:
             joints, words, plan = _measurement(options, design, visibility, rng, work)
-    screen.say(words)
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
-        screen.say(f'the tool is unknown: the target is assumed at {place} m from the flange')
+        words += f'\nthe tool is unknown: the target is assumed at {place} m from the flange'
+    screen.say(words)
     if options.out is not None:
         page = _page_beside(options.out)
         origin = given.origin_of(options, (options.candidates, options.task, options.taken))

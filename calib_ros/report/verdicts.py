@@ -7,21 +7,23 @@ from __future__ import annotations
 from calib_ros.apply.verification import DECIDING, Verification
 from calib_ros.estimation.levels import NEARER
 from calib_ros.identification.records import reused_in_words
+from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
+from calib_ros.shown import rounded
 
 
 def in_words(found: Verification) -> str:
     """Return the verdict and its basis."""
     before, after = found.comparison.figures
     lines = [
-        f'position error [mm] of {after.count} measurements at {found.configurations} poses',
+        f'position error [mm] of {after.count:,} measurements at {found.configurations:,} poses',
         '              RMS     mean      max   mean + 3 sigma',
     ]
     for label, figures in (('before', before), ('after', after)):
         turn = '' if figures.rms_mrad is None else f'   (RMS {figures.rms_mrad:.3f} mrad)'
         lines.append(
-            f'  {label:7} {figures.rms_mm:8.4f} {figures.mean_mm:8.4f} {figures.max_mm:8.4f} '
-            f'{figures.mean_plus_3_sigma_mm:10.4f}{turn}'
+            f'  {label:7} {rounded(figures.rms_mm):>8} {rounded(figures.mean_mm):>8} '
+            f'{rounded(figures.max_mm):>8} {rounded(figures.mean_plus_3_sigma_mm):>10}{turn}'
         )
     lines += each_in_words(found)
     verdict = '' if found.tolerance is None else f'{found.verdict}: '
@@ -32,18 +34,19 @@ def in_words(found: Verification) -> str:
 
 def likely(found: Verification) -> str:
     """Return the RMS error over poses like these, with its interval."""
-    rms, lower, upper = (f'{1e3 * x:.4f}' for x in (found.rms, found.lower, found.upper))
-    return f'{rms} mm ({100.0 * found.confidence:g} %: {lower} to {upper} mm)'
+    between = interval_mm(1e3 * found.lower, 1e3 * found.upper)
+    return f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} %: {between} mm)'
 
 
 def each_in_words(found: Verification) -> list[str]:
     """Return the table lines of the poses [mm]; of ISO 9283 only if the program is known."""
-    again = any(pose.repeatability is not None for pose in found.each)
+    repeated = any(pose.repeatability is not None for pose in found.each)
     what = 'repeatability' if found.by_program else 'scatter'
-    lines = ['  pose   measured   before    after' + again * f'   {what} (mean + 3 sigma)']
+    lines = ['  pose   measured   before    after' + repeated * f'   {what} (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
-        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
-        lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
+        line = f'  {k:4} {pose.cycles:10} {rounded(pose.before):>8} {rounded(pose.after):>8}'
+        again = '' if pose.repeatability is None else f' {rounded(pose.repeatability):>8}'
+        lines.append(line + again)
     return lines if found.each else []
 
 
@@ -74,7 +77,7 @@ def hints(found: Verification) -> list[str]:
     """Return what was refitted, and possible causes of the error."""
     lines = []
     if found.fitted:
-        lines.append(f'refitted, before and after alike: {" and ".join(found.fitted)}')
+        lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide')
