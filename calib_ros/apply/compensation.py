@@ -146,13 +146,10 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
             worst = max(columns, key=lambda k: float(size[k]))
             name = compensator.nominal.joint_names[worst]
             text += f', by {1e3 * size[worst]:.3f} {unit} at most ({name})'
-    text += (
-        f'; largest error by the calibration {1e3 * result.position_before[kept].max():.3f} mm, '
-    )
-    text += f'{1e3 * result.orientation_before[kept].max():.3f} mrad'
-    text += f' -> {1e3 * result.position[kept].max():.3f} mm, '
-    text += f'{1e3 * result.orientation[kept].max():.3f} mrad'
     turn, turned = result.orientation[kept].max(), result.orientation_before[kept].max()
+    shift, shifted = result.position[kept].max(), result.position_before[kept].max()
+    text += f'; largest error by the calibration {1e3 * shifted:.3f} -> {1e3 * shift:.3f} mm, '
+    text += f'{1e3 * turned:.3f} -> {1e3 * turn:.3f} mrad'
     if not compensator.follower.complete and turn > turned:
         x, y, z = compensator.tool
         text += (

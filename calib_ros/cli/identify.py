@@ -262,10 +262,8 @@ def show(found: Identified, screen: Screen) -> None:
         screen.say(found.loaded.read)
     reasons = reasons_of(result)
     if result.accepted:
-        within = within_tolerance(result.validation or result.fitted, found.wanted)
-        better = f'better{somewhere(result)}'
-        gained = f'the calibration makes the arm {better}'
-        gained = f'the arm gets {better}, {within}' if within else gained
+        within = within_tolerance(result.validation or result.fitted, found.wanted, 'is ')
+        gained = f'the calibration makes the arm better{somewhere(result)}{within}'
         screen.title(f'accepted: {gained}', None if 'not' in within or result.remarks else True)
     elif reasons[0].heading == GOOD_ARM.heading:
         screen.title('NOT accepted, nothing to correct: the robot stays as it was')

@@ -31,32 +31,32 @@ from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened
 
 GROUPS = {
     'First steps': {
-        'chain': 'print the chain file of a robot, to read or edit',
         'demo': 'simulate an arm, identify it, and compare the result with the truth',
         'robots': 'list the arms that come with calib_ros',
+        'chain': 'print the chain file of a robot, to read or edit',
         'simulate': 'write the bag of a simulated robot cell, with the true chain',
     },
-    'Before measuring': {
-        'board': 'make a board for cameras, as a PDF in true size',
-        'images': 'find the corners of a board in photographs',
-        'plan': 'choose the poses to measure, and predict the accuracy',
-    },
     'Calibrate': {
-        'fleet': 'identify all new recordings of a plant, and report which robots changed',
-        'history': 'list results over time',
+        'plan': 'choose the poses to measure, and predict the accuracy',
         'identify': 'identify the errors of an arm from a bag or a table of measured poses',
-        'verify': 'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
     },
     'Use the calibration': {
-        'compare': 'test what changed between two calibrations of one robot',
-        'compensate': 'correct the joint values of a program',
         'export': 'write a calibration for controllers, drivers and URDF users',
+        'compensate': 'correct the joint values of a program',
+        'verify': 'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
         'workspace': 'map errors over the workspace, and place a task where they are smallest',
     },
-    'Convert files': {
+    'Over time': {
+        'compare': 'test what changed between two calibrations of one robot',
+        'fleet': 'identify all new recordings of a plant, and report which robots changed',
+        'history': 'list results over time',
+    },
+    'Cameras and files': {
+        'board': 'make a board for cameras, as a PDF in true size',
+        'images': 'find the corners of a board in photographs',
+        'import': 'convert a table from another system',
         'bag2csv': 'write the poses of a bag as a table',
         'csv2bag': 'write a table of measured poses as a bag',
-        'import': 'convert a table from another system',
     },
 }
 """Commands by the groups of the overview, with descriptions."""
@@ -66,8 +66,8 @@ WAY = (
     ('calib_ros robots', 'the arms supplied'),
     ('calib_ros plan --chain ur10e --out plan.csv', 'the poses to measure'),
     ('calib_ros identify measured.csv --chain ur10e --out result/', ''),
-    ('calib_ros verify new.csv --chain ur10e --calibration result/', ''),
     ('calib_ros compensate program.csv --chain ur10e --calibration result/ ...', ''),
+    ('calib_ros verify new.csv --chain ur10e --calibration result/', ''),
 )
 
 

@@ -52,10 +52,10 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         else:
             joints, remarks, plan = _measurement(options, design, visibility, rng, work)
     table = [] if plan is None else planning.accuracy_in_words(plan)
-    screen.say('\n'.join([*table, *remarks]))
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
-        screen.say(f'the tool is unknown: the target is assumed at {place} m from the flange')
+        remarks.append(f'the tool is unknown: the target is assumed at {place} m from the flange')
+    screen.say('\n'.join([*table, *remarks]))
     if options.out is not None:
         page = _page_beside(options.out)
         origin = given.origin_of(options, (options.candidates, options.task, options.taken))

@@ -24,6 +24,7 @@ from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, likely, remarks
 from calib_ros.sampling.sample import gathered
+from calib_ros.shown import rounded
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
 
@@ -81,9 +82,9 @@ def show(found: Verification, screen: Screen) -> None:
     state, steps = standing(found)
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     rows = {
-        'measured': f'{after.count} times at {found.configurations} poses',
-        'position error': f'RMS {before.rms_mm:.4f} -> {after.rms_mm:.4f} mm',
-        'largest': f'{before.max_mm:.4f} -> {after.max_mm:.4f} mm',
+        'measured': f'{after.count:,} times at {found.configurations:,} poses',
+        'position error': f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm',
+        'largest': f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm',
         'orientation error': orientation,
         'poses like these': f'RMS {likely(found)}',
         'tolerance': tolerance,

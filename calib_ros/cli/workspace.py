@@ -19,6 +19,7 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.applied import placed_in_words, workspace_report
 from calib_ros.report.page import markdown
+from calib_ros.shown import rounded
 
 WORKSPACE_FILES = ('workspace.csv', 'workspace.md', 'workspace.png', 'report.html')
 PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
@@ -67,14 +68,15 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
 
 
 def _show(survey: Survey, screen: Screen) -> None:
-    rows = [('position error', f'at {len(survey.joints)} random poses of the joint range')]
+    rows = [('position error', f'at {len(survey.joints):,} random poses of the joint range')]
     for label, errors in survey.parts.items():
         s = Spread.of(1e3 * errors)
-        figures = f'RMS {s.rms:.4f}, 95 % below {s.percentile_95:.4f}, largest {s.max:.4f} mm'
+        rms, most, largest = map(rounded, (s.rms, s.percentile_95, s.max))
+        figures = f'RMS {rms}, 95 % below {most}, largest {largest} mm'
         rows.append((label.removesuffix(' by the calibration'), figures))
     found = regions(survey.positions, survey.removed)
     for label, sector in (('removes most', found[0]), ('removes least', found[-1])):
-        rows.append((label, f'{sector.words}: RMS {1e3 * sector.rms:.4f} mm'))
+        rows.append((label, f'{sector.words}: RMS {rounded(1e3 * sector.rms)} mm'))
     screen.table(rows)
 
 

@@ -110,14 +110,13 @@ def _of_the_gain(
             count = len(np.unique(validation.after.configurations[judged]))
             kind = 'places' if all(each.socket for each in problem.sets) else 'poses'
             chance = before.rms_mm * np.exp(-limit)
-            text += f'; with {count} {kind} chance alone may give {chance:.3f} mm'
+            text += f'; with {count} {kind}, chance alone can lower it to {chance:.3f} mm'
         yield Reason(Rule.GAIN, f'no gain on held-out poses beyond chance ({text})')
     elif result.chance is not None and result.chance > 1.0 - CONFIDENT:
         yield Reason(
             Rule.DRIFT,
-            'a slow drift of the measuring device could explain the improvement: time-shifted '
-            f'residuals are explained just as well in {100.0 * result.chance:.0f} % of cases '
-            f'(limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
+            'as with a slow drift, time-shifted residuals are explained just as well in '
+            f'{100.0 * result.chance:.0f} % of cases (limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled:
         yield Reason(Rule.SCALE, out_of_scale(scaled))

@@ -73,7 +73,7 @@ class Explained:
         if np.isnan(self.corrected):
             return whats[0]
         return (
-            f'{" -- or ".join(whats)} (so the uncorrected arm is typically '
+            f'{" -- or ".join(whats)} (the uncorrected arm is then typically '
             f'{1e3 * self.corrected:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
 

@@ -202,7 +202,7 @@ def _of_held_out(
         judged[new] = np.concatenate(distances_of(after, names, problem.system(sets))) <= OUTLIER
         judged |= np.False_ if explained is None else explained
         comparison = replace(comparison, judged=judged)
-    text = f'{comparison.counting.sum()} held-out poses{comparison.omitted}'
+    text = f'{comparison.counting.sum():,} held-out poses{comparison.omitted}'
     if repeats := int((~comparison.counting).sum()):
         text += f'; not counted because they repeat fitted poses: {repeats}'
     return comparison, text
@@ -228,7 +228,7 @@ def _cross_validate(
     )
     first, second = left_out(chains, problem.sets, groups, numbers)
     judged = Comparison(first, second, ~robust.outliers)
-    over = f'{folds}-fold cross-validation over {count} different poses'
+    over = f'{folds}-fold cross-validation over {count:,} different poses'
     return judged, f'{over}{note}{judged.omitted}'
 
 

@@ -213,8 +213,9 @@ class Calibration(Shown):
             return '', ''
         shift, turn = self.sigma(joints), self.sigma(joints, np.s_[3:])
         words = (
-            f'the calibration knows these poses to {1e3 * shift.max(initial=0.0):.3f} mm at the '
-            f'target measured and {1e3 * turn.max(initial=0.0):.3f} mrad, or better (one sigma)'
+            'uncertainty of these poses (one sigma): at most '
+            f'{1e3 * shift.max(initial=0.0):.3f} mm at the target measured and '
+            f'{1e3 * turn.max(initial=0.0):.3f} mrad'
         )
         if np.sum(turn**2) <= np.sum(turned**2):
             return words, ''

@@ -34,6 +34,8 @@ COMPUTED = (
     'joint values.'
 )
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
+BEYOND = 'To use the calibration beyond the measured poses, measure there too.'
+PLACE = 'To find the best place for a task: calib_ros workspace with --task FILE.'
 STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
     'PASS': (
         Verdict('good', 'PASS: the arm is within the tolerance'),
@@ -86,11 +88,11 @@ def workspace_report(
     """Return the report of a survey, and of the placements of a task, if any."""
     spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
     first, last = spreads[0][1], spreads[-1][1]
-    text = [f'The calibration removes {first.rms:.3f} mm RMS, {first.max:.3f} mm maximum.']
+    text = [f'The calibration removes {_sizes(first)} over random poses of the joint range.']
     rest = 'The remaining error is unknown: the file has no uncertainties.'
     if len(spreads) > 1:
-        text.append(f'Expected to remain: {last.rms:.3f} mm RMS, {last.max:.3f} mm maximum.')
-        rest = 'Expected to remain: this uncertainty and the RMS error on poses not fitted, which '
+        text.append(f'Expected to remain: {_sizes(last)}.')
+        rest = 'Expected to remain: its uncertainty and the RMS error on poses not fitted, which '
         rest += 'includes the noise of the measuring device.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
@@ -105,12 +107,20 @@ def workspace_report(
             'Position errors [mm]',
             (f'At {len(found.joints):,} random poses of the joint range.', rest),
             head=('', 'RMS', 'mean', 'median', '95 % below', 'max'),
-            rows=tuple((label, *(f'{x:.4f}' for x in astuple(s))) for label, s in spreads),
+            rows=tuple((label, *map(rounded, astuple(s))) for label, s in spreads),
+        ),
+        steps=(
+            *((BEYOND,) if arm.region is not None and not arm.region.whole else ()),
+            *((PLACE,) if placed is None else ()),
         ),
         identity=sections.identity_of(arm.chain, origin, corrected=table_hash(arm.chain)),
         sections=(*(_placed(each) for each in (placed,) if each), errors, *_worst(found)),
         origin=origin,
     )
+
+
+def _sizes(errors: Spread) -> str:
+    return f'{rounded(errors.rms)} mm RMS (at most {rounded(errors.max)} mm)'
 
 
 def _worst(found: Survey) -> Iterator[Section]:
@@ -129,7 +139,7 @@ def _worst(found: Survey) -> Iterator[Section]:
 
 def _region(found: Sector) -> tuple[str, ...]:
     spans = (f'{low:.2f} to {high:.2f}' for low, high in (found.radius, found.height))
-    return (found.words, str(found.poses), f'{1e3 * found.rms:.4f}', *spans)
+    return (found.words, str(found.poses), rounded(1e3 * found.rms), *spans)
 
 
 def placed_in_words(placed: Placements) -> str:
@@ -139,9 +149,10 @@ def placed_in_words(placed: Placements) -> str:
     where = ', '.join(f'{value:.3f}' for value in placed.positions[placed.best])
     return (
         f'Best at x, y, z = {where} m, {np.degrees(placed.turns[placed.best]):.0f}° about the '
-        f'vertical: {errors[placed.best]:.4f} mm; in the centre of the region '
-        f'{errors[placed.centre]:.4f} mm, at the worst place {errors[reached].max():.4f} mm. '
-        f'{int(reached.sum())} of {len(reached)} places can be reached.'
+        f'vertical: {rounded(errors[placed.best])} mm; in the centre of the region '
+        f'{rounded(errors[placed.centre])} mm, at the worst place '
+        f'{rounded(errors[reached].max())} mm. {int(reached.sum())} of {len(reached)} places can '
+        'be reached.'
     )
 
 
@@ -253,7 +264,7 @@ def verification_report(
         f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} % interval: {between} mm).'
     ]
     if found.fitted:
-        text.append('This allows for what the refitted frames absorb.')
+        text.append('The interval allows for the refitted frames.')
     if found.tolerance is not None:
         text.append(
             f'Tolerance: {1e3 * found.tolerance:g} mm. PASS: the whole interval is within it; '
@@ -304,7 +315,7 @@ def _by_configuration(found: Verification) -> Section:
         text,
         head=('pose', 'cycles', *names),
         rows=tuple(
-            (f'P{k}', str(cycles), *('' if x is None else f'{x:.4f}' for x in values))
+            (f'P{k}', str(cycles), *('' if x is None else rounded(x) for x in values))
             for k, (cycles, *values) in enumerate(map(astuple, found.each), 1)
         ),
     )

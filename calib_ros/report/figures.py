@@ -18,6 +18,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report.poses import Poses, numbers, unit_of
+from calib_ros.shown import LISTED
 from calib_ros.texts import one_line
 
 Figure: TypeAlias = dict[str, Any]
@@ -25,6 +26,8 @@ BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
 DOTTED = {'color': LIMIT, 'dash': 'dot'}
 QUANTILES = 2 * SOME_POSES  # points of a curve for any number of poses
+TICKS = {'tickvals': [m * 10.0**k for k in range(-6, 4) for m in (1, 2, 5)], 'tickformat': '~g'}
+"""Of a logarithmic axis: 0.1, 0.2, 0.5, 1, ..."""
 REVERSED = {'autorange': 'reversed', 'automargin': True}
 """Vertical axis with the first row on top."""
 ROUND = ('eccentricity', 'gear')  # periodic groups of effects
@@ -124,7 +127,7 @@ def forest(parameters: Sequence[ParameterRow], lengths: bool, limit: float) -> F
         lines += [{'x0': x, 'x1': x, 'line': edge} for x in (-1e3 * limit, 1e3 * limit)]
     shape = {'type': 'line', 'yref': 'paper', 'y0': 0, 'y1': 1}
     layout = {
-        'xaxis': axis(f'offset from nominal [{unit}]', range=[-reach, reach]),
+        'xaxis': axis(f'offset [{unit}]', range=[-reach, reach]),
         'yaxis': REVERSED,
         'shapes': [shape | each for each in lines],
         'margin': _margin(170, 30, 50),
@@ -167,7 +170,9 @@ def coverage(
         rows.append((joint.name, ends, used, f'{share:.0f} %'))
     x = numbers(100.0 * (np.arange(parts) + 0.5) / parts, 4)
     z = numbers(np.where(counts > 0, counts, np.nan))
-    mesh = _heat_map(x, labels, z, '%{y}<br>%{z} poses', scale_of('poses'))
+    look = scale_of('poses')
+    look['colorbar'] |= {'dtick': 1} if counts.max() < LISTED else {}  # whole numbers
+    mesh = _heat_map(x, labels, z, '%{y}<br>%{z} poses', look)
     across = axis('position in the joint range [%]', range=[0, 100])
     layout = {'xaxis': across, 'yaxis': REVERSED, 'margin': _margin(130, 20, 50)}
     return {'data': [mesh], 'layout': layout}, tuple(rows)
@@ -203,6 +208,7 @@ def error_map(survey: Survey) -> Figure:
     largest = 1e3 * max(float(np.quantile(errors, 0.99)) for errors in parts.values())
     data: list[Figure] = []
     layout: Figure = {'grid': {'rows': 1, 'columns': len(parts), 'pattern': 'independent'}}
+    layout['annotations'] = []
     for k, (label, errors) in enumerate(parts.items()):
         end = str(k + 1) if k else ''
         radius, height, rms = rms_map(np.hypot(x, y), z, 1e3 * errors)
@@ -211,10 +217,12 @@ def error_map(survey: Survey) -> Figure:
         look |= {'xaxis': f'x{end}', 'yaxis': f'y{end}'}
         hover = 'radius %{x:.2f} m, height %{y:.2f} m: %{z} mm'
         data.append(_heat_map(across, up, numbers(rms.T, 3), hover, look))
-        below = label.removesuffix(' by the calibration').replace(' to ', '<br>to ')
-        layout[f'xaxis{end}'] = axis(f'radius [m]<br>{below}')
+        title = {'text': label.removesuffix(' by the calibration'), 'showarrow': False}
+        place = {'xref': f'x{end} domain', 'yref': 'paper', 'x': 0, 'y': 1, 'yanchor': 'bottom'}
+        layout['annotations'].append(title | place)
+        layout[f'xaxis{end}'] = axis('radius [m]')
         layout[f'yaxis{end}'] = {} if k else axis('height [m]')
-    layout['margin'] = _margin(60, 20, 85)
+    layout['margin'] = _margin(60, 30, 50)
     return {'data': data, 'layout': layout}
 
 
@@ -227,7 +235,7 @@ def predictions(accuracy: FloatArray, at_random: FloatArray, wanted_mm: float | 
         data.append(_curve('lines+markers', name, count[known], 1e3 * errors[known], line=line))
     layout: Figure = {
         'xaxis': axis('poses measured'),
-        'yaxis': axis('predicted RMS error [mm]', type='log', dtick='D2'),
+        'yaxis': axis('predicted RMS error [mm]', type='log', **TICKS),
     }
     if wanted_mm is not None:
         at = {'x0': 0, 'x1': 1, 'y0': wanted_mm, 'y1': wanted_mm}

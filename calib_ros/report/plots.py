@@ -147,7 +147,10 @@ def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
     layout = figure['layout']
     count = layout.get('grid', {}).get('columns', 1)
     paper = _figure(9.0, height / 90.0)
-    for end, axes in zip(('', '2'), paper.subplots(1, count, squeeze=False)[0], strict=False):
+    titles = [each['text'] for each in layout.get('annotations', ())] or ['']
+    panels = paper.subplots(1, count, squeeze=False)[0]
+    for end, title, axes in zip(('', '2'), titles, panels, strict=False):
+        axes.set_title(title)
         for each in data:
             if each.get('xaxis', 'x') == f'x{end}':
                 (_draw_colours if each['type'] == 'heatmap' else _draw_curve)(axes, each)

@@ -233,7 +233,9 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
     kinds = [['length', 'position error [mm]']]
     kinds += [[axis, f'position error along {axis} [mm]'] for axis in 'xyz']
     kinds += [['angle', 'orientation error [mrad]']] if poses.oriented else []
-    before = 1e3 * np.linalg.norm(poses.before[poses.judged], axis=1)
+    judged = poses.select(poses.judged)
+    lengths = {when: _values(judged, 'length', when) for when in WHEN}
+    reach = float(np.linalg.norm(poses.position, axis=1).max())
     arrays = {
         'joints': shown.joints,
         'position': shown.position,
@@ -252,8 +254,9 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
             for j in chain.joints
         ],
         'tools': poses.tools.tolist(),
-        'reach': float(np.linalg.norm(poses.position, axis=1).max()),
-        'largest': float(np.quantile(before, 0.98)) if before.size else 1.0,
+        'reach': reach,
+        'largest': {w: float(np.quantile(x, 0.98)) if x.size else 1.0 for w, x in lengths.items()},
+        'enlarge': _enlargement(reach, lengths['after']),
         'total': len(poses),
         'oriented': poses.oriented,
         'kinds': kinds,
@@ -272,6 +275,12 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'bins': _bins(chain, poses, [kind for kind, _ in kinds]) if many else None,
         'cells': _cells(poses) if many else None,
     }
+
+
+def _enlargement(reach: float, errors_mm: FloatArray) -> float:
+    """Return log10 of the factor that draws the usual error as 0.05 of the reach [m]."""
+    usual = 1e-3 * float(np.median(errors_mm)) if errors_mm.size else 0.0
+    return round(float(np.log10(max(1.0, 0.05 * reach / max(usual, 1e-9)))), 2)
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:

@@ -91,13 +91,13 @@ def _verdict(
 ) -> Verdict:
     if not result.accepted:
         return _refused(reasons)
-    how = 'Before and after, each pose judged by a fit without it; 95 % interval in brackets.'
-    how += ' The whole interval decides on the tolerance.' * (tolerance is not None)
+    how = 'Each pose is judged by a fit without it; 95 % interval in brackets.'
+    how += ' The whole interval must be within the tolerance.' * (tolerance is not None)
     where = f'The calibration is {result.region.in_words()}.' if result.region else ''
     text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
     judged = result.validation or result.fitted
     within = within_tolerance(judged, tolerance)
-    heading = f'Accepted{somewhere(result)}' + (f', {within}' if within else '')
+    heading = f'Accepted{somewhere(result)}{within}'
     open_yet = 'not' in within or bool(result.remarks)
     return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
 
@@ -114,17 +114,17 @@ def doubts(result: Identification) -> tuple[str, ...]:
     return tuple(f'Check before you use it: {each}{end}' for each, end in ends)
 
 
-def within_tolerance(judged: Comparison, tolerance: float | None) -> str:
+def within_tolerance(judged: Comparison, tolerance: float | None, verb: str = '') -> str:
     """Return whether the remaining error is within the tolerance [m], if given."""
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
     lower, upper = interval_of(judged, 1)
     if upper <= tolerance:
-        return f'and {wanted}'
+        return f' and {verb}{wanted}'
     if lower > tolerance:
-        return f'but not {wanted}'
-    return f'but perhaps not {wanted}'
+        return f', but {verb}not {wanted}'
+    return f', but {verb}perhaps not {wanted}'
 
 
 def reasons_of(result: Identification) -> tuple[Advice, ...]:
@@ -200,9 +200,8 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         'Remaining errors against device noise',
         'If only the stated noise of the measuring device remained, all dots would lie on the '
         'dotted line. A steeper line means more error, understated noise, or few poses.',
-        f'Stated in the settings: {1e3 * problem.sigma_position:g} mm, '
-        f'{1e3 * problem.sigma_orientation:.3g} mrad and {problem.sigma_pixel:g} px in each '
-        'direction; a measurement with a covariance has its own.',
+        f'Stated in the settings: {_stated(problem, poses)} in each direction; a measurement with '
+        'a covariance has its own.',
         figure=figures.against_noise(poses),
         said=(
             words.scatter_in_words(result.noise),
@@ -241,13 +240,23 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
         )
 
 
+def _stated(problem: Problem, poses: Poses) -> str:
+    """Return the sigmas of what was measured."""
+    found = {
+        f'{1e3 * problem.sigma_position:g} mm': not poses.corner.all(),
+        f'{1e3 * problem.sigma_orientation:.3g} mrad': poses.oriented,
+        f'{problem.sigma_pixel:g} px': poses.corner.any(),
+    }
+    return ', '.join(text for text, measured in found.items() if measured)
+
+
 def _unmodelled(result: Identification) -> list[str]:
     """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
     turn, tilt = (1e3 * size for size in result.posterior.unmodelled)
     text = (
-        f"Part of the remaining error looks like the arm's own, which the model lacks: joints off "
-        f'by {turn:.3f} mrad about their axes and {tilt:.3f} mrad across them (one sigma). '
-        'Expected errors include it.'
+        'Part of the remaining error seems to come from the arm and is not in the model, as if '
+        f'joints were off by {turn:.3f} mrad about their axes and {tilt:.3f} mrad across them '
+        '(one sigma). Expected errors include it.'
     )
     return [text] if turn + tilt else []
 

@@ -21,13 +21,12 @@ from calib_ros.report.poses import Poses
 from calib_ros.shown import rounded
 
 ERROR = (
-    'An error is the distance from where the model of the arm puts the target to where it was '
-    'measured: for a controller with this model, the position accuracy AP of ISO 9283 and the '
-    'repeatability together, because each measurement counts by itself. Sigma is the standard '
-    'deviation of the errors.'
+    'Error: distance between the target measured and where the model puts it. With this model in '
+    'the controller it contains both AP and RP of ISO 9283 (accuracy and repeatability), because '
+    'each measurement counts by itself. Sigma: standard deviation of the errors.'
 )
 LABELS = (
-    *('RMS [mm]', '95 % interval', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
+    *('RMS [mm]', '95 % interval [mm]', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
     *('RMS orientation [mrad]', 'RMS [px]'),
 )
 """Rows of the accuracy table below head and count."""

@@ -7,23 +7,26 @@ from __future__ import annotations
 from calib_ros.apply.verification import DECIDING, Verification
 from calib_ros.estimation.levels import NEARER
 from calib_ros.identification.records import reused_in_words
+from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
+from calib_ros.shown import rounded
 
 
 def likely(found: Verification) -> str:
     """Return the RMS error over poses like these, with its interval."""
-    rms, lower, upper = (f'{1e3 * x:.4f}' for x in (found.rms, found.lower, found.upper))
-    return f'{rms} mm ({100.0 * found.confidence:g} %: {lower} to {upper} mm)'
+    between = interval_mm(1e3 * found.lower, 1e3 * found.upper)
+    return f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} %: {between} mm)'
 
 
 def each_in_words(found: Verification) -> list[str]:
     """Return the table lines of the poses [mm]; of ISO 9283 only if the program is known."""
-    again = any(pose.repeatability is not None for pose in found.each)
+    repeated = any(pose.repeatability is not None for pose in found.each)
     what = 'repeatability' if found.by_program else 'scatter'
-    lines = ['  pose   measured   before    after' + again * f'   {what} (mean + 3 sigma)']
+    lines = ['  pose   measured   before    after' + repeated * f'   {what} (mean + 3 sigma)']
     for k, pose in enumerate(found.each, 1):
-        line = f'  {k:4} {pose.cycles:10} {pose.before:8.4f} {pose.after:8.4f}'
-        lines.append(line if pose.repeatability is None else f'{line} {pose.repeatability:8.4f}')
+        line = f'  {k:4} {pose.cycles:10} {rounded(pose.before):>8} {rounded(pose.after):>8}'
+        again = '' if pose.repeatability is None else f' {rounded(pose.repeatability):>8}'
+        lines.append(line + again)
     return lines if found.each else []
 
 
@@ -54,7 +57,7 @@ def hints(found: Verification) -> list[str]:
     """Return what was refitted, and possible causes of the error."""
     lines = []
     if found.fitted:
-        lines.append(f'refitted, before and after alike: {" and ".join(found.fitted)}')
+        lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide')

@@ -93,8 +93,8 @@ def measured(result: Identification) -> str:
     """Return what was fitted: poses, images with corners, or both."""
     seen = ~np.isnan(result.fitted.after.pixels[:, 0])
     corners, poses = int(seen.sum()), int((~seen).sum())
-    parts = [f'{poses} poses'] if poses or not corners else []
-    parts += [f'{result.images} images with {corners} corners'] if corners else []
+    parts = [f'{poses:,} poses'] if poses or not corners else []
+    parts += [f'{result.images:,} images with {corners:,} corners'] if corners else []
     return ' and '.join(parts)
 
 

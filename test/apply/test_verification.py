@@ -19,6 +19,7 @@ from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
 from calib_ros.report.applied import _by_configuration
+from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'sigma)']
 
@@ -140,7 +141,7 @@ def test_pass_fail_and_undecided(cell, arm, program):
     table = heads[heads.index(['pose', 'measured', 'before', 'after', 'scatter', *_UNIT]) :]
     for k, (pose, row) in enumerate(zip(near.each, table[1:6], strict=True), 1):
         figures = (pose.before, pose.after, pose.repeatability)
-        assert row == [str(k), '3', *(f'{each:.4f}' for each in figures)]
+        assert row == [str(k), '3', *map(rounded, figures)]
 
 
 @pytest.mark.parametrize('shape', [(1.0, 1.0, 1.0), (1.0, 0.5, 0.2), (1.0, 0.1, 0.1)])
@@ -252,7 +253,7 @@ def test_a_device_that_stands_elsewhere(cell, arm):
     assert found.rms == pytest.approx(same.rms, rel=0.1)
     assert found.upper / found.rms > same.upper / same.rms
     assert 'moved' not in in_words(same)
-    anew = 'refitted, before and after alike: base'
+    anew = 'base refitted, before and after alike'
     assert (anew in in_words(found), 'refitted' in in_words(same)) == (True, False)
 
 
@@ -292,7 +293,7 @@ def test_a_session_is_judged_without_a_tolerance(arm, cell):
         found = verify(replace(arm, residual=residual), seen, None)
         assert (found.verdict, found.needed, found.tolerance) == (verdict, None, None)
         assert 'wanted is' not in in_words(found)
-        assert f'poses like these is {1e3 * found.rms:.4f} mm (' in in_words(found)
+        assert f'poses like these is {rounded(1e3 * found.rms)} mm (' in in_words(found)
 
 
 def test_the_fitted_frame_costs_its_freedom(arm):

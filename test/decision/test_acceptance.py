@@ -28,7 +28,7 @@ def test_no_gain_is_claimed_where_there_is_none():
         (text,) = [str(each) for each in result.refusals if each.rule is Rule.GAIN]
         before, after = result.validation.figures
         assert text.startswith('no gain on held-out poses beyond chance')
-        assert ('; with 40 poses chance' in text) == (after.rms_mm < before.rms_mm)
+        assert ('; with 40 poses, chance' in text) == (after.rms_mm < before.rms_mm)
         by_chance += after.rms_mm < before.rms_mm
     assert by_chance
 

@@ -74,7 +74,7 @@ def test_the_error_told_is_the_one_within_its_limits():
     found = verify(Calibration(arm, arm), [seen], 1e-3, new_base=True)
     assert found.rms > 1.02e-3 * found.comparison.figures[1].rms_mm
     said = 'over poses like these is '
-    assert f'{said}{1e3 * found.rms:.4f} mm' in in_words(found)
+    assert f'{said}{1e3 * found.rms:.3f} mm' in in_words(found)
     filing = Filing('7', datetime.now(timezone.utc), 'i', 's')
     row = verified(arm, found, filing)
     assert (row.rms_mm, row.rms_freedom) == pytest.approx((1e3 * found.rms, found.freedom))

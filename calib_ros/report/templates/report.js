@@ -81,7 +81,7 @@
   const byId = (id) => document.getElementById(id);
   const escaped = (text) => text.replaceAll('&', '&amp;').replaceAll('<', '&lt;');  // plotly reads tags
   const fixed = (x, digits = 3) => (Number.isFinite(x) ? x.toFixed(digits) : '');
-  const scale = () => Math.round(10 ** Number(byId('scale').value));
+  const scale = () => Number((10 ** Number(byId('scale').value)).toPrecision(2));
 
   // Forward kinematics of the corrected arm, for the picture alone
   const product = (A, B) => A.map((row) => B[0].map((_, k) => row.reduce((s, x, j) => s + x * B[j][k], 0)));
@@ -134,7 +134,8 @@
     for (let i = 0; i < total; i += step) {
       const p = e.cells ? e.cells.position[i] : triple('position', i);
       const v = e.cells ? e.cells['mean_' + state.when][i] : triple(state.when, i);
-      ['x', 'y', 'z'].forEach((c, k) => out[c].push(p[k], p[k] + s * v[k], null));
+      const drawn = Math.min(s, 0.5 * e.reach / (length(v) || 1));  // a gross error must not hide the arm
+      ['x', 'y', 'z'].forEach((c, k) => out[c].push(p[k], p[k] + drawn * v[k], null));
     }
     return out;
   }
@@ -156,8 +157,8 @@
     const wide = { type: 'scatter3d', hoverinfo: 'skip', mode: 'lines', showlegend: false };
     const traces = [
       { type: 'scatter3d', mode: 'markers', name: e.things, ...dots(), hoverinfo: 'text',
-        marker: { size: e.cells ? 5 : 3.5, color: errors(), colorscale: 'Viridis', reversescale: true, cmin: 0, cmax: e.largest,
-          colorbar: { title: { text: 'error [mm]' }, thickness: 12, len: 0.7 } } },
+        marker: { size: e.cells ? 5 : 3.5, color: errors(), colorscale: 'Viridis', reversescale: true, cmin: 0, cmax: e.largest[state.when],
+          colorbar: { title: { text: 'error [mm]' }, thickness: 12, len: 0.7, ...(narrow() ? { orientation: 'h', len: 1, y: -0.2 } : {}) } } },
       { type: 'scatter3d', mode: 'markers', name: 'outliers', ...at(outliers), text: outliers.map((i) => 'outlier, ' + words(i)),
         customdata: outliers, hoverinfo: 'text', marker: { size: 5, symbol: 'diamond', color: OUT } },
       { ...wide, ...vectors(), line: { color: '#6e7781', width: 2 }, name: 'errors' },
@@ -166,7 +167,7 @@
       { type: 'scatter3d', mode: 'markers', ...at(state.picked < 0 ? [] : [state.picked]), hoverinfo: 'skip',
         marker: { size: 11, symbol: 'circle-open', color: '#000', line: { width: 3 } }, showlegend: false },
     ];
-    const layout = base(), far = narrow() ? 1.9 : 1.2;
+    const layout = base(), far = narrow() ? 1.9 : 1.35;
     const title = (text) => ({ title: { text: text + ' [m]' } });
     layout.scene = { aspectmode: 'data', xaxis: title('x'), yaxis: title('y'), zaxis: title('z'), camera: { eye: { x: 1.2 * far, y: -1.2 * far, z: 0.5 * far }, center: { x: 0, y: 0, z: -0.15 } } };
     layout.margin = { l: 0, r: 0, t: 30, b: 0 };
@@ -183,7 +184,7 @@
   function update() {
     byId('scale-value').textContent = scale() + ' ×';
     if (!drawn('space')) return;
-    Plotly.restyle('space', { 'marker.color': [errors()] }, [POINTS]);
+    Plotly.restyle('space', { 'marker.color': [errors()], 'marker.cmax': e.largest[state.when] }, [POINTS]);
     const v = vectors();
     Plotly.restyle('space', { x: [v.x], y: [v.y], z: [v.z] }, [VECTORS]);
   }
@@ -206,7 +207,17 @@
 
   // The list
   const SIZE = 12;
-  const head = [e.things.slice(0, -1), 'from', 'used', 'before [mm]', 'after [mm]', ...(e.oriented ? ['before [mrad]', 'after [mrad]'] : []), 'times usual', ...e.joints];
+  const sized = floats.size.some(Number.isFinite), roles = new Set(e.role).size > 1 || outliers.length > 0;
+  const columns = [
+    ['from', source],
+    roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
+    ['before [mm]', (i) => fixed(lengths.before[i])], ['after [mm]', (i) => fixed(lengths.after[i])],
+    e.oriented && ['before [mrad]', (i) => fixed(floats.turned_before[i])],
+    e.oriented && ['after [mrad]', (i) => fixed(floats.turned_after[i])],
+    sized && ['times usual', (i) => fixed(floats.size[i], 1)],
+    ...e.joints.map((name, k) => [`${name} [${e.show[k][1]}]`, (i) => fixed(floats.joints[n * i + k] * e.show[k][0], e.show[k][2])]),
+  ].filter(Boolean);
+  const isNumber = ([title]) => !['from', 'used'].includes(title);
   function cell(row, text, number = true) {
     const td = row.insertCell();
     td.textContent = text;
@@ -232,25 +243,20 @@
       button.setAttribute('aria-label', `Show ${e.things.slice(0, -1)} ${number(i)} in the figure`);
       button.addEventListener('click', () => { pick(i, true); byId('rows').querySelector('.picked button').focus(); });
       cell(row, '', false).append(button);
-      cell(row, source(i), false);
-      cell(row, e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : ''), false);
-      cell(row, fixed(lengths.before[i]));
-      cell(row, fixed(lengths.after[i]));
-      if (e.oriented) { cell(row, fixed(floats.turned_before[i])); cell(row, fixed(floats.turned_after[i])); }
-      cell(row, fixed(floats.size[i], 1));
-      for (let k = 0; k < n; k++) cell(row, fixed(floats.joints[n * i + k] * e.show[k][0], e.show[k][2]));
+      for (const each of columns) cell(row, each[1](i), isNumber(each));
     }
     byId('page').textContent = `${state.page + 1} of ${pages}`;
     byId('previous').disabled = state.page === 0;
     byId('next').disabled = state.page >= pages - 1;
   }
   const headRow = byId('rows').tHead.insertRow();
-  head.forEach((text, k) => {
+  for (const each of [[e.things.slice(0, -1)], ...columns]) {
     const th = document.createElement('th');
-    th.textContent = k < 7 + 2 * e.oriented - 1 ? text : `${text} [${e.show[k - 6 - 2 * e.oriented][1]}]`;
-    if (k > 2) th.className = 'n';
+    th.textContent = each[0];
+    if (each[1] && isNumber(each)) th.className = 'n';
     headRow.append(th);
-  });
+  }
+  byId('only').parentElement.hidden = !outliers.length;
 
   // Errors over the session and against each joint
   const names = e.kinds;
@@ -270,7 +276,14 @@
       one('before', good, { name: 'before', marker: { color: BEFORE, size: 4, symbol: 'diamond', opacity: 0.6 } }),
       one('after', good, { name: 'after', marker: { color: AFTER, size: 4, opacity: 0.8 } }),
     ];
-    if (outliers.length) found.push(one('after', outliers, { name: 'outliers', marker: { color: OUT, size: 9, symbol: 'x' } }));
+    if (!outliers.length) return found;
+    const shown = found.flatMap((each) => each.y).filter(Number.isFinite);
+    const low = shown.reduce((a, b) => Math.min(a, b), 0), high = shown.reduce((a, b) => Math.max(a, b), 0);
+    const far = outliers.map((i) => Math.max(2 * low - high, Math.min(2 * high - low, value('after', i))));
+    const name = outliers.some((i, k) => far[k] !== value('after', i)) ? 'outliers, far ones drawn nearer' : 'outliers';
+    found.push(one('after', outliers, {
+      name, y: far, text: outliers.map((i) => `${source(i)}<br>${fixed(value('after', i))}`), hovertemplate: '%{text}<extra></extra>',
+      marker: { color: OUT, size: 9, symbol: 'x' } }));
     return found;
   }
   function bands(bin, axis) {
@@ -290,8 +303,8 @@
   });
   function drawSession() {
     const layout = base();
-    layout.xaxis = { title: { text: e.things + ' in the order of measurement' } };
-    layout.yaxis = { title: { text: label() }, zeroline: true };
+    layout.xaxis = { title: { text: e.things + ' in order' } };
+    layout.yaxis = { title: { text: label() }, rangemode: 'tozero' };
     Plotly.react('session', series(number, 'session', {}), layout, plain).then(() => byId('session').removeAllListeners && (byId('session').removeAllListeners('plotly_click'), clicks('session')));
   }
   function drawJoints() {
@@ -303,7 +316,7 @@
     for (let k = 0; k < n; k++) {
       const s = k ? String(k + 1) : '';
       layout['xaxis' + s] = { title: { text: `${escaped(e.joints[k])} [${e.show[k][1]}]`, standoff: 2 } };
-      layout['yaxis' + s] = k % columns ? {} : { title: { text: label() } };
+      layout['yaxis' + s] = { rangemode: 'tozero', ...(k % columns ? {} : { title: { text: label() } }) };
       series((i) => floats.joints[n * i + k] * e.show[k][0], 'joint' + k, { xaxis: 'x' + s, yaxis: 'y' + s })
         .forEach((trace) => traces.push({ ...trace, showlegend: k === 0 && trace.showlegend !== false }));
     }
@@ -342,6 +355,7 @@
         x: size * Math.cos(up) * Math.cos(around), y: size * Math.cos(up) * Math.sin(around), z: size * Math.sin(up) } });
     });
   }
+  byId('scale').value = e.enlarge;
   arrange();
   list();
   update();
