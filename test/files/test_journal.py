@@ -121,6 +121,20 @@ def test_kinds_of_one_stop_are_told_apart(tmp_path):
     assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], many)
 
 
+def test_of_rows_alike_the_last_is_taken_back_and_the_rest_keep_their_order(tmp_path):
+    path, many = tmp_path / 'cell.csv', [plain(1), plain(2), plain(1, validation=True)]
+    written(path, many)
+    journal = Journal(path, JOINTS)
+    for change, left in (
+        ({'removed': True}, [many[0], many[1]]),
+        ({'removed': True}, [many[1]]),
+        ({}, [many[1], many[0]]),
+    ):
+        journal.add(many[0], **change)
+        assert_equal(read_journal(path, JOINTS)[0], left)
+    journal.close()
+
+
 def test_a_row_written_twice_is_refused(tmp_path):
     written(tmp_path / 'cell.csv', [plain(1), plain(2), plain(1)])
     with pytest.raises(InputError, match='line 4: stamp_ns 1 already exists'):
