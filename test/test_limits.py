@@ -16,7 +16,7 @@ from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.programs import read_program
 from calib_ros.files.tables import read_journal, read_table
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
+from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.sampling.messages import Readings, usable
 from calib_ros.texts import LARGEST_TABLE, parse_yaml
@@ -80,14 +80,6 @@ def test_yaml_that_stands_for_more_is_refused(tmp_path, bomb):
         read_program(path, ['a'])
 
 
-@pytest.mark.parametrize(
-    'number', ['0x' + 'f' * 100_000, '9' * 100_000, '1' + ':59' * 30_000, '1e160', '-1e7']
-)
-def test_numbers_beyond_all_robots_are_refused(number):
-    with pytest.raises(ConfigError, match='theta must be'):
-        parse_chain(HEAD + number + '}')
-
-
 def test_aliases_that_save_writing_are_read():
     text = 'convention: standard\njoints:\n- &j {name: a, a: 1, alpha: 0, d: 0, theta: 0}\n'
     text += '- {<<: *j, name: b}\n'
@@ -99,20 +91,6 @@ def test_other_yaml_is_read_as_ever(text):
     assert parse_yaml(text, 'text') == yaml.safe_load(text)
 
 
-def test_a_chain_of_too_many_joints_is_refused():
-    rows = '\n'.join(f'- {{name: j{k}, a: 0, alpha: 0, d: 0, theta: 0}}' for k in range(51))
-    with pytest.raises(ConfigError, match='51 joints are more than 50'):
-        parse_chain(f'convention: standard\njoints:\n{rows}')
-
-
-@pytest.mark.parametrize('name', ['"ur\\n10"', '"a\\u2028b"', 'x' * 300])
-def test_names_that_break_a_line_are_refused(name):
-    with pytest.raises(ConfigError, match='must be printable'):
-        parse_chain(dump_chain(ARM).replace('name: arm', f'name: {name}'))
-    with pytest.raises(ConfigError, match='must be printable'):
-        parse_chain(dump_chain(ARM).replace('name: a,', f'name: {name},'))
-
-
 def test_a_limit_as_large_as_none_is_none():
     assert parse_chain(HEAD + '0, lower: -1e308, upper: 1e308}').joints[0].lower is None
 
@@ -120,8 +98,8 @@ def test_a_limit_as_large_as_none_is_none():
 # ---- URDF
 
 
-def urdf(links, kind='fixed', axis='0 0 1', name='r'):
-    text = [f'<robot name="{name}">', *(f'<link name="l{k}"/>' for k in range(links))]
+def urdf(links, kind='fixed', axis='0 0 1'):
+    text = ['<robot name="r">', *(f'<link name="l{k}"/>' for k in range(links))]
     for k in range(links - 1):
         moves = kind if k else 'continuous'
         text.append(
@@ -141,19 +119,8 @@ def test_the_most_links_are_read_and_more_refused(monkeypatch):
         chain_from_urdf(urdf(60, 'continuous'))
 
 
-@pytest.mark.parametrize('axis', ['1e-320 0 0', '0 0 0', '1e-10 0 1e-10'])
-def test_an_axis_without_direction_is_refused(axis):
-    with pytest.raises(ConfigError, match='has no direction'):
-        chain_from_urdf(urdf(2, axis=axis))
-
-
 def test_a_long_axis_is_a_direction():
     assert chain_from_urdf(urdf(2, axis='0 1e5 1e5')).joint_names == ('j0',)
-
-
-def test_a_robot_with_a_line_break_in_its_name_is_refused():
-    with pytest.raises(ConfigError, match='must be printable'):
-        chain_from_urdf(urdf(2, name='a&#10;b'))
 
 
 # ---- tables
@@ -222,45 +189,12 @@ def test_a_covariance_that_is_none_is_refused_everywhere(tmp_path, bad):
     assert any('covariance' in cause for cause in fault(bad))
 
 
-@pytest.mark.parametrize(
-    ('column', 'cell'),
-    [
-        *(('stamp_ns', each) for each in ('²', '9223372036854775808', '9' * 5000, '1.5', '--1')),
-        *(('x', each) for each in ('1e160', '-1e7', 'nan', '²')),
-        ('q1', '1e300'),
-    ],
-)
-def test_cells_beyond_all_robots_are_named_with_their_line(tmp_path, column, cell):
-    row = {'stamp_ns': '7', 'q1': '0', 'q2': '0', 'x': '1', 'y': '2', 'z': '3'} | {column: cell}
-    path = tmp_path / 'table.csv'
-    path.write_text(f'{",".join(row)}\n{",".join(row.values())}\n')
-    for read in (read_table, read_journal):
-        with pytest.raises(InputError, match=f'line 2: {column} must be'):
-            read(path, 2)
-
-
-def test_a_header_of_too_many_columns_is_refused(tmp_path):
-    path = tmp_path / 'table.csv'
-    path.write_text(','.join(f'c{k}' for k in range(100_000)) + '\n1' * 100_000)
-    with pytest.raises(InputError, match='100000 columns'):
-        read_table(path, 2)
-
-
-@pytest.mark.parametrize(
-    ('rows', 'wrong'),
-    [
-        (('q1,q2,q1,x,y,z', '0,0,0,1,2,3'), 'several columns q1'),
-        (('q1,q2,x,y,z', '0,0,1,2,3,4'), 'line 2: more values than the 5 columns'),
-        (('q1,q2,x,y,z', '0,' * 600_000), 'a line of 120000. characters'),
-        (('q1,q2,x,y,z', *['0,0,1,2,3,'] * 101), 'more than 100 rows'),
-    ],
-)
-def test_rows_that_no_table_has_are_refused(tmp_path, monkeypatch, rows, wrong):
+def test_more_rows_than_any_table_has_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr('calib_ros.files.csv_columns.MOST_ROWS', 100)
     path = tmp_path / 'table.csv'
-    path.write_text('\n'.join(rows) + '\n')
+    path.write_text('q1,q2,x,y,z\n' + '0,0,1,2,3,\n' * 101)
     for read in (read_table, read_journal):
-        with pytest.raises(InputError, match=wrong):
+        with pytest.raises(InputError, match='more than 100 rows'):
             read(path, 2)
 
 
@@ -275,31 +209,6 @@ def test_many_rows_that_were_taken_back_take_no_longer_than_others(tmp_path):
     path = tmp_path / 'table.csv'
     path.write_text('\n'.join(['stamp_ns,q1,q2,x,y,z,split', *rows, '1,0,0,1,2,3,']))
     assert len(read_table(path, 2).fitted[0]) == 1
-
-
-def test_too_many_devices_are_refused(tmp_path):
-    path = tmp_path / 'table.csv'
-    path.write_text('q1,q2,x,y,z,device\n' + '\n'.join(f'0,0,1,2,3,d{k}' for k in range(200)))
-    with pytest.raises(InputError, match='line 102: more than 100 sessions'):
-        read_table(path, 2)
-
-
-@pytest.mark.parametrize(
-    ('content', 'said'),
-    [
-        ('q1,x,y,z\n0,1,2,3\n'.encode('utf-16'), 'not UTF-8 text, line 1 has zero bytes'),
-        ('q1,é\n0,1\n'.encode('latin-1'), 'not UTF-8 text: save it as UTF-8'),
-        (
-            b'q1,x,y,z\n0,1,2,3\n' + bytes(5000),
-            'line 3 has zero bytes: .* Save it as UTF-8$',
-        ),
-        (b'q1,x,y,z\n0,1,2,3\n"0,1,2,3\n0,1,2,3\n', 'from line 3: .* quotation marks paired'),
-    ],
-)
-def test_a_table_that_is_no_text_is_refused_with_what_to_do(tmp_path, content, said):
-    (tmp_path / 'table.csv').write_bytes(content)
-    with pytest.raises(InputError, match=said):
-        read_table(tmp_path / 'table.csv', 1)
 
 
 def test_a_pipe_with_nobody_at_its_other_end_is_refused(tmp_path):

@@ -133,63 +133,48 @@ def test_plan_with_too_few_poses_says_so(run, tmp_path):
     assert 'Drive to each pose' not in page
 
 
+FROM, HEAD = ('--candidates', 'q.csv'), 'q1,q2,q3,q4,q5,q6\n'
+
+
 @pytest.mark.parametrize(
-    ('arguments', 'text'),
+    ('arguments', 'text', 'content'),
     [
-        (('--poses', 0), '--poses must be at least 1'),
-        (('--accuracy', -1), '--accuracy must be positive'),
-        (('--velocity', 0), 'each --velocity must be positive'),
-        (('--velocity', 1, 2), '--velocity: give one value, or 6'),
-        (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
-        (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
-        (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
-        (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
-        (('--iso9283', '--poses', 20), '--poses does not apply to --iso9283'),
-        (('--iso9283', '--candidates', 'q.csv'), '--candidates does not apply'),
-        (('--box', 0, 0, 0, 1, 1, 1, '--world'), 'where the base is'),
+        *(
+            (*each, joints_csv(some(arm(), 10)))
+            for each in [
+                (('--poses', 0), '--poses must be at least 1'),
+                (('--accuracy', -1), '--accuracy must be positive'),
+                (('--velocity', 0), 'each --velocity must be positive'),
+                (('--velocity', 1, 2), '--velocity: give one value, or 6'),
+                (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
+                (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
+                (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
+                (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
+                (('--iso9283', '--poses', 20), '--poses does not apply to --iso9283'),
+                (('--iso9283', '--candidates', 'q.csv'), '--candidates does not apply'),
+                (('--box', 0, 0, 0, 1, 1, 1, '--world'), 'where the base is'),
+                ((*FROM, '--box', 5, 5, 5, 6, 6, 6), 'the target at no pose of q.csv'),
+            ]
+        ),
+        *(
+            (
+                (option, 'q.csv'),
+                'line 2: q3 180 is beyond the limits of elbow_joint',
+                f'{HEAD}0,0,180,0,0,0\n',
+            )
+            for option in ('--task', '--taken')
+        ),
+        (FROM, 'line 3: q2 -90 is beyond the limits of sh', f'{HEAD}0,0,0,0,0,0\n0,-90,0,0,0,0\n'),
+        (
+            FROM,
+            'line 2: shoulder_lift_joint -90 is beyond the limits',
+            ','.join(load_chain('ur10e').joint_names) + '\n0,-90,0,0,0,0\n',
+        ),
+        (FROM, 'has no column q3, q4, q5, q6', 'q1,q2\n0,0\n'),
     ],
 )
-def test_plan_refuses_what_makes_no_sense(run, arguments, text):
+def test_plan_refuses_what_makes_no_sense(run, tmp_path, arguments, text, content):
+    (tmp_path / 'q.csv').write_text(content)
     status, out, err = run('plan', '--chain', 'ur10e', *arguments)
     assert (status, out) == (1, '')
-    assert text in err
-
-
-def test_plan_from_candidates_that_nothing_sees(run, tmp_path):
-    (tmp_path / 'q.csv').write_text(joints_csv(some(arm(), 10)))
-    arguments = ('--candidates', 'q.csv', '--box', 5, 5, 5, 6, 6, 6)
-    status, _, err = run('plan', '--chain', 'ur10e', *arguments)
-    assert status == 1
-    assert 'the target at no pose of q.csv' in err
-
-
-@pytest.mark.parametrize('option', ['--task', '--taken'])
-def test_other_files_of_poses_keep_the_limits_too(run, tmp_path, option):
-    (tmp_path / 'q.csv').write_text('q1,q2,q3,q4,q5,q6\n0,0,180,0,0,0\n')
-    status, _, err = run('plan', '--chain', 'ur10e', option, 'q.csv')
-    assert status == 1
-    assert 'q3 180 is beyond the limits of elbow_joint' in err
-
-
-@pytest.mark.parametrize(
-    ('content', 'text'),
-    [
-        ('q1,q2\n0,0\n', 'has no column q3, q4, q5, q6'),
-        ('q1,q2,q3,q4,q5,q6\n', 'has no rows'),
-        ('q1,q2,q3,q4,q5,q6,q7\n0,0,0,0,0,0,0\n', 'column q7, but the arm has 6 joints only'),
-        (
-            'q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0\n0,-90,0,0,0,0\n',
-            'line 3: q2 -90 is beyond the limits of shoulder_lift_joint',
-        ),
-        (
-            ','.join(load_chain('ur10e').joint_names) + '\n0,-90,0,0,0,0\n',
-            'line 2: shoulder_lift_joint -90 is beyond the limits',
-        ),
-        ('q1,q2,q3,q4,q5,q6\n0,0,0,0,0,x\n', "line 2: q6 must be a finite number, not 'x'"),
-    ],
-)
-def test_files_of_poses_that_cannot_be_read(run, tmp_path, content, text):
-    (tmp_path / 'q.csv').write_text(content)
-    status, _, err = run('plan', '--chain', 'ur10e', '--candidates', 'q.csv')
-    assert status == 1
     assert text in err

@@ -30,20 +30,36 @@ def test_configurations_of_nothing():
     assert configurations(np.zeros((1, 6))).tolist() == [0]
 
 
-def test_arrays_that_do_not_fit_together_are_refused():
-    with pytest.raises(InputError, match=r'positions of 3 observations .*\(3, 3\), not \(2, 3\)'):
-        Observations.from_arrays(np.zeros((3, 6)), np.zeros((2, 3)))
-    with pytest.raises(InputError, match='rotations of 3 observations'):
-        Observations.from_arrays(np.zeros((3, 6)), np.zeros((3, 3)), np.zeros((3, 4)))
+SIX, THREE = np.zeros((3, 6)), np.zeros((3, 3))
+MASKED = np.ma.masked_array(THREE, mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
 
 
-@pytest.mark.parametrize('bad', [np.nan, np.inf])
-@pytest.mark.parametrize('name', ['joints', 'positions'])
-def test_numbers_that_are_none_are_refused(name, bad):
-    arrays = {'joints': np.zeros((3, 6)), 'positions': np.zeros((3, 3))}
-    arrays[name][1, 2] = bad
-    with pytest.raises(InputError, match=f'{name} .* NaN or infinite'):
-        Observations.from_arrays(**arrays)
+@pytest.mark.parametrize(
+    ('arrays', 'complaint'),
+    [
+        ((SIX, THREE[:2]), r'positions of 3 observations .*\(3, 3\), not \(2, 3\)'),
+        ((SIX, THREE, np.zeros((3, 4))), 'rotations of 3 observations'),
+        *(((SIX + bad, THREE), 'joints .* NaN or infinite') for bad in (np.nan, np.inf)),
+        *(((SIX, THREE + bad), 'positions .* NaN or infinite') for bad in (np.nan, np.inf)),
+        ((SIX, MASKED), 'positions of the observations hold NaN'),
+        (([['a'] * 6], [[0.0] * 3]), 'joints must be numbers'),
+        *(
+            (arrays, r'joints must have the shape \(N, n\)')
+            for arrays in ((None, None), (1.0, 2.0), ([0.0] * 6, [0.0] * 3), ([], []))
+        ),
+        *(
+            ((SIX, THREE, np.stack([np.eye(3), turn, np.eye(3)])), f'pair 1 .* {words}')
+            for turn, words in (
+                (np.diag([1.0, 1.0, -1.0]), 'left-handed: 1 of 3'),
+                (np.zeros((3, 3)), 'not orthogonal'),
+                (1.1 * np.eye(3), 'not orthogonal'),
+            )
+        ),
+    ],
+)
+def test_arrays_that_cannot_be_are_refused(arrays, complaint):
+    with pytest.raises(InputError, match=complaint):
+        Observations.from_arrays(*arrays)
 
 
 def test_lists_will_do_as_arrays(rng):
@@ -52,42 +68,6 @@ def test_lists_will_do_as_arrays(rng):
     seen = Observations.from_arrays(joints.tolist(), positions.tolist(), rotations.tolist())
     np.testing.assert_array_equal(seen.rotations, rotations)
     np.testing.assert_array_equal(seen.joints, joints)
-
-
-@pytest.mark.parametrize(
-    ('joints', 'positions', 'complaint'),
-    [
-        (None, None, r'joints must have the shape \(N, n\)'),
-        ([['a'] * 6], [[0.0] * 3], 'joints must be numbers'),
-        (1.0, 2.0, r'joints must have the shape \(N, n\)'),
-        ([0.0] * 6, [0.0] * 3, r'joints must have the shape \(N, n\)'),
-        ([], [], r'joints must have the shape \(N, n\)'),
-    ],
-)
-def test_what_is_no_array_is_refused(joints, positions, complaint):
-    with pytest.raises(InputError, match=complaint):
-        Observations.from_arrays(joints, positions)
-
-
-def test_masked_values_are_missing():
-    positions = np.ma.masked_array(np.zeros((3, 3)), mask=[[0, 0, 0], [0, 1, 0], [0, 0, 0]])
-    with pytest.raises(InputError, match='positions of the observations hold NaN'):
-        Observations.from_arrays(np.zeros((3, 6)), positions)
-
-
-@pytest.mark.parametrize(
-    ('turn', 'complaint'),
-    [
-        (np.diag([1.0, 1.0, -1.0]), 'pair 1 .* left-handed: 1 of 3'),
-        (np.zeros((3, 3)), 'pair 1 .* not orthogonal'),
-        (1.1 * np.eye(3), 'pair 1 .* not orthogonal'),
-    ],
-)
-def test_matrices_that_are_no_rotations_are_refused(turn, complaint):
-    with pytest.raises(InputError, match=complaint):
-        Observations.from_arrays(
-            np.zeros((3, 6)), np.zeros((3, 3)), np.stack([np.eye(3), turn, np.eye(3)])
-        )
 
 
 def test_rotations_rounded_to_two_digits_are_rotations(rng):

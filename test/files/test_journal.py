@@ -119,6 +119,24 @@ def test_kinds_of_one_stop_are_told_apart(tmp_path):
     ]
     written(tmp_path / 'cell.csv', many)
     assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], many)
+    journal = Journal(tmp_path / 'cell.csv', JOINTS)
+    journal.add(many[6], removed=True)
+    journal.close()
+    assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], [*many[:6], many[7]])
+
+
+def test_of_rows_alike_the_last_is_taken_back_and_the_rest_keep_their_order(tmp_path):
+    path, many = tmp_path / 'cell.csv', [plain(1), plain(2), plain(1, validation=True)]
+    written(path, many)
+    journal = Journal(path, JOINTS)
+    for change, left in (
+        ({'removed': True}, [many[0], many[1]]),
+        ({'removed': True}, [many[1]]),
+        ({}, [many[1], many[0]]),
+    ):
+        journal.add(many[0], **change)
+        assert_equal(read_journal(path, JOINTS)[0], left)
+    journal.close()
 
 
 def test_a_row_written_twice_is_refused(tmp_path):

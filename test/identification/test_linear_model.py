@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The linear model against fits that are written out fold by fold."""
 
+import itertools
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -136,12 +137,18 @@ def test_verdicts_are_of_the_errors_left_out(model, monkeypatch):
     )
     for found, errors in ((verdict.rms_mm_before, before), (verdict.rms_mm_after, after)):
         assert found == pytest.approx(1e3 * np.sqrt((errors[0] ** 2).sum() / len(errors[0])))
-    gains = [log_gain(b, a, groups_of(sets)[0], 0.999) for b, a in zip(before, after, strict=True)]
-    for chance, likely in ((0.0, True), (0.005, True), (0.02, False)):
+    for sure, counts, chance in itertools.product((0.999, 0.8), (0.09, 0.005), (0.02, 0.005, 0.0)):
+        monkeypatch.setattr(linear_model, 'SURE', sure)
+        monkeypatch.setattr(linear_model, 'COUNTS', counts)
         monkeypatch.setattr(linear_model, 'chance', lambda _, chance=chance: chance)
         again = linear.judge(['wrist_2_joint.sin_1'], FIRST, 'waves')
-        pays = all(gain > max(limit, 0.005) for gain, limit in gains) and likely
+        pairs = zip(before, after, strict=True)
+        gains = [log_gain(*pair, groups_of(sets)[0], sure) for pair in pairs]
+        pays = all(gain > max(limit, counts) for gain, limit in gains) and chance < 0.01
         assert (again.what, again.pays) == ('waves', pays)
+    assert pays
+    monkeypatch.setattr(linear, '_shifts', None)  # nor is anything shifted at sockets
+    assert linear.judge([], FIRST, 'waves').pays
     assert not linear.judge([], SECOND, 'coupling').pays
 
 

@@ -184,6 +184,7 @@ def test_defaults_and_numbers_without_a_dot():
 
 
 BASE = UR + 'base: {xyz: [0, 0, 0], quat_xyzw: [0, 0, 0, 1]}\n'
+MANY = (f'\n- {{name: j{k}, a: 0, alpha: 0, d: 0, theta: 0}}' for k in range(45))
 WRONG = [
     ('alpha:', 'alpha: 0.0, alpha:', 'key "alpha" appears twice'),
     ('theta: 0.0', 'theat: 0.0', 'joint 1: unknown key "theat": did you mean "theta"'),
@@ -221,10 +222,20 @@ WRONG = [
     ('type: revolute', 'type: 1', 'cell'),
     ('d: 0.1273', f'd: 1{"0" * 400}', 'cell'),
     ('d: 0.1273', 'd: 2020-13-45', 'cell'),
+    *(
+        ('theta: 0.0', f'theta: {each}', 'theta must be')
+        for each in ('0x' + 'f' * 10**5, '9' * 10**5, '1' + ':59' * 30_000, '1e160', '-1e7')
+    ),
+    *(
+        (f'name: {old}', f'name: {new}', 'must be printable')
+        for new in ('"ur\\n10"', '"a\\u2028b"', 'x' * 300)
+        for old in ('some_ur', 'joint_1')
+    ),
+    ('joints:', f'joints:{"".join(MANY)}', '51 joints are more than 50'),
 ]
 
 
-@pytest.mark.parametrize(('right', 'wrong', 'complaint'), WRONG)
+@pytest.mark.parametrize(('right', 'wrong', 'complaint'), WRONG, ids=range(len(WRONG)))
 def test_a_wrong_chain_file_is_refused_with_the_place(right, wrong, complaint):
     assert right in BASE
     parse_chain(BASE)

@@ -38,10 +38,11 @@ def test_the_launch_file_names_what_is_there():
     assert set(REMAPPED) <= {source.topic for source in STANDARD} | {'joint_states'}
 
 
-def test_the_parameter_file_holds_where_no_argument_is_given(launched, tmp_path):
+@pytest.mark.parametrize('named', ['/**', 'calibration_node'])
+def test_the_parameter_file_holds_where_no_argument_is_given(launched, tmp_path, named):
     path = tmp_path / 'node.yaml'
     given = {'chain': 'ur10e', 'serial': '7', 'priors': ['*.a=0.001'], 'max_gap': 0.2}
-    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': given}}))
+    path.write_text(yaml.safe_dump({named: {'ros__parameters': given}}))
     (node,), _ = launched('calibration.launch.py', params_file=str(path))
     assert parameters_of(node.kwargs['ros_arguments']) == given | {'use_sim_time': False}
     (node,), _ = launched(
@@ -49,14 +50,6 @@ def test_the_parameter_file_holds_where_no_argument_is_given(launched, tmp_path)
     )
     found = parameters_of(node.kwargs['ros_arguments'])
     assert found == given | {'serial': '0012', 'max_gap': 1.0, 'use_sim_time': False}
-
-
-def test_arguments_reach_a_node_of_a_namespace_whose_file_names_it(launched, tmp_path):
-    path = tmp_path / 'node.yaml'
-    given = {'chain': 'ur10e', 'serial': '7'}
-    path.write_text(yaml.safe_dump({'calibration_node': {'ros__parameters': given}}))
-    (node,), _ = launched('calibration.launch.py', params_file=str(path), serial='8')
-    assert parameters_of(node.kwargs['ros_arguments'])['serial'] == '8'
 
 
 def test_every_type_arrives(launched):

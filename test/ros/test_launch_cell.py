@@ -65,16 +65,10 @@ def test_the_chain_of_a_parameter_file_holds_beside_a_urdf(launched, tmp_path):
     assert parameters_of(words)['chain'] == 'ur10e'
 
 
-def test_parts_of_a_cell_can_be_left_out(launched):
-    actions, _ = launched('cell.launch.py', chain='ur10e', rviz='false', diagnostics='false')
-    found = nodes(actions)
-    assert set(found) == {'calibration_node'}
-    assert parameters_of(found['calibration_node']['ros_arguments'])['chain'] == 'ur10e'
-
-
 def test_a_node_that_was_killed_goes_on_with_its_samples(launched):
     quiet = {'rviz': 'false', 'diagnostics': 'false'}
     actions, context = launched('cell.launch.py', chain='ur10e', serial='0012', **quiet)
+    assert set(nodes(actions)) == {'calibration_node'}
     for _ in range(2):  # it may be killed again
         handler = next(each for each in actions if type(each).__name__ == 'RegisterEventHandler')
         exited = handler.args[0].kwargs
