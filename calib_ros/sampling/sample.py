@@ -324,7 +324,7 @@ def gathered(
     """Return the sets of samples with their frames; arguments as in `collect`."""
     frames = Frames()
     fitted, held_out = collect(samples, sigmas, frames, posed, observed)
-    pairs, world_frame = socket_pairs(samples, frames), samples[0].frame_id  # that of `base`
+    pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
     cameras = {} if posed else lenses(samples, frames)
     return Gathered(fitted, held_out, pairs, world_frame, cameras, frames.owners)
 
