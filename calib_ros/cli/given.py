@@ -29,7 +29,7 @@ from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
-from calib_ros.sampling.sample import Measured
+from calib_ros.sampling.sample import Gathered
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -226,7 +226,7 @@ def table(
     settings: Settings,
     screen: Screen,
     eye_in_hand: bool = False,
-) -> Measured:
+) -> Gathered:
     """Return a table of measurements with the layout of the options."""
     foreign = foreign_of(options, chain)
     sessions = sessions_of(options)

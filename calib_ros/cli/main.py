@@ -81,9 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             setattr(sys, name, open(os.devnull, 'w', encoding='utf-8'))  # noqa: SIM115
     try:
         options = _options(given)
-        options.typed = re.sub(
-            '://[^/@]*@', '://', shlex.join(('calib_ros', *given))
-        )  # no password
+        typed = shlex.join(('calib_ros', *given))
+        options.typed = re.sub('://[^/@]*@', '://', typed)  # no password
         module, function = options.home.split('.')
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
         status: int = run(options, Screen(options.quiet))
@@ -197,9 +196,8 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
 
 
 def _example(words: str) -> str:
-    tied = re.sub(
-        '(--[a-z-]+) (?!-)', '\\1\xa0', f'calib_ros {words}'
-    )  # keep an option and its value together
+    # an option and its value stay together
+    tied = re.sub('(--[a-z-]+) (?!-)', '\\1\xa0', f'calib_ros {words}')
     parts = textwrap.wrap(tied, help_width() - 8, break_on_hyphens=False)
     return ('  ' + ' \\\n      '.join(parts)).replace('\xa0', ' ')
 

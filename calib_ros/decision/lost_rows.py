@@ -22,14 +22,11 @@ from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
-SLIPS = (0, 1, -1, 2, -2)
-"""Rows that may be missing (benchmarks/mistakes.py loses one)."""
+SLIPS = (0, 1, -1, 2, -2)  # rows that may be missing (benchmarks/mistakes.py loses one)
 FEWEST_ROWS = 3 * IN_A_FRAME
 """Rows of a table: with fewer, base and tool alone explain nearly all of a third."""
-MOST_SEARCHED = 10 * SOME_POSES
-"""Rows of a table; longer ones are not searched."""
-EXPLAINED_ROWS = 1.0 - EXCEPTION
-"""Share of the rows that a loss must explain."""
+MOST_SEARCHED = 10 * SOME_POSES  # rows of a table; longer ones are not searched
+EXPLAINED_ROWS = 1.0 - EXCEPTION  # share of the rows that a loss must explain
 
 Errors = Callable[[Chain, Observations], FloatArray]
 Framed = Callable[[Observations], Chain | None]

@@ -23,8 +23,7 @@ from calib_ros.kinematics.se3 import FloatArray
 
 Turn: TypeAlias = Callable[[FloatArray], FloatArray]
 ORDERS = tuple(map(''.join, permutations('XYZ')))
-VECTOR = ''
-""""Order" of a rotation vector."""
+VECTOR = ''  # "Order" of a rotation vector
 
 
 def misread() -> Iterator[tuple[str, str, Turn]]:

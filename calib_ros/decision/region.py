@@ -36,8 +36,7 @@ from calib_ros.shown import Shown
 
 RISK = 0.02
 """Largest probability that the arm gets worse over the poses of a shell (benchmarks/harm.py)."""
-SHELL = SOME_POSES // 20
-"""Random configurations per shell."""
+SHELL = SOME_POSES // 20  # random configurations per shell
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -64,8 +64,7 @@ HARMFUL = 0.15
 LEAST_NOISE = NEARER * EXCEPTION
 """Residuals in units of the given sigmas below which these are wrong: clearly less than a
 tenth, the ratio of a device's repeatability to its accuracy; mm would be thousandths."""
-SIMULATED = EXACT
-"""Residuals [m or rad] too small for any device."""
+SIMULATED = EXACT  # residuals [m or rad] too small for any device
 COUPLED = (
     'couplings of the last joints explain most of the residuals: are the joint values those '
     'of the motors? If so, add the effects "coupling"'

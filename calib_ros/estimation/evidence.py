@@ -77,22 +77,16 @@ def with_unmodelled(
 class Posterior(Shown):
     """Posterior of a fitted arm, given the data and the sizes of its errors."""
 
-    chain: Chain
-    """The fitted arm, with considered effects of size zero."""
-    names: tuple[str, ...]
-    """Fitted parameters and considered effects, (P,) in all."""
-    offsets: FloatArray
-    """(P,) fitted minus nominal values; zero for frames."""
-    shift: FloatArray
-    """(P,) posterior mean minus fitted values."""
+    chain: Chain  # the fitted arm, with considered effects of size zero
+    names: tuple[str, ...]  # fitted parameters and considered effects, (P,) in all
+    offsets: FloatArray  # (P,) fitted minus nominal values; zero for frames
+    shift: FloatArray  # (P,) posterior mean minus fitted values
     covariance: FloatArray
     """(P, P) for the measuring device; averaged over plausible sizes if used to judge."""
     device: FloatArray
     """(P, K), square root of the covariance that smooth errors of that device add."""
-    priors: Mapping[str, float]
-    """Standard deviation [m or rad] of parameters with a prior."""
-    sizes: Mapping[str, float]
-    """Size of the errors by group."""
+    priors: Mapping[str, float]  # standard deviation [m or rad] of parameters with a prior
+    sizes: Mapping[str, float]  # size of the errors by group
     doubted: tuple[Mixed, ...]
     """The posterior of the offsets for each plausible set of sizes, if the device may have a
     scale error and rounded joint values may be off."""

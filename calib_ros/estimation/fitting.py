@@ -36,8 +36,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray, left_jacobian_inverse
 
-SOME = 2 * SOME_POSES
-"""Samples for a first fit or a linear model."""
+SOME = 2 * SOME_POSES  # samples for a first fit or a linear model
 FOLLOWED = 2.0
 """Inverse share of the unmodelled error that the geometric model does not follow
 (benchmarks/real_robots.py)."""

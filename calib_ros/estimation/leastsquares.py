@@ -27,13 +27,11 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArr
 from calib_ros.settings import EXACT, EXCEPTION, Settings
 from calib_ros.shown import Shown
 
-Folds: TypeAlias = Sequence[Index]
-"""Fold number (N,) of every sample, set by set."""
+Folds: TypeAlias = Sequence[Index]  # fold number (N,) of every sample, set by set
 STEP_TOLERANCE = 1e-6
 """Convergence: the RMS step of the predictions in sigma or, if larger, in RMS residuals. A
 thousandth of the uncertainty with a million rows."""
-PATIENCE = SEVERAL
-"""Successive steps that may raise the cost before steps are damped."""
+PATIENCE = SEVERAL  # successive steps that may raise the cost before steps are damped
 SEPARATION_SIGMA = EXCEPTION * Settings.sigma_position
 """Assumed standard deviation [m] of known socket distances: nearly exact compared with a
 device."""

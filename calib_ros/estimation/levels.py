@@ -12,8 +12,7 @@ from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 CONFIDENT = 0.95
 """Confidence of intervals and gains: one in twenty may be chance. A convention, as all three
 are."""
-CERTAIN = 0.99
-"""Confidence of evidence against a result, and of several tests."""
+CERTAIN = 0.99  # confidence of evidence against a result, and of several tests
 SURE = 0.999
 """Confidence of changes of model or noise: the life of a cell makes hundreds of tests."""
 ALIKE = 1.5
@@ -29,10 +28,8 @@ eight times (docs/mistakes.md)."""
 MOST_OUTLIERS = 0.35
 """Share of gross errors beyond which nothing is accepted: most samples must support the fit. A fit
 withstands 40 % (benchmarks/outliers.py)."""
-TELLING = 8
-"""Values needed for a spread: known to a quarter, (2 n)^-1/2."""
-FEW = TELLING // 2
-"""Values without which nothing is known of a spread: to a third."""
+TELLING = 8  # values needed for a spread: known to a quarter, (2 n)^-1/2
+FEW = TELLING // 2  # values without which nothing is known of a spread: to a third
 LEAST_ASIDE = 1 + IN_A_FRAME // 3
 """Stops or rows before and after a single event: the freedoms of a frame explain the positions of
 fewer, which are gross errors."""
@@ -42,8 +39,7 @@ convention: benchmarks/recalibration.py changes one, mistakes.py makes three, an
 real_robots.py are the same with 1."""
 TRIED = 2 * SEVERAL
 """Best candidates of a rough search that are examined closely (benchmarks/mistakes.py)."""
-KNOWN = 1.0 / HALF_THE_DIGITS
-"""Degrees of freedom that count as infinite."""
+KNOWN = 1.0 / HALF_THE_DIGITS  # degrees of freedom that count as infinite
 SCALE = 1e-4
 """Standard deviation of a device's scale: trackers have 1e-5, cameras and motion capture 1e-3
 (assumed)."""
@@ -51,8 +47,7 @@ UNUSUAL = 1.0 - special.ndtr(1.0)
 """Share of devices out of scale: beyond one standard deviation."""
 OUT_OF_SCALE = 25.0 * SCALE
 """Standard deviation of the scale of these; half are worse (within a factor of ten)."""
-PRINTED = 5e-3
-"""Scale of a printed board (assumed): 1 mm of 200."""
+PRINTED = 5e-3  # scale of a printed board (assumed): 1 mm of 200
 
 
 def chance_of(squares: float, rank: int, freedom: float) -> float:

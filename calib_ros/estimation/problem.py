@@ -27,8 +27,7 @@ from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 
 SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
-TOOL = 1.0
-"""Largest length [m] of a target on a flange, assumed."""
+TOOL = 1.0  # largest length [m] of a target on a flange, assumed
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,11 @@ TYPICAL |= {group: EXPECTED[group] for group in ('gravity', 'compliance', 'backl
 SPREAD = 10.0
 """Factor between the error sizes of one arm and TYPICAL (one standard deviation;
 benchmarks/harm.py)."""
-TAILS = 3.0
-"""Degrees of freedom of the prior (benchmarks/harm.py)."""
+TAILS = 3.0  # degrees of freedom of the prior (benchmarks/harm.py)
 SHOWN, REFUTED = 0.5 * special.ndtri(CONFIDENT) ** 2, special.logit(CONFIDENT)
 """Logarithms of the ratio of probabilities beyond which effects show, and from which those of
 usual size are refuted."""
-SETTLED = 0.02
-"""Change of the log of a size at convergence; a convention."""
+SETTLED = 0.02  # change of the log of a size at convergence; a convention
 LEAST_SIZE = SPREAD**-3
 """Smallest size searched, relative to TYPICAL; its inverse is the largest."""
 

@@ -24,8 +24,7 @@ from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, Flags, FloatArray
 
-STARTS = 500
-"""As in FAST-LTS."""
+STARTS = 500  # as in FAST-LTS
 BEST = 10
 """As in FAST-LTS, followed to convergence after two concentration steps from every start."""
 

@@ -28,7 +28,7 @@ from calib_ros.sampling.hints import ALLOW, Account, allowing, too_much_lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES, VALIDATION
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.topics import Reading, check_joints, choose
+from calib_ros.sampling.topics import Reading, Recorded, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
@@ -89,16 +89,17 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
     with closing(reader):
         available = stored.named((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
-        streams, deserialise = _chosen(session, available, partial(stored.read, reader), defined)
+        streams, recorded = _chosen(session, available, partial(stored.read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
         messages = stored.read(reader, streams)
-        count, problem = _feed(session, messages, deserialise, progress, expected)
+        count, problem = _feed(session, messages, recorded.deserialise, progress, expected)
     if problem is not None and count == 0:
         found = stored.salvage(folder)
         if found is not None:
-            _check_joints(session, streams, found.on, deserialise)
-            count, _ = _feed(session, found.on(streams), deserialise)
+            recorded = recorded._replace(messages_on=_decodable(found.on))
+            _check_joints(session, streams, recorded)
+            count, _ = _feed(session, found.on(streams), recorded.deserialise)
     _check_links(streams)
     warnings = session.warnings
     if problem is not None:
@@ -121,8 +122,8 @@ def _opened(path: Path, folder: Path) -> Any:
 def _salvaged(
     path: Path, folder: Path, found: stored.Salvage, session: CalibrationSession
 ) -> Replayed:
-    streams, deserialise = _chosen(session, found.topics, found.on, {})
-    count, problem = _feed(session, found.on(streams), deserialise)
+    streams, recorded = _chosen(session, found.topics, found.on, {})
+    count, problem = _feed(session, found.on(streams), recorded.deserialise)
     _check_links(streams)
     problem = problem or found.problem
     total = stored.recorded(folder if folder.is_dir() else folder.parent)
@@ -169,29 +170,26 @@ def _chosen(
     available: Mapping[str, str],
     messages_on: Reading,
     definitions: Mapping[str, MessageDefinition],
-) -> tuple[dict[str, Stream], Deserialise]:
+) -> tuple[dict[str, Stream], Recorded]:
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
-    deserialise = _deserialiser(defined)
-    streams = choose(available, session.settings, _decodable(messages_on), deserialise)
+    recorded = Recorded(available, _decodable(messages_on), _deserialiser(defined))
+    streams = choose(recorded, session.settings)
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
             raise InputError(
                 f'the bag does not define {stream.type} of {topic}: record it on a computer with '
                 'that package'
             )
-    _check_joints(session, streams, messages_on, deserialise)
-    return streams, deserialise
+    _check_joints(session, streams, recorded)
+    return streams, recorded
 
 
 def _check_joints(
-    session: CalibrationSession,
-    streams: Mapping[str, Stream],
-    messages_on: Reading,
-    deserialise: Deserialise,
+    session: CalibrationSession, streams: Mapping[str, Stream], recorded: Recorded
 ) -> None:
     joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
     if len(joints) > 1 and not session.settings.joint_topics:
-        check_joints(_decodable(messages_on)(joints), session.joint_names, deserialise)
+        check_joints(recorded, joints, session.joint_names)
 
 
 def _check_links(streams: Mapping[str, Stream]) -> None:

@@ -47,7 +47,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.sample import Measured, Sample, View, gathered
+from calib_ros.sampling.sample import Gathered, Sample, View, gathered
 from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
@@ -64,7 +64,7 @@ def read_table(
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,
-) -> Measured:
+) -> Gathered:
     """Read a CSV table, or one in any other layout.
 
     Of several `sessions`, each after the first gets its own base and tool frames. `sigmas` are the
@@ -120,7 +120,7 @@ def _table(
     eye_in_hand: bool = False,
     warnings: tuple[str, ...] = (),
     by_line: bool = False,
-) -> Measured:
+) -> Gathered:
     made = made.kept()
     made.check_frames()
     if made.test.all():

@@ -18,13 +18,12 @@ import numpy as np
 
 from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.hints import Hint, apart, restless, sparse
-from calib_ros.sampling.making import ROW_WIDTH, Maker, Numbered
+from calib_ros.sampling.making import ROW_WIDTH, Found, Maker, Numbered
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import (
     JOINTS,
     NO_ACCIDENT,
     POSES,
-    Piece,
     Rows,
     Series,
     Slice,
@@ -336,12 +335,12 @@ class Collector:
                 if key.images and more:
                     self.unused['measurements: another image of a stop that has one'] += more
                 motion = self.track.at(stamps[good], standing=not moving)
-                piece = Piece(key, numbers[good], rows.stamps[good], rows.values[good])
-                begins = np.flatnonzero(np.diff(piece.places, prepend=-1))
+                measured = Found(key, numbers[good], rows.stamps[good], rows.values[good])
+                begins = np.flatnonzero(np.diff(measured.numbers, prepend=-1))
                 begins = np.arange(len(good)) if moving else begins
                 approach = self.track.approach(stamps[good[begins]], motion.joints[begins])
                 delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
-                found += self.maker.samples(piece, motion, begins, approach, delay, sigma)
+                found += self.maker.samples(measured, motion, begins, approach, delay, sigma)
             rows.release(due)
         self.maker.add(found)
 

@@ -269,10 +269,8 @@ class Clocks:
         if found is None:
             return
         known = self._seen
-        every = (found.seconds, *found.rivals)
-        if (
-            known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING
-        ):  # the resolution of speeds
+        every = (found.seconds, *found.rivals)  # SMOOTHING is the resolution of speeds
+        if known is None or min(abs(each - known.seconds) for each in every) > SMOOTHING:
             if found.rivals:
                 self._unclear = found if known is None else None
                 return

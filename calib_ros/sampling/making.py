@@ -8,7 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from operator import itemgetter
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import Piece, StreamKey
+from calib_ros.sampling.slices import Stamps, StreamKey
 from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 
@@ -26,6 +26,15 @@ ROW_WIDTH = COVARIANCE.stop
 Numbered: TypeAlias = tuple[int, Sample]  # A sample with the number of its round or stop
 VIBRATING = 'measurements: still vibrating, or a spike'
 RESTLESS = 'measurements: a stop with more spread than noise'
+
+
+class Found(NamedTuple):
+    """Measurements (N,) of one stream, with the numbers of their rounds or stops."""
+
+    key: StreamKey
+    numbers: Index
+    stamps: Stamps
+    values: FloatArray
 
 
 class Maker:
@@ -42,7 +51,7 @@ class Maker:
 
     def samples(
         self,
-        found: Piece,
+        found: Found,
         motion: Motion,
         begins: Index,
         approach: FloatArray,
@@ -52,11 +61,9 @@ class Maker:
         """Yield a sample of the measurements of each stop, unless they spread too much.
 
         Stops, or single measurements of a moving arm, begin at `begins` (S,), approached with the
-        signs `approach` (S, n). Places are their numbers. Measurements are late by `delay` [s]
-        and scatter by `sigma` [m].
+        signs `approach` (S, n). Measurements are late by `delay` [s] and scatter by `sigma` [m].
         """
         key, numbers, stamps, values = found
-        assert isinstance(key, StreamKey)
         counts = np.diff(begins, append=len(values))
         if key.images:
             yield from self._of_images(found, motion, begins, approach, delay)
@@ -101,10 +108,9 @@ class Maker:
             )
 
     def _of_images(
-        self, found: Piece, motion: Motion, begins: Index, approach: FloatArray, delay: float
+        self, found: Found, motion: Motion, begins: Index, approach: FloatArray, delay: float
     ) -> Iterator[Numbered]:
         key, numbers, stamps, values = found
-        assert isinstance(key, StreamKey)
         ends = np.append(begins[1:], len(values))
         joints = self._mean(motion.joints, begins, np.ones(len(values), dtype=bool))
         for k, (begin, end) in enumerate(zip(begins.tolist(), ends.tolist(), strict=True)):

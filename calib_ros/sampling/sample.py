@@ -288,7 +288,7 @@ def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Measured(Shown):
+class Gathered(Shown):
     """The sets to fit and held out, each with its own frames."""
 
     fitted: Sequence[Observations]
@@ -320,13 +320,13 @@ def gathered(
     sigmas: tuple[float, float],
     posed: bool = False,
     observed: Callable[[Sequence[int]], Observations] | None = None,
-) -> Measured:
+) -> Gathered:
     """Return the sets of samples with their frames; arguments as in `collect`."""
     frames = Frames()
     fitted, held_out = collect(samples, sigmas, frames, posed, observed)
-    pairs, world_frame = socket_pairs(samples, frames), samples[0].frame_id  # that of `base`
+    pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
     cameras = {} if posed else lenses(samples, frames)
-    return Measured(fitted, held_out, pairs, world_frame, cameras, frames.owners)
+    return Gathered(fitted, held_out, pairs, world_frame, cameras, frames.owners)
 
 
 def problem_of(
@@ -370,4 +370,4 @@ def problem_since(
     cameras = {each.camera for each in sets if each.pixels is not None}
     known = {name: calibration.chain.frame(name).lens for name in cameras}
     seen = {name: lens for name, lens in known.items() if lens}
-    return Measured(sets, lenses=seen).problem(chain, **settings.for_problem())
+    return Gathered(sets, lenses=seen).problem(chain, **settings.for_problem())

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -34,16 +34,20 @@ Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, byt
 """Returns the messages of a recording on some topics."""
 
 
-def choose(
-    available: Mapping[str, str],
-    settings: Settings,
-    messages_on: Reading,
-    deserialise: Deserialise,
-) -> dict[str, Stream]:
-    """Choose topics by type from those available (topic to type), unless named in the settings.
+class Recorded(NamedTuple):
+    """The types of a recording by topic, its messages, and how they are decoded."""
+
+    available: Mapping[str, str]
+    messages_on: Reading
+    deserialise: Deserialise
+
+
+def choose(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
+    """Choose topics by type from those available, unless named in the settings.
 
     Raises InputError with the candidates if there is none, or more than one.
     """
+    available = recorded.available
     own = outputs(available)
     sources = parse_sources(settings.sources)
     for topic in (*settings.joint_topics, *(source.topic for source in sources)):
@@ -68,30 +72,28 @@ def choose(
             raise _no_topic(f'"{source.camera_info}"', (CAMERA_INFO,), available)
     if all(source.validation for source in sources):
         error = _no_topic('pose topic', tuple(DECODERS), available)
-        raise InputError('; '.join([str(error), *_links(available, messages_on, deserialise)]))
+        raise InputError('; '.join([str(error), *_links(recorded)]))
     streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
     chosen = {stream.topic: stream for stream in streams if stream.topic in available}
     still = {topic: stream for topic, stream in chosen.items() if stream.still}
     if still:  # read first: measurements must not wait for it
-        _learn(messages_on(still), deserialise)
+        _learn(recorded, still)
     return chosen
 
 
-def _links(
-    available: Mapping[str, str], messages_on: Reading, deserialise: Deserialise
-) -> list[str]:
+def _links(recorded: Recorded) -> list[str]:
     found = []
-    for topic, kind in available.items():
+    for topic, kind in recorded.available.items():
         if kind in LINKS and not topic.endswith(STATIC):
             links = Links(topic, kind=kind)
-            _learn(messages_on({topic: Stream(topic, kind, None, links)}), deserialise)
+            _learn(recorded, {topic: Stream(topic, kind, None, links)})
             found.append(str(links))
     return found
 
 
-def _learn(messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise) -> None:
-    for batch, _ in batches(messages):
-        Intake(batch, deserialise)
+def _learn(recorded: Recorded, streams: Mapping[str, Stream]) -> None:
+    for batch, _ in batches(recorded.messages_on(streams)):
+        Intake(batch, recorded.deserialise)
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
@@ -110,14 +112,14 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 
 
 def check_joints(
-    messages: Iterator[tuple[Stream, bytes]], joint_names: Sequence[str], deserialise: Deserialise
+    recorded: Recorded, streams: Mapping[str, Stream], joint_names: Sequence[str]
 ) -> None:
     """Refuse joint states if several topics name the same joints.
 
     The InputError names the topics, and how far their values differ.
     """
     series: dict[str, dict[str, Series]] = defaultdict(dict)
-    for (topic, name), parts in _joint_values(messages, deserialise).items():
+    for (topic, name), parts in _joint_values(recorded, streams).items():
         if name in joint_names:
             stamps = np.concatenate([each for each, _ in parts])
             values = np.concatenate([each for _, each in parts])
@@ -138,13 +140,15 @@ def check_joints(
 
 
 def _joint_values(
-    messages: Iterator[tuple[Stream, bytes]], deserialise: Deserialise
+    recorded: Recorded, streams: Mapping[str, Stream]
 ) -> dict[tuple[str, str], list[Series]]:
     found = defaultdict(list)
-    for batch, _ in batches(messages):
+    for batch, _ in batches(recorded.messages_on(streams)):
         for topic in dict.fromkeys(stream.topic for stream, _ in batch):
             of_topic = [each for each in batch if each[0].topic == topic]
-            for _, _, (stamps, (_, *names), values) in Intake(of_topic, deserialise).parts:
+            for _, _, (stamps, (_, *names), values) in Intake(
+                of_topic, recorded.deserialise
+            ).parts:
                 for name, column in zip(names, values.T, strict=True):
                     found[topic, name].append((stamps, column))
     return found
