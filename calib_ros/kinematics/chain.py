@@ -65,12 +65,17 @@ def nearly_parallel(tilt: float, apart: float) -> bool:
     mm, 1 mrad, so 0.5 m) turn the common normal 1 / sin f times as much, and the line to where the
     next axis pierces the plane across this one (0.5 m / apart) / cos f times.
     """
-    return tilt < max(math.sin(PARALLEL_TOLERANCE), _across(tilt, apart))
+    near = tilt < max(math.sin(PARALLEL_TOLERANCE), _across(tilt, apart))
+    return near or nearly_coincident(tilt, apart)
 
 
 def nearly_coincident(tilt: float, apart: float) -> bool:
-    """Tell whether axes are better described by b, too, than by theta."""
-    return max(tilt, _across(tilt, apart)) < math.sin(PARALLEL_TOLERANCE)
+    """Tell whether axes are better described by b, too, than by theta.
+
+    Beta and b exaggerate no error, so this holds up to an angle at which d is still tolerable.
+    """
+    close = _across(tilt, apart) < math.sin(PARALLEL_TOLERANCE)
+    return close and tilt < math.sin(3.0 * PARALLEL_TOLERANCE)
 
 
 def _across(tilt: float, apart: float) -> float:
@@ -147,9 +152,10 @@ class Chain(Shown):
         parallel = frozenset(self.parallel or ())
         coincident = parallel.intersection(self._joining(nearly_coincident))
         for joint in self.joints:
-            left_out = {'d' if joint.name in parallel else 'beta'}
-            left_out |= {'b'} if joint.name not in coincident else set()
-            names += [name for name in joint.parameters if name.kind not in left_out]
+            beside = joint.name in coincident  # theta comes last: it trades against beta and b
+            left_out = 'd' if joint.name in parallel else 'beta', '' if beside else 'b'
+            own = [name for name in joint.parameters if name.kind not in left_out]
+            names += sorted(own, key=lambda name: name.kind == 'theta') if beside else own
         return (*names, *(Parameter(name) for name, _ in self.effects))
 
     @cached_property

@@ -46,13 +46,23 @@ def test_a_nominal_beta_tilts_the_axis():
     assert Chain('arm', 'standard', rows).parallel == ('j0',)
 
 
-@pytest.mark.parametrize(('a', 'beside'), [(0.0, True), (0.02, True), (0.2, False)])
-def test_axes_that_coincide_may_be_shifted_both_ways(a, beside):
-    chain = Chain('arm', 'standard', (Joint('j1', a=a), Joint('j2')))
-    assert ('j1.b' in chain.parameter_names) == beside
-    assert 'j2.b' not in chain.parameter_names
+@pytest.mark.parametrize(
+    ('a', 'degrees', 'kinds'),
+    [
+        (0.0, 0.0, ('a', 'alpha', 'beta', 'b', 'theta')),
+        (0.04, 14.9, ('a', 'alpha', 'beta', 'b', 'theta')),
+        (0.05, 4.9, ('a', 'alpha', 'theta', 'beta')),
+        (0.04, 15.1, ('a', 'alpha', 'd', 'theta')),
+    ],
+)
+@pytest.mark.parametrize(('convention', 'row'), [('standard', 'j1'), ('modified', 'j2')])
+def test_axes_that_coincide_may_be_shifted_both_ways(a, degrees, kinds, convention, row):
+    bend = {'a': a, 'alpha': np.radians(degrees)}
+    chain = Chain('arm', convention, tuple(Joint(name, **bend) for name in ('j1', 'j2')))
+    assert tuple(n.kind for n in chain.parameter_names if n.owner == row) == kinds
     assert chain.table.shape == (2, 5)
-    assert chain.with_offsets({'j1.b': 0.1}).table[0].tolist() == [a, 0.0, 0.0, 0.0, 0.0, 0.1]
+    table = chain.with_offsets({'j1.b': 0.1}).table
+    assert table[:, 5].tolist() == [0.1, 0.0]
 
 
 @pytest.mark.parametrize(
