@@ -291,7 +291,7 @@ def test_too_many_devices_are_refused(tmp_path):
         ('q1,é\n0,1\n'.encode('latin-1'), 'not UTF-8 text: save it as UTF-8'),
         (
             b'q1,x,y,z\n0,1,2,3\n' + bytes(5000),
-            'line 3 has zero bytes: .* Save it as UTF-8$',
+            'line 3 has zero bytes: .* Save it as CSV in UTF-8$',
         ),
         (b'q1,x,y,z\n0,1,2,3\n"0,1,2,3\n0,1,2,3\n', 'from line 3: .* quotation marks paired'),
     ],

@@ -265,8 +265,8 @@ def test_an_integer_with_separators_of_thousands_is_named_by_its_line(read):
 
 
 @pytest.mark.parametrize('row', ['1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5'])
-def test_a_table_of_semicolons_says_what_to_give(read, row):
-    with pytest.raises(InputError, match=r'separated by semicolons: .* give --separator'):
+def test_a_table_of_semicolons_says_what_to_do(read, row):
+    with pytest.raises(InputError, match=r'separated by semicolons: .*calib_ros import'):
         read(f'q1;q2;x;y;z\n{row}\n')
 
 
