@@ -1,0 +1,10 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line, as `python -m calib_ros`."""
+
+import sys
+
+from calib_ros.cli.main import main
+
+if __name__ == '__main__':
+    sys.exit(main())
