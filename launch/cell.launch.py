@@ -9,6 +9,7 @@ of the measuring device, whose topic of poses is remapped. A node that was kille
 and goes on with its poses; one that ended by itself is not.
 """
 
+import atexit
 import sys
 import tempfile
 from pathlib import Path
@@ -124,6 +125,7 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             'w', suffix='.rviz', encoding='utf-8', delete=False
         ) as file:
             file.write(shown)
+        atexit.register(Path(file.name).unlink, missing_ok=True)
         started.append(Node(package='rviz2', executable='rviz2', arguments=['-d', file.name]))
     return [*started, *calibration(given)]
 

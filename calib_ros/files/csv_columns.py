@@ -137,8 +137,8 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
     if (place := data.find(b'\0')) >= 0:
         line = above + 1 + data.count(b'\n', 0, place)
         raise ColumnsError(
-            f'{path} is not UTF-8 text, line {line} has zero bytes: is it damaged? Save it as '
-            'UTF-8'
+            f'{path} is not UTF-8 text, line {line} has zero bytes: is it a workbook, or damaged? '
+            'Save it as CSV in UTF-8'
         )
     if not data.isascii():
         data = decoded(data, str(path), ColumnsError).encode()
@@ -239,8 +239,7 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
         if any(mark in cell for cell in header):
             raise ColumnsError(
                 f'the cells of {path} are separated by {name}s: save it with commas between cells '
-                f'and points in numbers. To read measurements as they are, give --separator {name}'
-                ' (and, where they differ, --decimal comma, --columns, --length, --angle)'
+                'and points in numbers (measurements: calib_ros import)'
             )
 
 

@@ -27,7 +27,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import UnknownNameError
+from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics.joint import Frame, Joint
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index, cross
@@ -118,8 +118,10 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
         return members(chain, name)
     joint = Parameter(name).owner
     if joint not in chain.joint_names:
+        if name in (alone := ('geometric', 'auto')):
+            raise ConfigError(f'model {name} stands alone: no effects can be joined to it')
         if '.' not in name:
-            raise UnknownNameError('model', name, ('geometric', 'auto', *GROUPS))
+            raise UnknownNameError('model', name, (*alone, *GROUPS))
         raise UnknownNameError(f'joint in effect {name}', joint, chain.joint_names)
     check(name, chain.joint_names)
     return (name,)

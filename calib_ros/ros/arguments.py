@@ -12,15 +12,18 @@ from __future__ import annotations
 import argparse
 import textwrap
 from ast import literal_eval
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from fnmatch import fnmatchcase
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from calib_ros.atomic import given_path
-from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.settings import EXCEPTION, STARTUP, Settings
+from calib_ros.shown import some
 from calib_ros.values import parse_like
 
 NODE = 'calibration_node'
@@ -174,6 +177,24 @@ def typed(command: Sequence[str]) -> list[str]:
         if isinstance(parameter.default, str) and value[:1] not in ('"', "'", '!'):
             words[k] = f'{name}:={_quoted(value)}'
     return words
+
+
+def refuse_ignored(command: Sequence[str], node: str) -> None:
+    """Refuse parameter files with no key for a node, by its full name: ROS ignores them."""
+    import yaml
+
+    def nodes(content: Mapping[str, Any], above: str) -> Iterator[str]:
+        for key, below in content.items():
+            name = f'{above}/{key.strip("/")}'
+            yield from nodes(below, name) if 'ros__parameters' not in below else (name,)
+
+    paths = [path for flag, path in pairwise(command) if flag == '--params-file']
+    keys = [key for path in paths for key in nodes(yaml.safe_load(Path(path).read_bytes()), '')]
+    if keys and not any(fnmatchcase(node, key.replace('/**', '*')) for key in keys):
+        raise ConfigError(
+            f'{" and ".join(paths)} has no parameters of {node}, but of {", ".join(some(keys))}: '
+            'use the key /**, which matches every node'
+        )
 
 
 def refuse_unknown(command: Sequence[str], launch_file: str, known: Sequence[str]) -> None:

@@ -46,7 +46,7 @@ from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_un
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.sample import Sample, check_settings
+from calib_ros.sampling.sample import Sample, check_settings, socket_place
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
@@ -168,6 +168,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             for each in changes:
                 if each.name in FILENAMES:
                     self._keeper.file_of(each.name, each.value)
+                if each.name == 'socket' and each.value:
+                    socket_place(each.value)
             check_settings(self.session.chain, changed(self.session.settings, changes))
         except CalibrationError as err:
             return SetParametersResult(successful=False, reason=str(err))
@@ -299,7 +301,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         count = len(self.session.samples)
         old = self._archive.start_new()
         self.session.clear()
-        kept = f'; they remain in {old}' if old else ''
+        kept = f'; they remain in {old}' if old and count else ''
         return True, f'{count} poses cleared{kept}; the calibration stays'
 
     def _on_record(self, request: Any) -> Answer:

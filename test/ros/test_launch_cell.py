@@ -3,6 +3,7 @@
 """The launch files of a whole cell and of the examples."""
 
 import sys
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -14,7 +15,11 @@ from calib_ros.errors import ConfigError
 from calib_ros.ros.arguments import rviz_config
 
 
-def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path):
+def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path, monkeypatch):
+    ends = []
+    monkeypatch.setattr(
+        'atexit.register', lambda *work, **given: ends.append(partial(*work, **given))
+    )
     urdf = tmp_path / 'robot.urdf'
     urdf.write_text('<robot name="arm"/>')
     actions, _ = launched(
@@ -44,8 +49,10 @@ def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path):
     assert analyzers['ros__parameters']['calibration']['contains'] == ['calibration_node']
     flag, shown = found['rviz2']['arguments']
     manager = yaml.safe_load(Path(shown).read_text())['Visualization Manager']
-    Path(shown).unlink()
     assert flag == '-d'
+    for end in ends:
+        end()
+    assert not Path(shown).exists()
     assert manager['Global Options']['Fixed Frame'] == 'vicon'
     assert '/cell_1/calibration_node/residuals' in str(manager['Displays'])
 

@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray
+from launching import parameters_of
 from rclpy.exceptions import ParameterException
 from rclpy.parameter import Parameter
 from ros_cell import Cell, Child, topics
 
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import node as node_module
-from calib_ros.ros.arguments import PARAMETERS, typed
+from calib_ros.ros.arguments import PARAMETERS, refuse_ignored, typed
 from calib_ros.settings import STARTUP, Settings
 
 FREE = (
@@ -51,6 +52,8 @@ def test_the_parameter_file_holds_every_parameter_with_its_default(idle):
     ('name', 'value', 'said'),
     [
         ('model', 'nonsense', 'unknown model "nonsense"'),
+        ('model', 'auto+ratio', 'model auto stands alone'),
+        ('socket', 'A1', 'must be LOCATION/SOCKET'),
         ('model', 'gear', 'nothing to fit in "gear"'),
         ('loss', 'hubert', 'did you mean "huber"'),
         ('fixed', ['joint_7.a'], 'unknown parameter "joint_7.a"'),
@@ -190,6 +193,40 @@ def test_a_serial_number_is_text(word, meant):
     words = typed(['node', '--ros-args', '-p', f'serial:={word}', '-p', 'folds:=4'])
     assert words[-1] == 'folds:=4'
     assert yaml.safe_load(words[3].partition(':=')[2]) == meant
+
+
+@pytest.mark.parametrize(
+    ('keys', 'applies'),
+    [
+        (['calibration_node'], False),
+        (['/cell_1/calibration'], False),
+        (['/cell_2/*', '/cell_2/calibration_node'], False),
+        (['/cell_2/calibration_node', '/cell_1/calibration_node'], True),
+        (['/**'], True),
+        (['/**/calibration_node'], True),
+        (['/cell_1/*'], True),
+    ],
+)
+def test_a_parameter_file_of_other_nodes_is_refused(tmp_path, keys, applies):
+    """ROS ignores it: the node would run with its defaults."""
+    path = tmp_path / 'parameters.yaml'
+    path.write_text(yaml.safe_dump({key: {'ros__parameters': {'chain': 'ur10e'}} for key in keys}))
+    words = ['--params-file', str(path), '-r', '__ns:=/cell_1']
+    assert ('chain' in parameters_of(words)) == applies
+    node, command = '/cell_1/calibration_node', ['node', '--ros-args', *words]
+    if applies:
+        refuse_ignored(command, node)
+        return
+    with pytest.raises(ConfigError, match=rf'no parameters of {node}, but of /.*: use the key /'):
+        refuse_ignored(command, node)
+
+
+def test_a_node_does_not_start_with_the_parameters_of_another(tmp_path):
+    path = tmp_path / 'parameters.yaml'
+    path.write_text('cell_2: {calibration_node: {ros__parameters: {mode: triggered}}}')
+    with Child('--params-file', path, chain='ur10e', data_dir=tmp_path) as child:
+        assert child.end() == 1
+        assert 'but of /cell_2/calibration_node: use the key /**' in child.output
 
 
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):
