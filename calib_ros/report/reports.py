@@ -273,10 +273,15 @@ def _effects(result: Identification) -> Section:
         'and does better; its error is at the top.',
         head=('effect', 'changes the error by', 'used'),
         rows=tuple(
-            (v.what, f'{100.0 * (v.rms_mm_after / v.rms_mm_before - 1.0):+.1f} %', used[v.pays])
+            (v.what, _change(v.rms_mm_after / v.rms_mm_before), used[v.pays])
             for v in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before))
         ),
     )
+
+
+def _change(ratio: float) -> str:
+    percent = round(100.0 * (ratio - 1.0), 1)
+    return f'{percent:+.1f} %' if percent else '0.0 %'
 
 
 def _outliers(poses: Poses) -> Section:

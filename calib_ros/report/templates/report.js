@@ -168,7 +168,7 @@
       { type: 'scatter3d', mode: 'markers', ...at(state.picked < 0 ? [] : [state.picked]), hoverinfo: 'skip',
         marker: { size: 11, symbol: 'circle-open', color: '#000', line: { width: 3 } }, showlegend: false },
     ];
-    const layout = base(), far = narrow() ? 1.9 : 1.35;
+    const layout = base(), far = narrow() ? 1.6 : 1.35;
     const title = (text) => ({ title: { text: text + ' [m]' } });
     layout.scene = { aspectmode: 'data', xaxis: title('x'), yaxis: title('y'), zaxis: title('z'), camera: { eye: { x: 1.2 * far, y: -1.2 * far, z: 0.5 * far }, center: { x: 0, y: 0, z: -0.15 } } };
     layout.margin = { l: 0, r: 0, t: 30, b: 0 };
