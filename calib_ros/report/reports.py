@@ -79,7 +79,14 @@ def identification_report(
         steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *_notes(result)),
         identity=sections.identity_of(
-            result.chain, origin, poses, ('Judged by', result.validated_by), corrected
+            result.chain,
+            origin,
+            poses,
+            (
+                ('Stated device noise', f'{_stated(problem, poses)} (one sigma)'),
+                ('Judged by', result.validated_by),
+            ),
+            corrected,
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
