@@ -211,8 +211,8 @@
   const sized = floats.size.some(Number.isFinite), roles = new Set(e.role).size > 1 || outliers.length > 0;
   const columns = [
     ['from', source],
-    roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     ['before [mm]', (i) => fixed(lengths.before[i])], ['after [mm]', (i) => fixed(lengths.after[i])],
+    roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     e.oriented && ['before [mrad]', (i) => fixed(floats.turned_before[i])],
     e.oriented && ['after [mrad]', (i) => fixed(floats.turned_after[i])],
     sized && ['times usual', (i) => fixed(floats.size[i], 1)],
