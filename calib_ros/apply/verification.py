@@ -211,8 +211,8 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     count = len(moments)
     if count - lost < least:
         raise InputError(
-            f'{count} poses were measured; at least {least + lost} are needed: five are '
-            'usual (calib_ros plan --iso9283)'
+            f'{count} poses were measured; at least {least + lost} are needed'
+            + f', {lost} of them for the refitted frames' * (lost > 0)
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
 

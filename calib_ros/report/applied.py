@@ -286,7 +286,7 @@ def verification_report(
         picture=sections.distribution(poses),
         steps=steps,
         remarks=(*warnings, *hints(found)),
-        identity=sections.identity_of(chain, origin, poses, different, table_hash(chain)),
+        identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(
             *((_by_configuration(found),) if found.each else ()),

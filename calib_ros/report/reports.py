@@ -78,7 +78,14 @@ def identification_report(
         steps=_steps(result, reasons, limits, tolerance),
         remarks=(*warnings, *_notes(result)),
         identity=sections.identity_of(
-            result.chain, origin, poses, ('Judged by', result.validated_by), corrected
+            result.chain,
+            origin,
+            poses,
+            (
+                ('Stated device noise', f'{_stated(problem, poses)} (one sigma)'),
+                ('Judged by', result.validated_by),
+            ),
+            corrected,
         ),
         explorer=explorer(result.chain, poses),
         sections=tuple(_sections(problem, result, poses)),
@@ -272,10 +279,15 @@ def _effects(result: Identification) -> Section:
         'and does better; its error is at the top.',
         head=('effect', 'changes the error by', 'used'),
         rows=tuple(
-            (v.what, f'{100.0 * (v.rms_mm_after / v.rms_mm_before - 1.0):+.1f} %', used[v.pays])
+            (v.what, _change(v.rms_mm_after / v.rms_mm_before), used[v.pays])
             for v in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before))
         ),
     )
+
+
+def _change(ratio: float) -> str:
+    percent = round(100.0 * (ratio - 1.0), 1)
+    return f'{percent:+.1f} %' if percent else '0.0 %'
 
 
 def _outliers(poses: Poses) -> Section:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import platform
 import time
+from collections.abc import Sequence
 from datetime import datetime, timezone
 
 import numpy as np
@@ -73,7 +74,7 @@ def identity_of(
     chain: Chain,
     origin: Origin,
     poses: Poses | None = None,
-    judged: tuple[str, str] = ('', ''),
+    more: Sequence[tuple[str, str]] = (),
     corrected: str = '',
 ) -> tuple[tuple[str, str], ...]:
     """Return the identity of the result: robot, people, times; unknown entries are omitted."""
@@ -87,7 +88,7 @@ def identity_of(
         ('Operator', origin.operator),
         ('Measured, by the stamps', _measured(poses)),
         *(((poses.things.capitalize(), f'{len(poses):,}'),) if poses else ()),
-        judged,
+        *more,
         ('Report made', datetime.now(timezone.utc).strftime('%Y-%m-%d %H:%M UTC')),
         ('Software', software),
         ('Corrected table, SHA-256', corrected),

@@ -19,6 +19,7 @@ from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import Comparison, ErrorFigures
 from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
@@ -320,8 +321,8 @@ def chance_in_words(chance: float) -> str:
     """Return how well drift explains the gain."""
     share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'below 0.1'
     return (
-        f'The chance that the improvement is only drift of the device is {share} % (share of '
-        'time-shifted residuals explained just as well).'
+        f'Of time-shifted residuals {share} % are explained just as well: above '
+        f'{100.0 * (1.0 - CONFIDENT):.0f} % the improvement may only be drift of the device.'
     )
 
 

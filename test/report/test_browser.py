@@ -215,7 +215,7 @@ def test_the_list_shows_the_largest_errors_first_and_outliers_alone(wide):
     page = wide.page
     page.select_option('#sort', 'after')
     assert page.inner_text('#rows tbody tr:first-child button') == '4'
-    shown = [float(cell) for cell in page.locator('#rows tbody td:nth-child(5)').all_inner_texts()]
+    shown = [float(cell) for cell in page.locator('#rows tbody td:nth-child(4)').all_inner_texts()]
     assert shown == sorted(shown, reverse=True)
     page.check('#only')
     assert page.locator('#rows tbody tr').count() == 1

@@ -167,7 +167,7 @@
       { type: 'scatter3d', mode: 'markers', ...at(state.picked < 0 ? [] : [state.picked]), hoverinfo: 'skip',
         marker: { size: 11, symbol: 'circle-open', color: '#000', line: { width: 3 } }, showlegend: false },
     ];
-    const layout = base(), far = narrow() ? 1.9 : 1.35;
+    const layout = base(), far = narrow() ? 1.6 : 1.35;
     const title = (text) => ({ title: { text: text + ' [m]' } });
     layout.scene = { aspectmode: 'data', xaxis: title('x'), yaxis: title('y'), zaxis: title('z'), camera: { eye: { x: 1.2 * far, y: -1.2 * far, z: 0.5 * far }, center: { x: 0, y: 0, z: -0.15 } } };
     layout.margin = { l: 0, r: 0, t: 30, b: 0 };
@@ -210,8 +210,8 @@
   const sized = floats.size.some(Number.isFinite), roles = new Set(e.role).size > 1 || outliers.length > 0;
   const columns = [
     ['from', source],
-    roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     ['before [mm]', (i) => fixed(lengths.before[i])], ['after [mm]', (i) => fixed(lengths.after[i])],
+    roles && ['used', (i) => e.roles[e.role[i]] + (e.outlier[i] ? ', outlier' : '')],
     e.oriented && ['before [mrad]', (i) => fixed(floats.turned_before[i])],
     e.oriented && ['after [mrad]', (i) => fixed(floats.turned_after[i])],
     sized && ['times usual', (i) => fixed(floats.size[i], 1)],
