@@ -278,6 +278,7 @@ WRONG = [
     ('.yaml', 'joint_names: [a]\npoints: [{positions: []}]', 'has no positions'),
     ('.yaml', trajectory(np.zeros((2, 5))), 'positions must be a list of 6 numbers'),
     ('.yaml', trajectory(ZEROS, 'abcdef'), 'unknown joint in the program'),
+    ('.yaml', trajectory(np.zeros((2, 7)), [*UR.joint_names, 'elbow_joint']), 'comes twice'),
     ('.yaml', trajectory(ZEROS, velocities=[True] * 6), 'finite number, not True'),
     (
         '.yaml',

@@ -169,16 +169,18 @@ def test_errors_away_from_the_fitted_poses_are_of_the_size_predicted(name, sessi
     assert least < np.sqrt(np.mean(squares)) < 1.35
 
 
-@pytest.mark.parametrize('criterion', ['d', 'task'])
-def test_so_many_poses_are_needed_and_no_fewer(criterion):
+@pytest.mark.parametrize(('criterion', 'wanted'), [('d', 1e-4), ('task', 1e-4), ('d', 7.5e-5)])
+def test_so_many_poses_are_needed_and_no_fewer(criterion, wanted):
+    """Also of more poses than the parameters that the search begins with."""
     chain = arm()
     design, q, task = design_of(chain), some(chain, 200), some(chain, 100, 2)
-    found = planning.fewest(design, q, task, 1e-4, criterion)
+    found = planning.fewest(design, q, task, wanted, criterion)
 
     def best(count):
         return accuracy(design, q[choose(design, q, count, criterion, task)], task)[-1]
 
-    assert accuracy(design, q[found], task)[-1] <= 1e-4 < best(len(found) - 1)
+    assert (len(found) > len(design.names)) == (wanted < 1e-4)
+    assert accuracy(design, q[found], task)[-1] <= wanted < best(len(found) - 1)
     with pytest.raises(InputError, match='all 200 candidates together'):
         planning.fewest(design, q, task, 1e-6)
 

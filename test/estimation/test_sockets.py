@@ -12,7 +12,7 @@ from fits import fitted
 from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 
 from calib_ros.apply.simulation import Cell, faulty
-from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
@@ -143,6 +143,9 @@ def test_only_sockets_are_a_known_distance_apart():
     _, problem = cell(0)
     with pytest.raises(UnknownNameError, match=r'"base_9".*base_0_0'):
         replace(problem, separations=(('base_0_0', 'base_9', DISTANCE),))
+    for distance in (0.0, np.nan):
+        with pytest.raises(ConfigError, match='distance of sockets must be positive'):
+            replace(problem, separations=(('base_0_0', 'base_1_1', distance),))
     poses = replace(problem.sets[0], socket=False)
     with pytest.raises(UnknownNameError, match='base_0_0'):
         replace(problem, observations=poses)

@@ -274,6 +274,9 @@ def test_joint_values_that_stand_a_row_below(read):
         ('', {}, 'no rows'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n', {'columns': {'x': 'z/0'}}, 'line 2: x = z/0 is infinite'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n', {'inverse': True}, '--inverse needs poses'),
+        ('q1,q2,x,y,z\n1,2,3,4,5\n', {'shift': 1}, '--shift 1 leaves none of 1 rows'),
+        (PLAIN, {'euler': 'XYZ', 'rotation_vector': True}, 'only one form of rotation'),
+        (PLAIN, {'separator': ',', 'decimal': ','}, 'cannot separate both cells and decimals'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n', {'length': 'um', 'columns': {'sx': '1'}}, 'sx, sy and sz'),
     ],
 )

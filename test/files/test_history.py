@@ -145,12 +145,16 @@ def test_rows_without_what_is_compared_are_named(tmp_path, column):
         store.rows('SN 1/ö')
 
 
-def test_what_is_no_row_is_named(tmp_path):
+@pytest.mark.parametrize('damaged', [True, False])
+def test_what_is_no_row_is_named(tmp_path, damaged):
     store = History(tmp_path)
     store.file(row())
     (path,) = tmp_path.rglob('*.parquet')
-    path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(InputError, match=path.name):
+    other = path.rename(path.with_name(f'{row(1).key}.parquet'))
+    if damaged:
+        other.rename(path)
+        path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(InputError, match=path.name if damaged else 'its name is not its key'):
         store.rows('SN 1/ö')
 
 

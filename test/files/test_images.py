@@ -345,3 +345,42 @@ def test_a_bag_of_the_real_photographs(photographs, capsys):
             found = list(csv.DictReader(file))
         assert [row['u'] for row in found] == [row['u'] for row in wanted]
         assert found[0]['image'] == '1000000000'
+
+
+MATRIX = 'k: [800, 0, 320, 0, 800, 240, 0, 0, 1]'
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        (f'[{MATRIX}]', 'must be a mapping'),
+        ('k: [800, 0, 320, 0, 800, 240, 0, 0]', 'must hold 9 numbers, not 8'),
+        ('k: 800', 'camera_matrix must be numbers'),
+        ('d: [0, 0, 0, 0, 0]', 'camera_matrix must be numbers'),
+        (f'{MATRIX}\nd: [0, 0, 0, 0, 0, 1e-3]', 'supports only k1 k2 p1 p2 k3'),
+    ],
+)
+def test_intrinsics_that_are_none_are_refused(tmp_path, text, said):
+    path = tmp_path / 'camera.yaml'
+    path.write_text(MATRIX)
+    assert boards.read_lens(path) == Lens(800.0, 800.0, 320.0, 240.0)
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=said):
+        boards.read_lens(path)
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        ('image,q1,q2\na,1,2\nb,1,2\nb,3,4\n', 'line 3: image b appears twice'),
+        ('image,q1\na,1\n', 'has no column q2: give q1 ... q2, or x y z'),
+        ('image,x,y\na,1,2\n', 'has no column z, qx, qy, qz, qw'),
+        ('image,q1,q2\nb,1,2\n', "no image has joint values: .*'a' and 'b' do not"),
+    ],
+)
+def test_places_of_images_that_are_none_are_refused(tmp_path, text, said):
+    (tmp_path / 'places.csv').write_text(text)
+    (tmp_path / 'corners.csv').write_text('image,corner,u,v\na,0,1,2\n')
+    found = boards.read_detections(tmp_path / 'corners.csv', CHARUCO)
+    with pytest.raises(InputError, match=said):
+        boards.observed(found, CHARUCO, boards.read_places(tmp_path / 'places.csv', 2)[0], False)

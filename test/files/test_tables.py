@@ -251,6 +251,8 @@ def test_sessions_come_in_the_order_asked_for(tmp_path):
     found = read_table(path, 2, ('B', 'A')).fitted
     assert [each.positions[:, 0].tolist() for each in found] == [[2.0], [1.0, 3.0]]
     assert [each.base for each in found] == ['base', 'base_A']
+    with pytest.raises(InputError, match='session "A" is named twice'):
+        read_table(path, 2, ('A', 'A'))
 
 
 @pytest.mark.parametrize(

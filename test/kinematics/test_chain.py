@@ -1,9 +1,12 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
+from calib_ros.errors import ConfigError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.joint import Frame
 from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS
@@ -102,3 +105,23 @@ def test_delays_of_a_frame_add_up():
     chain = row_of((HALF, 0.0), 'standard')
     assert chain.value(f'base.{DELAY}') == 0.0
     assert chain.with_frame('base', later).value(f'base.{DELAY}') == 0.25
+
+
+ONE = row_of((HALF, 0.0), 'standard')
+
+
+@pytest.mark.parametrize(
+    ('made', 'said'),
+    [
+        (lambda: row_of((), 'standard'), 'chain "arm" has no joints'),
+        (lambda: replace(ONE, parallel=('j1', 'j1')), 'names joint "j1" twice'),
+        (lambda: ONE.with_offsets({'j1.a': np.inf}), 'the offset of j1.a must be a finite number'),
+        (lambda: ONE.with_offsets({'j3.a': 0.0}), 'unknown parameter "j3.a"'),
+        (lambda: ONE.with_effects(['j3.ratio']), 'unknown parameter "j3.ratio"'),
+        (lambda: Joint('j', sign=2), 'sign of joint "j" must be 1 or -1, not 2'),
+        (lambda: Joint('j', d=np.nan), 'd of joint "j" must be a finite number'),
+    ],
+)
+def test_what_is_no_chain_and_no_change_of_one_is_refused(made, said):
+    with pytest.raises(ConfigError, match=said):
+        made()

@@ -149,6 +149,50 @@ def test_several_devices_and_targets(rng):
     assert live.suspicious == []
 
 
+def by_wire(samples, unit=1.0):
+    """Return what a wire at the tracker's origin measures at the same stops."""
+    ends = {'device': 'wire', 'position': None, 'rotation': None}
+    return [
+        replace(s, stamp_ns=s.stamp_ns + 500, distance=unit * np.linalg.norm(s.position), **ends)
+        for s in samples
+    ]
+
+
+def test_a_gross_error_of_a_wire_is_found_as_of_a_tracker(rng):
+    samples = seen(faulty(UR10E, Cell(), rng), 40, rng)
+    samples += by_wire(samples)
+    samples[77] = replace(samples[77], distance=samples[77].distance + 1e-3)
+    live = LiveEstimate(session().problem_of)
+    assert [live.update(samples[:k]).samples for k in (70, 80)] == [70, 79]
+    assert live.suspicious == [samples[77]]
+
+
+def test_samples_that_make_no_problem_yet_are_told_or_waited_for(rng, monkeypatch):
+    samples = seen(faulty(UR10E, Cell(), rng), 20, rng)
+    live = LiveEstimate(session().problem_of)
+    assert live.update([*samples, *by_wire(samples, 1e3)]) is None
+    assert 'are they in metres' in live.refused
+    with monkeypatch.context() as failing:
+        failing.setattr(live_module, 'start_frames', lambda *_: np.linalg.inv(np.zeros((1, 1))))
+        assert live.update(samples) is None
+    assert live.refused == ''
+    assert live.update(samples).samples == 20
+
+
+@pytest.mark.parametrize('share', [0.0, 0.5, 1.0])
+@pytest.mark.parametrize(
+    'own', [{'covariance': np.diag(np.repeat(NOISE, 3) ** 2)}, {'spread': NOISE[0]}]
+)
+def test_what_is_left_is_compared_with_the_scatter_of_each_sample(rng, own, share):
+    """With the given sigma where it is not known, here a third of the noise."""
+    samples = seen(faulty(UR10E, Cell(), rng), 80, rng)
+    for k in rng.permutation(80)[: round(share * 80)]:
+        samples[k] = replace(samples[k], **own)
+    given = {name: sigma / 3.0 for name, sigma in SIGMAS.items()}
+    found = LiveEstimate(session(**given).problem_of).update(samples)
+    assert found.excess == pytest.approx(np.sqrt(9.0 - 8.0 * share), rel=0.15)
+
+
 def test_held_out_samples_are_not_fitted(rng):
     true = faulty(UR10E, Cell(), rng)
     samples = seen(true, 40, rng)
