@@ -242,21 +242,23 @@ class _Judge:
 
     def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
         """Return plausible offsets, as in `Posterior.doubted`, for the arm only."""
-        weights, means, covariances = (np.array(each) for each in zip(*doubted, strict=True))
-        return weights, means[:, self._arm], covariances[:, self._arm][:, :, self._arm]
+        weights, means, covariances = zip(*doubted, strict=True)
+        arm = np.ix_(self._arm, self._arm)
+        own = np.array([each[arm] for each in covariances])
+        return np.array(weights), np.array(means)[:, self._arm], own
 
     def risk(self, which: FloatArray, around: FloatArray, doubts: _Doubts) -> float:
         """Return the risk at some poses, in frames fitted to poses around; by their products."""
         frames, arm = np.s_[: self._placed], np.s_[self._placed :]
         root = inverse_root(around[frames, frames], np.diag(around)[frames])
-        taken = root @ (root.T @ around[frames, arm])
-        cross = taken.T @ which[frames, arm]
-        left = which[arm, arm] - cross - cross.T + taken.T @ which[frames, frames] @ taken
-        slope = left @ self._offsets
+        placed = -root @ (root.T @ (around[frames, arm] @ self._offsets))
+        pushed = which @ np.append(placed, self._offsets)
+        slope = pushed[arm] - around[arm, frames] @ (root @ (root.T @ pushed[frames]))
         gain = float(slope @ self._offsets)
         weights, means, covariances = doubts
         margins = means @ slope - 0.5 * gain
-        spreads = np.sqrt(np.maximum(covariances @ slope @ slope, 0.0))
+        along = (covariances.reshape(-1, len(slope)) @ slope).reshape(means.shape)
+        spreads = np.sqrt(np.maximum(along @ slope, 0.0))
         with np.errstate(divide='ignore', invalid='ignore'):
             risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
         return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

@@ -221,9 +221,11 @@ def _cross_validate(
         return None, 'nothing: too few poses to hold any out'
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
+    order = [np.argsort(each, kind='stable') for each in numbers]  # once for both
+    system, dealt = robust.system.select(order), [np.sort(each) for each in numbers]
     chains = zip(
-        without_each(before, frames, robust.system, numbers),
-        without_each(after, names, robust.system, numbers),
+        without_each(before, frames, system, dealt),
+        without_each(after, names, system, dealt),
         strict=True,
     )
     first, second = left_out(chains, problem.sets, groups, numbers)

@@ -127,7 +127,7 @@ class Fitted:
 
 def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ...], Chain, Fitted]:
     """Return the structurally identifiable names, the chain with start frames, and the fit."""
-    model, separations = problem.model, problem.system(problem.sets).separation_rows
+    model, separations = problem.model, System((), None, (*problem.separations,)).separation_rows
     structural, held = identifiability.identifiable_and_held(
         model, problem.free, problem.kinds, separations
     )

@@ -89,15 +89,12 @@ def noise_of(
     if not estimated.any():
         return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))
 
-    def covariances(by_part: Sequence[FloatArray]) -> FloatArray:
-        sources = (*by_part, extra.T @ extra)
-        return np.array([identifiability.covariance(factor, middle) for middle in sources])
-
-    covariance = covariances(
-        [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
-    )
+    sources = [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
+    parts = [identifiability.covariance(factor, middle) for middle in sources]
+    by_priors = plain @ extra.T
+    covariance = np.array([*parts, by_priors @ by_priors.T])
     if neighbours.middles:
-        alone = np.diag(covariances(middles).sum(axis=0))
+        alone = np.diag(identifiability.covariance(factor, sum(middles, extra.T @ extra)))
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
     size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))

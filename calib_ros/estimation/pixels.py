@@ -162,10 +162,8 @@ class PixelSamples(Samples):
         joints, velocity = self.moving(model.chain)
         approach = None if self.approach is None else self.approach[:, images]
         moving = None if velocity is None else velocity[:, images]
-        axes, origin, shift, turn = model.linearise(joints[:, images], approach, moving)
-        turning = model.order < model.rotations
-        twist = np.zeros((len(turning), 6, origin.shape[1]))
-        twist[:, :3], twist[turning, 3:] = shift[model.order], turn[model.order[turning]]
+        axes, origin, *found = model.linearise(joints[:, images], approach, moving)
+        twist = model.twists(*found)
         if self.observations.on_flange:  # in the axes of the camera, which moves the other way
             flat = twist.reshape(len(twist), 2, 3, -1)
             twist = np.einsum('kcm,pscm->pskm', axes, flat).reshape(twist.shape)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -28,9 +29,12 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 from calib_ros.values import LARGEST
 
-Block: TypeAlias = tuple[slice, FloatArray, FloatArray, ErrorModel]
+Block: TypeAlias = tuple[slice, FloatArray, FloatArray, FloatArray, ErrorModel]
 Both: TypeAlias = tuple[FloatArray, FloatArray]
 """Residuals by position and orientation, or in the image and at the board."""
+Places: TypeAlias = tuple[Index, list[tuple[int, Index]]]
+"""The place (P + 1,) of each parameter and the residual in `_products`, -1 if none; and by row the
+numbers of the effects that multiply it."""
 
 
 class Samples:
@@ -77,9 +81,9 @@ class Samples:
     def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
         """Yield weighted rows of Jacobian and residual in blocks.
 
-        Each is a slice of samples; `shift` (P + 1, c, B), the derivative of the residual, which is
-        the last row; `turn` (P_rotational + 1, 3, B) of a separate orientation, else empty; and
-        the error model with the order of the parameters in the rows.
+        Each is a slice of samples; `shift` (K + 1, c, B), the derivative of the residual, which is
+        the last row; `turn` (K_rotational + 1, 3, B) of a separate orientation, else empty; `phi`
+        (E, B) of the effects; and the error model with the order of the parameters in the rows.
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
         empty = np.zeros((0, 0, 0))
@@ -91,8 +95,8 @@ class Samples:
                 out = None  # the last is shorter
             approach = None if self.approach is None else self.approach[:, part]
             moving = None if velocity is None else velocity[:, part]
-            axes, origin, shift, turn = model.linearise(joints[:, part], approach, moving, out)
-            out = shift, turn
+            axes, origin, *rows, phi = model.linearise(joints[:, part], approach, moving, out)
+            out = shift, turn = rows[0], rows[1]
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
@@ -106,34 +110,35 @@ class Samples:
                 turn *= weights / sigmas[1]
             if self.whitening is not None:
                 shift, turn = self._whitened(shift, turn, part), empty
-            yield part, shift, turn if self.oriented else empty, model
+            yield part, shift, turn if self.oriented else empty, phi, model
 
     def products(
         self, chain: Chain, names: Sequence[str], count: int = 1, folds: Index | None = None
     ) -> FloatArray:
         """Return products (K, 2, P + 1, P + 1) of rows by fold (N,) (`products_of`)."""
-        size = len(names) + 1
-        found = np.zeros((count, 2, size, size))
-        order, samples, ends = np.arange(size), self, np.array([0, self.count])
+        samples, ends = self, np.array([0, self.count])
         if folds is not None:
-            samples = self.select(np.argsort(folds, kind='stable'))
             ends = np.append(0, np.cumsum(np.bincount(folds, minlength=count)))
-        for which, shift, turn, model in samples.blocks(chain, names):
-            last = len(turn) - 1
+            if (np.diff(folds) < 0).any():
+                samples = self.select(np.argsort(folds, kind='stable'))
+        found = np.zeros((count, 2, len(names) + 1, len(names) + 1))
+        sums: dict[tuple[int, int], FloatArray] = {}
+        places: list[Places] = []
+        for which, shift, turn, phi, model in samples.blocks(chain, names):
+            parts = [rows for rows in (shift, turn) if len(rows)]
+            places = places or [_places(model, len(rows) - 1) for rows in parts]
             cuts = np.clip(ends - which.start, 0, shift.shape[2]).tolist()
-            for (by_position, by_orientation), *cut in zip(found, cuts, cuts[1:], strict=False):
-                part = slice(*cut)
-                rows = shift[..., part].reshape(size, -1)
-                by_position += rows @ rows.T
-                if last >= 0:
-                    rows = turn[..., part].reshape(last + 1, -1)
-                    products = rows @ rows.T
-                    by_orientation[:last, :last] += products[:-1, :-1]
-                    by_orientation[:last, -1] += products[:-1, -1]
-                    by_orientation[-1, -1] += products[-1, -1]
-            order[:-1] = model.order
-        found[:, 1, -1, :-1] = found[:, 1, :-1, -1]
-        return np.asarray(found[:, :, order[:, np.newaxis], order])
+            for fold, (first, last) in enumerate(pairwise(cuts)):
+                cut = np.s_[..., first:last]
+                for k, (rows, (_, driven)) in enumerate(zip(parts, places, strict=True)):
+                    new = _products(rows[cut], phi[cut], driven)
+                    sums[fold, k] = sums[fold, k] + new if (fold, k) in sums else new
+        for (fold, k), lower in sums.items():
+            place, driven = places[k]
+            every = np.tril(lower) + np.tril(lower, -1).T if driven else lower
+            known = np.flatnonzero(place >= 0)
+            found[fold, k, known[:, np.newaxis], known] = every[place[known]][:, place[known]]
+        return found
 
     def sums(
         self, chain: Chain, names: Sequence[str], groups: Index
@@ -163,15 +168,16 @@ class Samples:
         Parameters are in the order of their names, the residual last. Without a separate
         orientation there is one part.
         """
-        for _, shift, turn, model in self.blocks(chain, names):
-            order = [*model.order, len(names)]
-            if not len(turn):
-                yield (shift[order],)
-                continue
-            full = np.zeros((len(names) + 1, *turn.shape[1:]))
-            rotational = np.flatnonzero(model.order < model.rotations)
-            full[rotational], full[-1] = turn[model.order[rotational]], turn[-1]
-            yield shift[order], full
+        for _, shift, turn, phi, model in self.blocks(chain, names):
+            found = [shift[[*model.order, -1]]]
+            if len(turn):
+                full = np.zeros((len(names) + 1, *turn.shape[1:]))
+                rotational = np.flatnonzero(model.order < model.rotations)
+                full[rotational], full[-1] = turn[model.order[rotational]], turn[-1]
+                found.append(full)
+            for rows in found:
+                rows[model.spread] *= phi[:, np.newaxis]
+            yield tuple(found)
 
     @property
     def width(self) -> int:
@@ -228,6 +234,38 @@ class Samples:
         """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
         for part in self.whitened_residuals(chain):
             yield part, slice(None)
+
+
+def _places(model: ErrorModel, last: int) -> Places:
+    """Return the places for rows (last + 1, c, B) of a block, the residual last."""
+    place = np.append(np.where(model.order < last, model.order, -1), last)
+    own = np.arange(len(place))[model.spread]
+    rows = place[own]
+    effects = [(row, np.flatnonzero(rows == row)) for row in np.unique(rows[rows >= 0]).tolist()]
+    ordered = np.concatenate([np.zeros(0, np.intp), *(numbers for _, numbers in effects)])
+    place[own[ordered]] = last + 1 + np.arange(len(ordered))
+    return place, effects
+
+
+def _products(rows: FloatArray, phi: FloatArray, effects: list[tuple[int, Index]]) -> FloatArray:
+    """Return the lower triangle of products of rows (K, c, B), and of some times phi (E, B).
+
+    The `effects` of a row share its products with the others, so theirs need no components.
+    """
+    size = len(rows)
+    flat = rows.reshape(size, -1)
+    if not effects:
+        return np.asarray(flat @ flat.T)
+    parts = [phi[numbers] for _, numbers in effects]
+    ends = np.cumsum([size, *map(len, parts)]).tolist()
+    found = np.zeros((ends[-1], ends[-1]))
+    found[:size, :size] = flat @ flat.T
+    for k, (row, _) in enumerate(effects):
+        inner, which = np.einsum('kcb,cb->kb', rows, rows[row]), slice(ends[k], ends[k + 1])
+        found[which, :size] = parts[k] @ inner.T
+        for m, (other, _) in enumerate(effects[k:], k):
+            found[ends[m] : ends[m + 1], which] = (parts[m] * inner[other]) @ parts[k].T
+    return found
 
 
 def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:

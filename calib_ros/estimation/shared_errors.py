@@ -164,6 +164,7 @@ class _Forms:
         self._basis: dict[int, FloatArray] = {}
         self._residual: dict[int, FloatArray] = {}
         self._known: dict[int, FloatArray] = {}
+        self._white: dict[int, FloatArray] = {}
         self.parts: list[int] = []
         first = 0
         for part, each in enumerate(units.parts):
@@ -176,6 +177,7 @@ class _Forms:
             self._basis[part] = np.ascontiguousarray(turned)
             self._residual[part] = left[block].reshape(shape).T
             self._known[part] = each.any(axis=0).T.astype(float)
+            self._white[part] = gram(basis[block].T)
             self.parts.append(part)
 
     def _moments(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
@@ -184,7 +186,8 @@ class _Forms:
         for part, own in matrices.items():
             basis, known, count = self._basis[part], self._known[part], len(own)
             products = np.matmul(own, basis.reshape(len(basis), -1))
-            products = products.reshape(count, *basis.shape) * known[:, :, np.newaxis]
+            products = products.reshape(count, *basis.shape)
+            products *= known[:, :, np.newaxis]
             columns = basis.reshape(-1, basis.shape[2])
             crossed = np.matmul(columns.T, products.reshape(count, *columns.shape))
             inner.append(crossed.reshape(count, -1))
@@ -203,7 +206,7 @@ class _Forms:
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
         product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
         product *= known[:, :, np.newaxis]
-        white, linked = _inner(basis, basis), _inner(basis, product)
+        white, linked = self._white[part], _inner(basis, product)
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())
         freedom = float(known.sum() - np.trace(white))
@@ -316,41 +319,44 @@ def _successive(
     kernels: Mapping[int, Sequence[tuple[float, float]]],
 ) -> dict[int, FloatArray]:
     """Return by part J^T K J of errors fading in succession, for (length, size) each."""
-    found = {part: np.zeros((len(names), len(names))) for part in kernels}
+    size = len(names)
+    inside = {part: np.zeros((size, size)) for part in kernels}
+    across = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
         states: dict[int, FloatArray] = {}
         for _, sums in samples.sums(chain, names, samples.observations.stops):
             for part, own_kernels in kernels.items():
                 if part >= len(sums):
                     continue
-                rows = sums[part][:-1]
-                own = rows.reshape(len(rows), -1)
-                earlier, states[part] = _faded_sums(
-                    rows.reshape(-1, rows.shape[2]), states.get(part), own_kernels
-                )
-                found[part] += own @ earlier.reshape(own.shape).T
-    return {part: cross + cross.T for part, cross in found.items()}
+                rows = sums[part][:-1].reshape(-1, sums[part].shape[2])
+                mixed, later, earlier, states[part] = _by_runs(rows, states.get(part), own_kernels)
+                inside[part] += gram(mixed.reshape(size, -1))
+                across[part] += later.reshape(size, -1) @ earlier.reshape(size, -1).T
+    return {part: inside[part] + cross + cross.T for part, cross in across.items()}
 
 
-def _faded_sums(
+def _by_runs(
     rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the faded sum (R, n) of the columns before each of (R, n), and half of itself.
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return parts of the products of columns (R, n) with kernels of (length, size) each.
 
-    With it, for each kernel (length, size), the sum (R, K) so far, which continues `state`. Runs
-    of about the root of n columns make both a product with a small matrix.
+    Within runs of about the root of n columns these are the products of the first (R, n). Between
+    runs kernels separate: for each kernel and run, products of the second (R, K L) with the third,
+    the faded sums before. The last (R, K) are those so far, which continue `state`.
     """
     lengths, sizes = np.array(kernels).T
     run = int(np.sqrt(rows.shape[1]))
-    ahead = np.subtract.outer(np.arange(run), np.arange(run))[..., np.newaxis]
-    inside = (np.exp(-np.abs(ahead) / lengths) @ sizes) * np.heaviside(-ahead[..., 0], 0.5)
+    apart = np.abs(np.subtract.outer(np.arange(run), np.arange(run)))[..., np.newaxis]
+    root = np.linalg.cholesky(np.exp(-apart / lengths) @ sizes)
+    fading = np.exp(-np.arange(1, run + 1)[:, np.newaxis] / lengths)
     after = np.exp(-np.arange(run)[::-1, np.newaxis] / lengths)
-    found = np.empty_like(rows)
+    mixed, later, earlier = np.empty_like(rows), list[FloatArray](), list[FloatArray]()
     state = np.zeros((len(rows), len(lengths))) if state is None else state
     for first in range(0, rows.shape[1], run):
         part = np.ascontiguousarray(rows[:, first : first + run])
         width = part.shape[1]
-        fading = np.exp(-np.arange(1, width + 1) / lengths[:, np.newaxis])
-        found[:, first : first + width] = part @ inside[:width, :width] + (state * sizes) @ fading
-        state = state * fading[:, -1] + part @ after[run - width :]
-    return found, state
+        mixed[:, first : first + width] = part @ root[:width, :width]
+        later.append(part @ (fading[:width] * sizes))
+        earlier.append(state)
+        state = state * fading[width - 1] + part @ after[run - width :]
+    return mixed, np.concatenate(later, axis=1), np.concatenate(earlier, axis=1), state

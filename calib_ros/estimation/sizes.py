@@ -35,10 +35,7 @@ def solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (P,) and a root (P, P) of the covariance."""
     scaled, scale = _scaled(matrix, precision)
-    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
-    if failed:
-        raise np.linalg.LinAlgError('singular posterior')
-    inverse = lapack.dtrtri(factor, lower=1, overwrite_c=1)[0]
+    inverse = lapack.dtrtri(_factor(scaled), lower=1, overwrite_c=1)[0]
     inverse *= scale
     return inverse.T @ (inverse @ vector), inverse.T
 
@@ -52,6 +49,14 @@ def mixed(
     away = [np.outer(each - mean, each - mean) for each in means]
     squares = [root @ root.T + more for (_, root), more in zip(solutions, away, strict=True)]
     return mean, np.average(squares, axis=0, weights=weights)
+
+
+def _factor(scaled: FloatArray) -> FloatArray:
+    """Return the lower triangular factor (P, P); overwrites the matrix."""
+    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError('singular posterior')
+    return np.asarray(factor)
 
 
 def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -210,7 +215,9 @@ class Evidence:
         """Return the log evidence of log sizes (S, G)."""
         weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
         scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
-        seen = (scale * self._vector)[:, :, np.newaxis]
-        fit = (seen * np.linalg.solve(scaled, seen)).sum(axis=(1, 2))
-        volume = 2.0 * np.log(scale).sum(axis=1) - np.linalg.slogdet(scaled)[1]
+        factors = [_factor(each) for each in scaled]
+        seen = zip(factors, scale * self._vector, strict=True)
+        fit = [(lapack.dtrtrs(factor, each, lower=1)[0] ** 2).sum() for factor, each in seen]
+        roots = np.array([np.diag(factor) for factor in factors])
+        volume = 2.0 * (np.log(scale) - np.log(roots)).sum(axis=1)
         return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))

@@ -20,12 +20,13 @@ from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.decision.validation import COUNTS, log_gain
 from calib_ros.estimation.evidence import group_of
-from calib_ros.estimation.leastsquares import gram, owners, stacked
+from calib_ros.estimation.leastsquares import Folds, System, gram, owners, products_of, stacked
 from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
@@ -73,16 +74,16 @@ class LinearModel:
         for each in numbers:  # every fold gets some of each set
             new = np.unique(each[blocks[each] < 0])
             blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
-        dealings = (self._groups % problem.folds, blocks[self._groups])
         rows = self._rows(self._names)
-        self._columns = np.ascontiguousarray(stacked(rows).T)
-        self._residual = self._columns[-1].copy()
-        self._number = {name: k for k, name in enumerate([*self._names, ''])}
+        *columns, self._residual = stacked(rows).T
+        self._columns = np.array(columns).reshape(len(columns), -1)
+        self._number = {name: k for k, name in enumerate(self._names)}
         self._ends = np.cumsum([each[-1].size for each in rows])
-        owner = owners(rows)
+        owner, ends = owners(rows), np.cumsum([len(each) for each in sets])[:-1]
+        dealings = (self._groups % problem.folds, blocks[self._groups])
         self._folds = [dealing[owner] for dealing in dealings]
-        self._inside = np.array([d == k for d in self._folds for k in range(problem.folds)])
-        self._products = np.array([gram(self._columns[:, part]) for part in self._inside])
+        self._dealt = [_sorted(self._system, np.split(dealing, ends)) for dealing in dealings]
+        self._products = self._all_products()
         self._pairs = [
             effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
@@ -185,7 +186,7 @@ class LinearModel:
         assert self._shifts is not None
         wanted = {name for group in groups for name in group}
         if not {*wanted, *chosen} <= self._moved.keys():
-            lots: list[Sequence[str]] = [[name for name in self._number if name]]
+            lots: list[Sequence[str]] = [[*self._number]]
             if wanted & {name for pair in self._pairs for name in pair}:
                 for _, own in itertools.groupby(self._pairs, lambda pair: pair[0].owner):
                     left = [n for pair in own for n in pair if n not in self._number]
@@ -216,17 +217,20 @@ class LinearModel:
             added = stacked(self._rows(missing)).T[:-1]
             self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
             self._columns = np.concatenate([self._columns, added])
-            size, count = len(self._columns), len(added)
-            new = np.array([added[:, part] @ self._columns[:, part].T for part in self._inside])
-            known, self._products = self._products, np.zeros((len(new), size, size))
-            self._products[:, :-count, :-count] = known
-            self._products[:, :, -count:] = np.swapaxes(new, 1, 2)
-            self._products[:, -count:] = new
+            self._products = self._all_products()
         return [self._number[name] for name in names]
 
+    def _all_products(self) -> list[FloatArray]:
+        """Return by dealing the products (K, P + 1, P + 1) of each fold, the residual last."""
+        names = [*self._number]
+        fitted = self._with(names), names
+        return [products_of(*fitted, *dealt).sum(axis=1) for dealt in self._dealt]
+
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
-        chain = self._chain.with_effects([name for name in names if name not in self._names])
-        return self._system.rows_of(chain, names)
+        return self._system.rows_of(self._with(names), names)
+
+    def _with(self, names: Sequence[str]) -> Chain:
+        return self._chain.with_effects([name for name in names if name not in self._names])
 
     def _left_out(
         self, dealing: int, chosen: Sequence[str], new: Sequence[str] = (), size: float = 0.0
@@ -243,9 +247,8 @@ class LinearModel:
         extra, offset = self._system.extra_rows(self._chain, self._names)
         offset = np.append(offset, np.zeros(len(priors)))
         extra = np.column_stack([linalg.block_diag(extra, np.diag(priors)), offset])
-        ends = [*which, self._number['']]
-        folds = self._problem.folds
-        parts = self._products[dealing * folds :][:folds, ends][:, :, ends]
+        products, ends = self._products[dealing], [*which, -1]
+        parts = products[np.ix_(range(len(products)), ends, ends)]
         rest = parts.sum(axis=0) + gram(extra.T)
         # a fold may hold all of a column
         scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))
@@ -278,3 +281,9 @@ class LinearModel:
                 size = given or usual
             found[k] = self._noise / size if size else 0.0
         return found
+
+
+def _sorted(system: System, folds: Folds) -> tuple[System, Folds]:
+    """Return the samples by fold, for products."""
+    order = [np.argsort(each, kind='stable') for each in folds]
+    return system.select(order), [each[k] for each, k in zip(folds, order, strict=True)]

@@ -185,9 +185,11 @@ class Chain(Shown):
 
     def value(self, name: str) -> float:
         """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
+        if name in self._effect_values:
+            return self._effect_values[name]
         owner, kind = self._split(name)
         if isinstance(owner, Joint):
-            return float(getattr(owner, kind)) if kind in ROW_KINDS else self._effect_values[name]
+            return float(getattr(owner, kind))
         if kind == DELAY:
             return owner.delay or 0.0
         if kind in LENS_KINDS:
@@ -196,11 +198,10 @@ class Chain(Shown):
 
     def offset(self, name: str, nominal: Chain) -> float:
         """Return the offset from a nominal chain, as for `with_offsets`."""
-        owner, kind = self._split(name)
-        if isinstance(owner, Joint) or kind == DELAY or kind in LENS_KINDS:
+        owner, _, kind = name.partition('.')
+        if owner not in self.all_frames or kind not in FRAME_KINDS:
             return self.value(name) - nominal.value(name)
-        reference = nominal.frame(name.partition('.')[0])
-        return float(owner.offsets(reference)[FRAME_KINDS.index(kind)])
+        return float(self.frame(owner).offsets(nominal.frame(owner))[FRAME_KINDS.index(kind)])
 
     def frame(self, name: str) -> Frame:
         """Return a base or tool frame; the identity if unknown."""

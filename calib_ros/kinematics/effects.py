@@ -69,6 +69,7 @@ EXPECTED = dict.fromkeys(GROUPS, 1e-4) | dict.fromkeys(('gravity', 'compliance',
 bending (at a torque arm of a metre) and play."""
 
 
+@lru_cache(maxsize=1024)
 def group_of(name: str) -> str:
     """Return the group of an effect."""
     first, rest = Parameter(name).effect
@@ -191,9 +192,9 @@ def _wave(
     highest, whole = int(orders.max()), (orders == np.round(orders)) & (orders > 0.0)
     if 2 * len(orders) <= highest or not whole.all():
         return np.asarray(np.exp(1j * orders[:, np.newaxis] * q))
-    if len(circles.get(joint, ())) < highest:
-        turn = np.broadcast_to(np.exp(1j * q), (highest, len(q)))
-        circles[joint] = np.multiply.accumulate(turn, axis=0)
+    turn = circles.setdefault(joint, np.exp(1j * q[np.newaxis]))
+    while len(turn) < highest:
+        circles[joint] = turn = np.concatenate([turn, turn * turn[-1]])
     return np.asarray(circles[joint][orders.astype(int) - 1])
 
 

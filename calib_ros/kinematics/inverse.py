@@ -115,7 +115,7 @@ class Aim:
         axes (3, 3, B), whose first index counts them; a radian counts as `lever` [m].
         """
         model, turning = self._model, self._turning
-        found, origin, shift, turn = model.linearise(q, approach)
+        found, origin, shift, turn, _ = model.linearise(q, approach)
         columns = np.zeros((len(q), 6, q.shape[1]))
         columns[:, :3] = self._signs * shift[model.order]
         columns[turning, 3:] = lever * self._signs[turning] * turn[model.order[turning]]

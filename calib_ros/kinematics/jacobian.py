@@ -57,15 +57,18 @@ class ErrorModel:
         self.names = tuple(names)
         self._ends = (base, tool)
         turning = tuple(bool(turns) for turns in chain.walk.turning)
-        asked = set(self.names)
-        fitted = tuple(name for name, _ in chain.effects if name in asked)
+        known = dict(chain.effects)
+        fitted = tuple(name for name in self.names if name in known)
         standard = chain.convention == 'standard'
         joints = tuple(zip(chain.joint_names, turning, strict=True))
         self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
         self.rotations = self._layout.rotations
-        """Number of rotational parameters; they come first in the arrays of `linearise`."""
+        """Number of rotations; they come first in the arrays of `linearise`."""
         self.order = self._layout.order
-        """Row of each named parameter in the arrays of `linearise`."""
+        """Row of each named parameter in the arrays of `linearise`; of effects, to be multiplied
+        by phi."""
+        self.spread = self._layout.spread
+        """Numbers (E,) of the effects among the names, or a slice."""
 
     def linearise(
         self,
@@ -73,15 +76,16 @@ class ErrorModel:
         approach: FloatArray | None = None,
         velocity: FloatArray | None = None,
         out: tuple[FloatArray, FloatArray] | None = None,
-    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return axes (3, 3, B), origin (3, B) [m] and derivatives of the target for one block.
 
         `q` (n, B) [rad or m] are joint values, `approach` (n, B) signs of the preceding
         velocities, for backlash, `velocity` (n, B) those for the delay of the device. The first
-        index of the axes counts them. The derivatives are `shift` (P + 1, 3, B) of the position,
-        rotational parameters first, and `turn` (P_rotational + 1, 3, B) of the orientation as a
-        rotation vector in the world; their last row is free for the residual. They are written to
-        `out`, if given, to reuse memory.
+        index of the axes counts them. The derivatives are `shift` (K + 1, 3, B) of the position,
+        rotations first, and `turn` (K_rotational + 1, 3, B) of the orientation as a rotation
+        vector in the world; their last row is free for the residual. They are written to `out`, if
+        given, to reuse memory. All effects of a joint share the row of its motion, to be
+        multiplied by their `phi` (E, B).
         """
         layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
         names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
@@ -92,7 +96,7 @@ class ErrorModel:
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last stays zero
         se3.cross(axes, target[3] - flat[layout.points], levers[:-1])
         shift, turn = out or (
-            np.empty((len(self.names) + 1, 3, samples)),
+            np.empty((self.rotations + len(layout.shifts) + 1, 3, samples)),
             np.empty((self.rotations + 1, 3, samples)),
         )
         np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
@@ -100,16 +104,10 @@ class ErrorModel:
         np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')
         for k in layout.still:
             (turn if k < self.rotations else shift)[k] = 0.0
-        if layout.effects:
-            phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
-            turning, sliding = layout.driven
-            about, along = np.split(phi[:, np.newaxis], [turning.stop - turning.start])
-            shift[turning] *= about
-            turn[turning] *= about
-            shift[sliding] *= along
         if velocity is not None and layout.delay is not None:
             turn[layout.delay], shift[layout.delay] = _twist(walk, velocity, frames, target[3])
-        return target[:3], target[3], shift, turn
+        phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
+        return target[:3], target[3], shift, turn, phi
 
     def _frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return frames (F, 4, 3, B) along the chain and the target's (4, 3, B).
@@ -145,22 +143,26 @@ class ErrorModel:
         rows = np.ascontiguousarray(self.chain.joint_values(q).T)
         signs = None if approach is None else np.ascontiguousarray(approach.T)
         moving = None if velocity is None else np.ascontiguousarray(velocity.T)
-        _, _, shift, turn = self.linearise(rows, signs, moving)
-        full = np.zeros((len(q), 6, len(self.names)))
-        full[:, :3] = shift[self.order].transpose(2, 1, 0)
-        rotational = self.order < self.rotations
-        full[:, 3:, rotational] = turn[self.order[rotational]].transpose(2, 1, 0)
-        return full
+        _, _, *found = self.linearise(rows, signs, moving)
+        return np.ascontiguousarray(self.twists(*found).transpose(2, 1, 0))
+
+    def twists(self, shift: FloatArray, turn: FloatArray, phi: FloatArray) -> FloatArray:
+        """Return the derivatives (P, 6, B) by the named parameters from those of `linearise`."""
+        found = np.zeros((len(self.names), 6, shift.shape[2]))
+        turning = self.order < self.rotations
+        found[:, :3], found[turning, 3:] = shift[self.order], turn[self.order[turning]]
+        found[self.spread] *= phi[:, np.newaxis]
+        return found
 
 
 class _Layout(NamedTuple):
-    """Rows of the parameters, rotations first, in `order` of the names.
+    """Rows of the columns, rotations first, and that of each name in `order`.
 
     Of the rows of all frames, four each, `axes` and `points` belong to rotations; `levers` (of
-    these), `shifts` and `turns` to each parameter; `still` ones move nothing. `behind` are the
+    these), `shifts` and `turns` to each column; `still` ones move nothing. `behind` are the
     frames after the constant part of each link, `bent` if something moves along or about x there,
-    `beside` if b does along y before it. `effects` are the last rotations and the last rows of
-    all, `driven`, of the `joints`; `delay` is the row of a delay.
+    `beside` if b does along y before it. `effects`, with numbers `spread` among the names, share
+    the columns of the motion of their `joints`; `delay` is the row of a delay.
     """
 
     rotations: int
@@ -175,7 +177,7 @@ class _Layout(NamedTuple):
     bent: bool
     beside: bool
     effects: tuple[str, ...]
-    driven: tuple[slice, slice]
+    spread: Index | slice
     joints: Index
     delay: int | None
 
@@ -215,27 +217,26 @@ def _layout(
 ) -> _Layout:
     """Return the layout of named parameters of joints (name, turning), frames and effects."""
     number = {joint: i for i, (joint, _) in enumerate(joints)}
-    turning = [turns for _, turns in joints]
     lines = _lines(number, standard, frames, ends)
     own = {name: number[Parameter(name).owner] for name in fitted}
-    lines |= {name: (i, 2, turning[i]) for name, i in own.items()}
+    driving = [Parameter(joint, 'theta' if turns else 'd') for joint, turns in joints]
+    driven = {name: driving[i] for name, i in own.items()}
     for name in names:
-        if name not in lines:
-            raise UnknownNameError('parameter', name, lines)
-    ordered = sorted(names, key=lambda name: (not lines[name][2], name in own))
+        if name not in lines and name not in own:
+            raise UnknownNameError('parameter', name, lines | own)
+    columns = dict.fromkeys(driven.get(name, name) for name in names)
+    ordered = sorted(columns, key=lambda name: not lines[name][2])
     row = {name: k for k, name in enumerate(ordered)}
-    rotations = sum(lines[name][2] for name in names)
+    rotations = sum(lines[name][2] for name in ordered)
     taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
     moved = [lines[name][0] is not None for name in ordered]
     # rotations of the target about itself do not move it
     away = [lines[name][0] not in (None, len(joints) + 2) for name in ordered[:rotations]]
     axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
     levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
-    driving = tuple(name for name in ordered if name in own)
-    about = sum(lines[name][2] for name in driving)
     return _Layout(
         rotations,
-        _indices(row[name] for name in names),
+        _indices(row[driven.get(name, name)] for name in names),
         _indices(axes),
         _indices(k // 4 * 4 + 3 for k in axes),
         _indices(levers),
@@ -245,9 +246,9 @@ def _layout(
         slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
         any(Parameter(name).kind in ('a', 'alpha') for name in names),
         any(Parameter(name).kind == 'b' for name in names),
-        driving,
-        (slice(rotations - about, rotations), slice(len(names) - len(own) + about, len(names))),
-        _indices(own[name] for name in driving),
+        fitted,
+        _span([k for k, name in enumerate(names) if name in own]),
+        _indices(own.values()),
         row.get(Parameter(ends[0], DELAY)),
     )
 
@@ -270,6 +271,12 @@ def _indices(numbers: Iterable[int]) -> Index:
     found = np.array([*numbers], dtype=np.intp)
     found.setflags(write=False)
     return found
+
+
+def _span(numbers: list[int]) -> Index | slice:
+    """Return ascending numbers as a slice if they are successive: faster than indices."""
+    first, last = (numbers[0], numbers[-1] + 1) if numbers else (0, 0)
+    return slice(first, last) if last - first == len(numbers) else _indices(numbers)
 
 
 def orientation_error(measured: FloatArray, model: FloatArray) -> FloatArray:

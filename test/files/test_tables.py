@@ -170,9 +170,9 @@ FAULTS = [
      'line 102: more than 100 sessions'),
     (POINTS.encode('utf-16'), 'not UTF-8 text, line 1 has zero bytes'),
     ('q1,é\n0,1\n'.encode('latin-1'), 'not UTF-8 text: save it as UTF-8'),
-    (POINTS.encode() + bytes(5000), 'line 4 has zero bytes: .* Save it as UTF-8$'),
+    (POINTS.encode() + bytes(5000), 'line 4 has zero bytes: .* Save it as CSV in UTF-8$'),
     (f'{POINTS}"0,1,2,3,4\n0,1,2,3,4\n', 'from line 4: .* quotation marks paired'),
-    *((f'q1;q2;x;y;z\n{each}\n', r'separated by semicolons: .* give --separator') for each in
+    *((f'q1;q2;x;y;z\n{each}\n', r'separated by semicolons: .*calib_ros import') for each in
       ('1;2;3;4;5', '0,1;0,2;1,3;1,4;1,5')),
 ]  # fmt: skip
 
