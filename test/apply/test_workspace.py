@@ -163,8 +163,8 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     assert len(rows) == 500
     assert rows[0].keys() == {'x', 'y', 'z', 'error', 'sigma'}
     rms = 1e3 * np.sqrt(np.mean([float(row['error']) ** 2 for row in rows]))
-    assert f'| removed by the calibration | {rms:.4f} |' in text
-    assert f'{rms:.4f}' in out
+    assert f'| removed by the calibration | {rms:.3f} |' in text
+    assert f'{rms:.3f}' in out
     assert run('workspace', *arguments)[0] == 1
 
 
@@ -188,7 +188,7 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     assert 10 < len(reached) < len(rows)
     best = min(reached, key=lambda row: float(row['error']))
     place = [float(best[axis]) for axis in 'xyz']
-    assert f'best:   {1e3 * float(best["error"]):.4f} mm at ' in out
+    assert f'best:   {1e3 * float(best["error"]):.3f} mm at ' in out
     arm = load_calibration(tmp_path / folder, UR)
     poses = workspace.in_base(arm.before, joints)
     np.testing.assert_allclose(poses[:, :3, 3], place + task[:, :3, 3], atol=1e-7)
