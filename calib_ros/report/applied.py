@@ -276,7 +276,12 @@ def verification_report(
     title = 'Accuracy before and after the correction'
     different = 'Different poses', f'{found.configurations:,}'
     accuracy = sections.accuracy_section(
-        title, found.comparison, poses.things, COMPUTED, intervals=False
+        title,
+        found.comparison,
+        poses.things,
+        COMPUTED,
+        intervals=False,
+        error=sections.OF_THE_PROGRAM if found.by_program else sections.ERROR,
     )
     return Report(
         kind='Verification of a calibrated arm',

@@ -21,10 +21,16 @@ from calib_ros.report.page import Origin, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.shown import rounded
 
+BOTH = (
+    'it contains both AP and RP of ISO 9283 (accuracy and repeatability), because each '
+    'measurement counts by itself. Sigma: standard deviation of the errors.'
+)
 ERROR = (
     'Error: distance between the target measured and where the model puts it. With this model in '
-    'the controller it contains both AP and RP of ISO 9283 (accuracy and repeatability), because '
-    'each measurement counts by itself. Sigma: standard deviation of the errors.'
+    f'the controller {BOTH}'
+)
+OF_THE_PROGRAM = (
+    f'Error: distance between the target measured and where the program intends it; {BOTH}'
 )
 LABELS = (
     *('RMS [mm]', '95 % interval [mm]', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
@@ -49,6 +55,7 @@ def accuracy_section(
     *text: str,
     with_outliers: ErrorFigures | None = None,
     intervals: bool = True,
+    error: str = ERROR,
 ) -> Section:
     """Return the accuracy table, before and after; `things` are counted."""
     columns = [
@@ -59,7 +66,7 @@ def accuracy_section(
         columns.append(_column('after, with outliers', with_outliers))
     labels = ('', things, *LABELS)
     head, *rows = (row for row in zip(labels, *columns, strict=True) if any(row[1:]))
-    return section('accuracy', title, *text, ERROR, head=head, rows=tuple(rows))
+    return section('accuracy', title, *text, error, head=head, rows=tuple(rows))
 
 
 def _column(label: str, found: ErrorFigures, between: str = '') -> tuple[str, ...]:

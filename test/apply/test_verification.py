@@ -18,7 +18,9 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
-from calib_ros.report.applied import _by_configuration
+from calib_ros.report.applied import _by_configuration, verification_report
+from calib_ros.report.page import Origin
+from calib_ros.report.poses import poses_to_verify
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'sigma)']
@@ -204,6 +206,9 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
     for each, word in ((found, 'repeatability'), (alone, 'scatter')):
         assert f'after   {word} (mean + 3 sigma)' in in_words(each)
         assert ('AP after [mm]' in str(_by_configuration(each))) is each.by_program
+        poses = poses_to_verify(arm.chain, [seen], each.comparison)
+        page = verification_report(UR, each, poses, Origin())
+        assert ('where the program intends it' in str(page.accuracy)) is each.by_program
 
 
 @pytest.mark.parametrize(('scale', 'told'), [(1.0, False), (1e3, True)])
