@@ -79,23 +79,6 @@ def poses_of(path, *sources):
     return se3.transform(observations.rotations, observations.positions), session
 
 
-@storages
-@pytest.mark.parametrize('with_robot', [False, True])
-def test_a_link_between_two_frames_is_a_measurement(tmp_path, rng, storage, with_robot):
-    expected = [frame(rng) for _ in TIMES]
-    moving = [tf(link('world', 'tool', ms * MS, t)) for ms, t in zip(TIMES, expected, strict=True)]
-    path = record(tmp_path / 'bag', events(rng, moving, with_robot=with_robot), storage)
-    found, session = poses_of(path)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-    (sample, *_) = session.samples
-    assert (sample.frame_id, sample.target) == ('world', 'tool')
-    assert [each.stamp_ns for each in session.samples] == [ms * MS for ms in TIMES]
-    joints = session.problem().observations.joints
-    np.testing.assert_allclose(joints, [[0.1, 0.2, 0.3]] * len(TIMES), atol=1e-15)
-    assert session.account().poses == len(TIMES)
-    assert session.account().dropped == session.account().unused == {}
-
-
 CHAINS = {
     'direct': ([], [('world', 'tool')]),
     'turned round': ([], [('tool', 'world')]),
@@ -301,22 +284,6 @@ def test_one_by_one_is_as_good_as_by_the_batch(rng, little_endian):
     for a, b in zip(found.samples, expected.samples, strict=True):
         np.testing.assert_allclose(a.position, b.position, rtol=0, atol=1e-14)
         assert a.stamp_ns == b.stamp_ns
-
-
-def test_messages_are_read_whatever_stands_between_their_names(rng):
-    """Serialisers leave bytes of any kind where numbers are aligned."""
-    message = tf(link('world', 'tool', 105 * MS, frame(rng)), link('a', 'bc', 7, frame(rng)))
-    data = bytes(TYPESTORE.serialize_cdr(message, TRANSFORMS))
-    (one,) = alike(TRANSFORMS, [data], {})
-    assert tuple(item.strings for item in one.layout.items) == (('world', 'tool'), ('a', 'bc'))
-    other = bytearray(data)
-    gap = data.index(b'world\0') + 6
-    other[gap : gap + 2] = b'\xff\xff'
-    (both,) = alike(TRANSFORMS, [data, bytes(other)], {})
-    assert both.which.tolist() == [0, 1]
-    stamps, _, numbers = both.of(1)
-    assert stamps.tolist() == [7, 7]
-    np.testing.assert_array_equal(numbers[0], numbers[1])
 
 
 @pytest.mark.parametrize('cut', range(4, 130, 7))
