@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from designs import POSTURE, SIGMAS, arm, design_of, predicted_square, some
 
+from calib_ros import CalibrationSession, Problem, identify, load_chain
 from calib_ros.apply import planning, simulation
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
@@ -22,13 +23,9 @@ from calib_ros.apply.planning import choose
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import observability
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.sampling.live import LiveEstimate
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.session import CalibrationSession
 
 
 @pytest.mark.parametrize(

@@ -25,12 +25,9 @@ from urdfs import (
     some_joints,
 )
 
+from calib_ros import Problem, chain_from_urdf, corrected_urdf, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 
 def stripped(text):
