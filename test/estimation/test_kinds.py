@@ -10,6 +10,7 @@ from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.validation import residuals
 from calib_ros.errors import InputError
+from calib_ros.kinematics import se3
 
 EXACT = 1e-9
 
@@ -50,6 +51,23 @@ def assert_exact(found, *unseen):
         position, turn = worst(found, each)
         assert position < EXACT
         assert turn < EXACT
+
+
+@pytest.mark.parametrize('seed', range(2))
+def test_distances_alone_find_the_arm_up_to_a_turn_of_the_world(seed):
+    """Neither base nor tool is known; turning the cell about the wire's exit changes nothing."""
+    rng = np.random.default_rng(seed)
+    true = faulty(UR10E, Cell(), rng)
+    result = identify(Problem(UR10E, wire(true, 150, rng)))
+    assert result.converged
+    assert result.rank == 27 - 3
+    assert {f'base.r{axis}' for axis in 'xyz'} <= set(result.unidentifiable)
+    assert {f'tool.r{axis}' for axis in 'xyz'} <= set(result.unidentifiable)
+    assert not result.not_excited
+    q = UR10E.random_joints(200, rng)
+    found, wanted = (chain.forward(q)[:, :3, 3] for chain in (result.chain, true))
+    turn = se3.nearest_rotation(wanted.T @ found)
+    np.testing.assert_allclose(found @ turn.T, wanted, rtol=0, atol=1e-8)
 
 
 def test_distances_with_a_known_base_leave_no_gauge_of_the_world(rng):

@@ -64,6 +64,20 @@ def still_joint(name, seed):
     return start, names, problem.system(problem.sets)
 
 
+def test_a_long_curved_valley_is_followed_to_its_end():
+    """Condition 3e4: the best parameters are far away, and steps must be short."""
+    start, names, system = still_joint('kuka_iiwa14', 1)
+    fit = minimise(start, names, system)
+    assert fit.converged
+    assert 50 < fit.iterations < 400
+    early = minimise(start, names, system, iterations=50)
+    assert not early.converged
+    assert fit.normal.cost < (1.0 - 1e-3) * early.normal.cost
+    again = normal_equations(fit.chain, names, system)
+    left = np.linalg.solve(again.matrix, again.gradient)
+    assert left @ again.gradient < 1e-9 * again.cost
+
+
 def test_steps_that_go_to_and_fro_are_damped(monkeypatch):
     """Undamped steps on x^2 + (1 + 0.6 x^2)^2 end in going from x to -x and back."""
     start, names, system = still_joint('ur10e', 0)

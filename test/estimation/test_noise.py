@@ -81,6 +81,21 @@ def test_sigmas_are_consistent_as_far_as_a_chi_squared_test_says(part, level, in
         np.testing.assert_allclose(uncertainty.freedom, [*estimated, np.inf], rtol=1e-4)
 
 
+def test_pairs_of_a_configuration_that_share_their_error_count_once():
+    """Three of each: the sums of their residuals are three times as large as if independent."""
+    rng = np.random.default_rng(1)
+    once = measure(UR10E, UR10E.random_joints(40, rng), rng, *NOISE)
+    first, plain, *_ = found(once)
+    noise, uncertainty, _, _, squares, freedom = found(once.select(np.repeat(np.arange(40), 3)))
+    np.testing.assert_allclose(squares / freedom, [noise.position**2, noise.orientation**2])
+    ratio = np.diag(uncertainty.covariance) / np.diag(plain.covariance)
+    # residuals of as many degrees of freedom as 120 pairs would leave are taken for the size
+    np.testing.assert_allclose(np.sqrt(ratio), 1.0, atol=0.15)
+    taken = 360.0 - freedom
+    np.testing.assert_allclose(uncertainty.freedom[:2], 120.0 - taken, rtol=1e-6)
+    assert first.size == pytest.approx(noise.size / np.sqrt(3.0), rel=0.2)
+
+
 def test_a_prior_is_as_uncertain_as_it_says_whatever_the_noise():
     """Weighed by three times the noise given, its own variance is what it was."""
     rng = np.random.default_rng(3)

@@ -80,3 +80,14 @@ def test_a_joint_that_nobody_shows_to_stand_does_not():
     fill(made, [(250, (0.0,))], (1,))
     fill(made, [(ms, (0.0,)) for ms in range(0, 600, 10)], (0,))
     assert made.standing(5e-4, 0.1).tolist() == []
+
+
+def test_a_joint_that_stands_at_half_a_turn_stands(rng):
+    """A driver that counts within one turn reports it now as pi, now as -pi."""
+    angles = np.pi + rng.normal(scale=1e-5, size=100)
+    angles = (angles + np.pi) % (2.0 * np.pi) - np.pi
+    assert np.ptp(angles) > 6.0
+    samples = [(10 * k, (angle, 0.0)) for k, angle in enumerate(angles)]
+    for revolute in (True, False):
+        made = filled(samples, revolute=(revolute, True))
+        assert (made.standing(5e-4, 0.1).tolist() == [[0, 990 * MS]]) is revolute

@@ -60,6 +60,22 @@ def test_spikes_are_left_out_and_no_others(rng, share, sigma_given):
     assert set(np.flatnonzero(~used)) == set(hit)
 
 
+@pytest.mark.parametrize('share', [0.1, 0.2])
+def test_of_many_spikes_none_is_used(share):
+    """Others may go with them, as spikes close together look like vibration; few are refused."""
+    refused = 0
+    for seed in range(200):
+        values, hit = with_spikes(np.random.default_rng(seed), share)
+        found = average(values)
+        if found is None:
+            refused += 1
+            continue
+        used, mean, _ = found
+        assert not used[hit].any()
+        assert np.linalg.norm(mean - PLACE) < 5.0 * SIGMA * np.sqrt(3.0 / used.sum())
+    assert refused < 10
+
+
 @pytest.mark.parametrize('at', range(1, 60))
 def test_two_places_are_never_averaged(rng, at):
     """A few at another place are left out; where the larger part is not clear it is refused."""
@@ -148,6 +164,22 @@ def test_few_measurements_are_taken_as_they_are(count):
     used, mean, _ = average(values)
     assert used.all()
     np.testing.assert_allclose(mean, values.mean(axis=0))
+
+
+def test_each_stop_is_averaged_by_itself(rng):
+    """As those before and after it were not there, and one that spreads costs no other."""
+    counts = [1, 30, 2, 40, 3, 30]
+    parts = [noisy(rng, count) for count in counts]
+    parts[1][7] += 0.1
+    parts[3] += np.linspace(0.0, 20.0 * SIGMA, 40)[:, np.newaxis]
+    begins = np.cumsum([0, *counts[:-1]])
+    found = averages(np.concatenate(parts), begins, np.full(len(counts), SIGMA))
+    assert found.rests.tolist() == [True, True, True, False, True, True]
+    for k in np.flatnonzero(found.rests).tolist():
+        used, mean, spread = average(parts[k])
+        np.testing.assert_array_equal(found.used[begins[k] :][: counts[k]], used)
+        np.testing.assert_array_equal(found.values[k], mean)
+        assert found.spreads[k] == spread
 
 
 def test_the_limit_of_the_spread_is_beyond_chance(rng):

@@ -44,6 +44,17 @@ def measured():
     return standing([pose_stamped((100 * k + 5) * MS, (k, 2, 3)) for k in range(1, 9)], '/tracker')
 
 
+@storages
+@pytest.mark.parametrize('node', ['/calibration_node', '/cell_1/left/calibration', '/c'])
+def test_what_a_node_publishes_is_neither_measured_nor_a_joint_state(tmp_path, storage, node):
+    plain = observations_of(record(tmp_path / 'plain', measured(), storage))
+    path = record(tmp_path / 'all', [*outputs(node), *measured()], storage)
+    mixed = observations_of(path)
+    assert mixed.positions.tolist() == plain.positions.tolist()
+    assert mixed.joints.tolist() == plain.joints.tolist()
+    assert len(mixed) == 8
+
+
 def test_two_nodes_are_both_left_out(tmp_path):
     events = [*outputs('/left/calibration_node'), *outputs('/right/calib'), *measured()]
     assert len(observations_of(record(tmp_path / 'bag', events))) == 8

@@ -289,3 +289,23 @@ def test_release_keeps_the_last_sample_and_the_signs():
     np.testing.assert_array_equal(came(made, 90), [[1.0, -1.0]])
     made.release(500 * MS)
     assert made.horizon_ns == 1000 * MS
+
+
+@pytest.mark.parametrize('capacity', [1, 2, 3, 4, 5, 100])
+def test_a_full_track_is_halved(capacity):
+    made = track(capacity=capacity)
+    taken = gone = 0
+    for k in range(500):
+        if not made.room(BOTH):
+            made.sort()
+            gone += made.halve()
+        assert made.room(BOTH) or capacity == 1
+        if made.room(BOTH):
+            add(made, BOTH, k * MS, np.zeros(2))
+            taken += 1
+    made.sort()
+    held, _ = made.samples()
+    assert len(held) == taken - gone
+    assert held.tolist() == [k * MS for k in range(500 - len(held), 500)] or capacity == 1
+    if capacity > 3:
+        assert capacity // 2 <= len(held) <= capacity

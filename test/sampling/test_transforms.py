@@ -286,6 +286,22 @@ def test_one_by_one_is_as_good_as_by_the_batch(rng, little_endian):
         assert a.stamp_ns == b.stamp_ns
 
 
+def test_messages_are_read_whatever_stands_between_their_names(rng):
+    """Serialisers leave bytes of any kind where numbers are aligned."""
+    message = tf(link('world', 'tool', 105 * MS, frame(rng)), link('a', 'bc', 7, frame(rng)))
+    data = bytes(TYPESTORE.serialize_cdr(message, TRANSFORMS))
+    (one,) = alike(TRANSFORMS, [data], {})
+    assert tuple(item.strings for item in one.layout.items) == (('world', 'tool'), ('a', 'bc'))
+    other = bytearray(data)
+    gap = data.index(b'world\0') + 6
+    other[gap : gap + 2] = b'\xff\xff'
+    (both,) = alike(TRANSFORMS, [data, bytes(other)], {})
+    assert both.which.tolist() == [0, 1]
+    stamps, _, numbers = both.of(1)
+    assert stamps.tolist() == [7, 7]
+    np.testing.assert_array_equal(numbers[0], numbers[1])
+
+
 @pytest.mark.parametrize('cut', range(4, 130, 7))
 def test_messages_that_are_cut_off_are_not_read(rng, cut):
     data = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
