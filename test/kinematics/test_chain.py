@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, strategies as st
 
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.joint import Frame
-from calib_ros.kinematics.parameter import DELAY
+from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS
 
 HALF = np.pi / 2
 
@@ -64,6 +65,15 @@ def test_a_nominal_beta_tilts_the_axis():
 def test_a_joint_ranges_over_its_limits_and_a_whole_stroke_without(kind, lower, upper, expected):
     found = Joint('j', kind, lower=lower, upper=upper).range
     assert found == pytest.approx(expected, abs=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_frame_moves_by_its_offsets(seed):
+    first, second = np.random.default_rng(seed).uniform(-1.0, 1.0, (2, 6))
+    start = Frame().moved(dict(zip(FRAME_KINDS, first, strict=True)))
+    moved = start.moved(dict(zip(FRAME_KINDS, second, strict=True)))
+    np.testing.assert_allclose(start.offsets(), first, atol=1e-12)
+    np.testing.assert_allclose(moved.offsets(start), second, atol=1e-12)
 
 
 def test_delays_of_a_frame_add_up():
