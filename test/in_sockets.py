@@ -7,12 +7,10 @@ from functools import cache
 
 import numpy as np
 
+from calib_ros import Observations, Problem, load_chain
 from calib_ros.apply.simulation import Cell, faulty
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 
 DISTANCE = 0.05

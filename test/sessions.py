@@ -6,11 +6,9 @@ import numpy as np
 from fits import NOISE, SIGMAS
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
+from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 UR5E = load_chain('ur5e')
 TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))

@@ -6,11 +6,8 @@ import functools
 
 import numpy as np
 
+from calib_ros import Calibration, Problem, identify, load_chain
 from calib_ros.apply import simulation
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import transform
 
 UR = load_chain('ur10e')

@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import copy
-import csv
 import re
 from dataclasses import replace
 
@@ -105,27 +104,6 @@ def test_the_whole_way_from_identification_to_program(run, tmp_path, oriented):
         np.linalg.norm(true.forward(each)[:, :3, 3] - wanted, axis=1) for each in (joints, q)
     )
     assert np.sqrt(np.mean(after**2)) < 2e-4 < 1e-3 < before.max()
-
-
-def test_a_table_is_corrected_and_its_other_columns_kept(run, tmp_path):
-    status, said, err = run(TABLE)
-    assert (status, err) == (0, '')
-    assert said.startswith('wrote out.csv: 2 of 2 points corrected, by ')
-    assert 'largest error by the calibration' in said
-    before, after = (
-        list(csv.DictReader((tmp_path / name).read_text().splitlines()))
-        for name in ('program.csv', 'out.csv')
-    )
-    assert [list(row) for row in after] == [list(row) for row in before]
-    for key in ('label', 'speed'):
-        assert [row[key] for row in after] == [row[key] for row in before]
-    columns = [f'q{k + 1}' for k in range(6)]
-    q, corrected = (
-        np.array([[float(row[key]) for key in columns] for row in rows])
-        for rows in (before, after)
-    )
-    expected = compensate(Compensator(UR, UR_TRUE), q).joints
-    np.testing.assert_allclose(corrected, expected, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize(('mark', 'name'), [(';', 'semicolon'), ('\t', 'tab')])

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from designs import POSTURE, SIGMAS, arm, design_of, log_det, predicted_square, some
+from designs import POSTURE, SIGMAS, arm, design_of, predicted_square, some
 
+from calib_ros import CalibrationSession, Problem, identify, load_chain
 from calib_ros.apply import planning, simulation
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
@@ -22,13 +23,9 @@ from calib_ros.apply.planning import choose
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import observability
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.sampling.live import LiveEstimate
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.session import CalibrationSession
 
 
 @pytest.mark.parametrize(
@@ -169,26 +166,6 @@ def test_distances_are_refused():
     lengths = np.linalg.norm(observations.positions, axis=1)
     with pytest.raises(InputError, match='not distances'):
         Design.of(Problem(chain, replace(observations, distances=lengths)))
-
-
-@pytest.mark.parametrize('oriented', [True, False])
-def test_worth_by_updates_equals_that_computed_anew(oriented):
-    chain = arm()
-    design = design_of(chain, oriented)
-    q, task = some(chain, 30), some(chain, 40, 2)
-    space = Candidates(design, q)
-    chosen = list(range(12))
-    so_far = space.known + information_of(space.rows[chosen])
-    by_det, by_task = (
-        planning._Worth(space, criterion, task).of(so_far, space.rows)
-        for criterion in ('d', 'task')
-    )
-    for k in (3, 20, 29):  # one of them a second time
-        more = np.concatenate([q[chosen], q[k : k + 1]])
-        anew = log_det(design, more) - log_det(design, q[chosen])
-        assert by_det[k] == pytest.approx(anew, rel=1e-6)
-        anew = predicted_square(design, q[chosen], task) - predicted_square(design, more, task)
-        assert by_task[k] == pytest.approx(anew, rel=1e-6)
 
 
 @pytest.mark.parametrize('criterion', ['o2', 'o3', 'o4', 'o5'])

@@ -6,14 +6,12 @@ import numpy as np
 import pytest
 from surveyed import DOWN, TASK, calibrated, identified
 
+from calib_ros import Calibration, Chain, Problem, identify
 from calib_ros.apply import simulation, workspace
 from calib_ros.apply.workspace import in_base, place, task_of
 from calib_ros.cli.workspace import _task
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.se3 import exp_rotation, transform
 from calib_ros.settings import MODELS
 

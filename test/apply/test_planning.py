@@ -10,17 +10,14 @@ from hypothesis import given, settings, strategies as st
 from robots import DATA, needs_data
 from scipy.spatial.distance import pdist
 
+from calib_ros import Chain, Problem, identify, load_chain, read_table
 from calib_ros.apply import planning
 from calib_ros.apply.candidates import visit_order
 from calib_ros.apply.design import Design, accuracy
 from calib_ros.apply.planning import choose
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.identifiability import observability
-from calib_ros.estimation.problem import Problem
-from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain import Joint
 
 POSITIONER = Chain(
     'positioner',

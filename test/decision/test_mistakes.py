@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import explained
 from calib_ros.decision.suspects import QUARTERS, dead
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame, Joint
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain import Frame, Joint
 
 UR = load_chain('ur10e')
 

@@ -8,13 +8,10 @@ import pytest
 import yaml
 from fits import UR10E, arm, rms
 
-from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.region import region_of_record
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.calibration import Calibration, load_calibration
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error

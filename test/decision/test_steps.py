@@ -9,15 +9,13 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, along_path
 
+from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import minimise
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
 from calib_ros.report.words import as_document, remarks
 

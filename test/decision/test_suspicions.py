@@ -8,13 +8,11 @@ import numpy as np
 import pytest
 from fits import SIGMAS, rms
 
+from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.suspicions import _common, _motion, scale_of
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain import Chain, Frame, Joint
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.report.words import as_document, summary
 
 UR = load_chain('ur10e')

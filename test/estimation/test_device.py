@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 from measured import bent
 
+from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.estimation.considered import bends
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 
 ARM = load_chain('ur10')
 SIGMA = 2e-4

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from fits import UR10E, arm, rms
 
+from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.estimation import evidence
 from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Posterior, _device, group_of
 from calib_ros.estimation.leastsquares import System
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.parameter import Parameter
 

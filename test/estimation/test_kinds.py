@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, fitted
 
+from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.validation import residuals
 from calib_ros.errors import InputError
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
 
 EXACT = 1e-9

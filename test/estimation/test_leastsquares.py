@@ -9,6 +9,7 @@ import pytest
 from fits import NO_PRIOR, UR10E, measured_arm
 from scipy.optimize import least_squares
 
+from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.validation import residuals
 from calib_ros.estimation import leastsquares
@@ -23,11 +24,8 @@ from calib_ros.estimation.leastsquares import (
     triangular_factor,
     without_each,
 )
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import BLOCK, Samples
 from calib_ros.estimation.start import start_frames
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, fitted, measured_arm
+from fits import NOISE, UR10E, measured_arm
 from scipy import stats
 
 from calib_ros.apply.simulation import measure
@@ -19,7 +19,6 @@ from calib_ros.estimation.leastsquares import (
     triangular_factor,
 )
 from calib_ros.estimation.noise import noise_of
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.shared_errors import Shared
 
@@ -47,22 +46,6 @@ def found(seen, sigmas=NOISE, weights=None, prior=None):
     number = 3.0 * (len(seen) if weights is None else weights.sum())
     freedom = np.array([number - np.trace(np.linalg.solve(matrix, each)) for each in shares])
     return noise, uncertainty, matrix, shares, squares, freedom
-
-
-def test_the_noise_is_the_root_of_squares_over_their_freedom():
-    *_, seen = measured_arm(0, 30)
-    weights = np.where(np.arange(30) % 5, 1.0, 0.25)
-    for given in (None, weights):
-        noise, _, _, _, squares, freedom = found(seen, weights=given)
-        expected = np.sqrt(squares / freedom)
-        assert (noise.position, noise.orientation) == pytest.approx(tuple(expected), rel=1e-6)
-        assert (noise.successive, noise.near, noise.widened) == (0.1, 0.2, 1.0)
-    rng = np.random.default_rng(0)
-    alone = measure(UR10E, UR10E.random_joints(30, rng), rng, *NOISE, oriented=False)
-    assert (
-        Problem(UR10E, alone, **SIGMAS).sigmas
-        == fitted(Problem(UR10E, alone, **SIGMAS)).noise.given
-    )
 
 
 @pytest.mark.parametrize('part', [0, 1])
@@ -111,30 +94,6 @@ def test_pairs_of_a_configuration_that_share_their_error_count_once():
     taken = 360.0 - freedom
     np.testing.assert_allclose(uncertainty.freedom[:2], 120.0 - taken, rtol=1e-6)
     assert first.size == pytest.approx(noise.size / np.sqrt(3.0), rel=0.2)
-
-
-def test_deviations_of_neighbours_that_share_errors_are_wider(monkeypatch):
-    """By the middle that they give for a part; the median of the ratio is told."""
-    *_, seen = measured_arm(2, 30)
-    wide = 9.0
-    _, plain, matrix, shares, *_ = found(seen)
-    middles = {0: wide * shares[0]}
-    monkeypatch.setattr(
-        noise_module, 'shared_errors', lambda *_: Shared(0.5, 0.0, ('near',), middles)
-    )
-    noise, uncertainty, matrix, shares, squares, freedom = found(seen)
-    inverse = np.linalg.inv(matrix)
-    size = max(squares[1] / freedom[1], 1.0) if noise.consistent else squares[1] / freedom[1]
-    expected = inverse @ (wide * shares[0] + size * shares[1]) @ inverse
-    np.testing.assert_allclose(uncertainty.covariance, expected, rtol=1e-5, atol=1e-16)
-    assert noise.shared == ('near',)
-    own = squares[0] / freedom[0]
-    own = max(own, 1.0) if noise.consistent else own
-    alone = inverse @ (own * shares[0] + size * shares[1]) @ inverse
-    ratio = np.median(np.sqrt(np.diag(expected) / np.diag(alone)))
-    assert noise.widened == pytest.approx(ratio, rel=1e-4)
-    assert plain.covariance.shape == uncertainty.covariance.shape
-    np.testing.assert_allclose(uncertainty.freedom[0], freedom[0], rtol=1e-6)
 
 
 def test_a_prior_is_as_uncertain_as_it_says_whatever_the_noise():

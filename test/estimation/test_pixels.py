@@ -12,19 +12,16 @@ import pytest
 from fits import rms
 from measured import rows_of, write_csv, write_images
 
+from calib_ros import Observations, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.mistakes import explained
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.leastsquares import System, products_of, stacked
-from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.pixels import PixelSamples
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import _from_homography, board_poses, resect
 from calib_ros.estimation.samples import seen_residuals
 from calib_ros.identification import identification
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
 
 UR = load_chain('ur5e')

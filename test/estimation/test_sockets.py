@@ -11,13 +11,11 @@ import pytest
 from fits import fitted
 from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 
+from calib_ros import Chain, Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame, Joint
+from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.report.words import summary
 
 

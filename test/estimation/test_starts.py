@@ -9,17 +9,15 @@ import numpy as np
 import pytest
 from fits import UR10E, worst_prediction
 
+from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.estimation import start, trimmed
 from calib_ros.estimation.leastsquares import Prior, System
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.start import _shortest, closed_forms, start_frames
 from calib_ros.estimation.trimmed import _Halves, _Linear, trimmed_sum
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import norms
 
 

@@ -10,20 +10,16 @@ import pytest
 from measured import write_csv
 from scipy import special
 
+from calib_ros import Chain, Observations, Problem, identify, load_chain, read_table
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.suspicions import _apart
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import System, triangular_factor
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.samples import Samples, residual_arrays
-from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain import Chain, Frame, Joint
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.kinematics.jacobian import ErrorModel
 
 UR = replace(load_chain('ur10e'), base=None, tool=None)

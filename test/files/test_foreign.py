@@ -10,14 +10,12 @@ import pytest
 from robots import DATA, needs_data
 from scipy.spatial.transform import Rotation
 
+from calib_ros import Chain, Settings, load_chain, read_table
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, load_layout
-from calib_ros.files.tables import read_table
-from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.settings import Settings
+from calib_ros.kinematics.chain import Joint
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])

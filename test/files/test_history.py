@@ -10,9 +10,9 @@ import pandas
 import pyarrow.dataset
 import pytest
 
+from calib_ros import Problem, Settings, identify, load_chain
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.estimation.problem import Problem
 from calib_ros.files.history import (
     Filing,
     History,
@@ -22,9 +22,6 @@ from calib_ros.files.history import (
     samples_hash,
     settings_hash,
 )
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.settings import Settings
 
 CHAIN = load_chain('ur10e')
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)

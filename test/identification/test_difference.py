@@ -9,15 +9,11 @@ import pytest
 from measured import bent
 from robots import DATA, needs_data
 
+from calib_ros import Calibration, Observations, Problem, difference, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import gauged
 from calib_ros.errors import InputError
-from calib_ros.estimation.observations import Observations
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.difference import difference
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain, parse_chain
+from calib_ros.kinematics.chain_file import parse_chain
 from calib_ros.kinematics.parameter import Parameter
 
 UR = load_chain('ur10e')

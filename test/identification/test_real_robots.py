@@ -11,11 +11,8 @@ import numpy as np
 import pytest
 from robots import DATA, needs_data
 
+from calib_ros import Problem, identify, load_chain, read_table
 from calib_ros.cli.main import main
-from calib_ros.estimation.problem import Problem
-from calib_ros.files.tables import read_table
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 
 pytestmark = needs_data
 

@@ -11,15 +11,12 @@ from fits import NOISE, SIGMAS, UR10E, rms
 from measured import rows_of, write_csv
 from robots import DATA, needs_data
 
+from calib_ros import Calibration, Problem, identify, load_chain, read_table, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Explanation
 from calib_ros.errors import InputError
-from calib_ros.estimation.problem import Problem
-from calib_ros.files.tables import read_table
-from calib_ros.identification.calibration import Calibration, parse_calibration
-from calib_ros.identification.identification import identify
-from calib_ros.identification.recalibration import recalibrate, years_since
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.identification.calibration import parse_calibration
+from calib_ros.identification.recalibration import years_since
 
 Q = UR10E.random_joints(300, np.random.default_rng(99))
 

@@ -14,7 +14,6 @@ from urdfs import (
     EXACT,
     IIWA,
     PANDA,
-    PI,
     SCARA,
     SEEDS,
     UR10E,
@@ -26,12 +25,9 @@ from urdfs import (
     some_joints,
 )
 
+from calib_ros import Problem, chain_from_urdf, corrected_urdf, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 
 def stripped(text):
@@ -135,30 +131,6 @@ def test_the_nominal_ends_are_kept(rng):
 
 def origin_of(text, joint):
     return ET.fromstring(text).find(f'joint[@name="{joint}"]/origin').attrib
-
-
-def flipped(chain, i):
-    """Return the same arm with z of frame i - 1 turned over, and the sign of joint i with it."""
-    joints = list(chain.joints)
-    before, joint = joints[i - 1], joints[i]
-    joints[i - 1] = replace(before, alpha=before.alpha + PI)
-    joints[i] = replace(
-        joint, theta=-joint.theta, d=-joint.d, alpha=joint.alpha - PI, sign=-joint.sign
-    )
-    return replace(chain, joints=tuple(joints), parallel=None)
-
-
-@pytest.mark.parametrize('turned', [None, 1, 2, 3, 4])
-def test_the_chain_may_come_from_an_equal_table(turned, rng):
-    shipped = load_chain('ur10e')
-    chain = shipped if turned is None else flipped(shipped, turned)
-    q = some_joints(chain, rng, 10)
-    np.testing.assert_allclose(chain.forward(q), shipped.forward(q), atol=1e-13)
-    chain = chain.with_offsets(random_offsets(chain, rng))
-    nominal = chain_from_urdf(UR10E)
-    expected = nominal.base.matrix @ chain.forward(q) @ nominal.tool.matrix
-    found = poses_of(corrected_urdf(UR10E, chain), chain, q)
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=EXACT)
 
 
 def test_a_chain_of_another_arm_is_refused():

@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commanded import numeric_jacobian, twist
-from hypothesis import given, strategies as st
+from commanded import twist
 
 from calib_ros.apply import simulation
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, shipped_robots
 from calib_ros.kinematics.inverse import limits, solve
-from calib_ros.kinematics.newton import solve_positive
 from calib_ros.values import SAME
 
 
@@ -34,19 +32,6 @@ def test_poses_are_reached_from_nearby(robot, rng):
     if len(chain.joints) < 7:
         near = np.abs(found.joints - q).max(axis=1)[found.converged]
         assert np.mean(near < 1e-4) > 0.9
-
-
-def test_redundant_arms_move_as_little_as_needed(rng):
-    """The step to a pose close by is orthogonal to the motion that leaves the pose alone."""
-    chain = load_chain('kuka_iiwa14')
-    q = chain.random_joints(200, rng) * 0.7
-    wanted = chain.forward(q + rng.normal(scale=1e-4, size=q.shape))
-    found = solve(chain, wanted, q)
-    step = found.joints - q
-    assert found.converged.all()
-    free = np.linalg.svd(numeric_jacobian(chain, q))[2][:, -1]
-    along = np.abs(np.einsum('ni,ni->n', step, free))
-    assert np.median(along / np.linalg.norm(step, axis=1)) < 1e-2
 
 
 def test_non_geometric_effects_are_taken_into_account(rng):
@@ -103,16 +88,3 @@ def test_each_pose_is_solved_as_if_alone(rng):
         assert alone.converged[0] == together.converged[k]
         if alone.converged[0]:
             np.testing.assert_allclose(alone.joints[0], together.joints[k], atol=1e-6)
-
-
-@given(st.integers(1, 8), st.integers(0, 1000))
-def test_elimination_solves(size, seed):
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(size, size, 4))
-    matrix = np.einsum('ikb,jkb->ijb', root, root) + 0.1 * np.eye(size)[:, :, None]
-    right = rng.normal(size=(size, 4))
-    before = matrix.copy(), right.copy()
-    expected = [np.linalg.solve(matrix[..., k], right[:, k]) for k in range(4)]
-    np.testing.assert_allclose(solve_positive(matrix, right).T, expected, rtol=1e-8, atol=1e-10)
-    np.testing.assert_array_equal(matrix, before[0])
-    np.testing.assert_array_equal(right, before[1])

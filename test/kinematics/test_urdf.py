@@ -16,7 +16,6 @@ from urdfs import (
     SCARA,
     SEEDS,
     UR10E,
-    UR10E_ORIGINS,
     ZERO,
     Z,
     numbers,
@@ -24,7 +23,6 @@ from urdfs import (
     random_arm,
     reference_forward,
     some_joints,
-    ur10e,
     written,
 )
 
@@ -89,25 +87,6 @@ def test_panda_has_the_table_of_its_maker():
     assert chain.joints == load_chain('franka_panda').joints
     np.testing.assert_array_equal(chain.base.matrix, np.eye(4))
     np.testing.assert_allclose(chain.tool.matrix, np.eye(4), atol=1e-15)
-
-
-@pytest.mark.parametrize('convention', CONVENTIONS)
-@pytest.mark.parametrize('tilt', [1e-12, 1e-6, 1e-3, 1e-2])
-def test_a_calibrated_ur_has_no_absurd_lengths(convention, tilt, rng):
-    origins = [
-        (xyz + rng.normal(scale=min(tilt, 1e-3), size=3), rpy + rng.normal(scale=tilt, size=3))
-        for xyz, rpy in UR10E_ORIGINS
-    ]
-    text = ur10e(origins)
-    chain = chain_from_urdf(text, convention=convention)
-    q = some_joints(chain, rng, 20)
-    np.testing.assert_allclose(chain.forward(q), poses_of(text, chain, q), rtol=0.0, atol=EXACT)
-    assert chain.parallel == chain_from_urdf(UR10E, convention=convention).parallel
-    assert len(chain.parallel) == 2
-    nominal = chain_from_urdf(UR10E, convention=convention)
-    change = np.abs(chain.table - nominal.table)
-    assert change[:, [0, 2]].max() < 5.0 * max(tilt, 1e-9)
-    assert change[:, [1, 3, 4]].max() < 20.0 * max(tilt, 1e-9)
 
 
 @given(angle=st.floats(0.0, 0.2), heading=st.floats(-PI, PI), half=st.booleans(), seed=SEEDS)

@@ -9,11 +9,9 @@ import pytest
 from measured import UR, measured
 from pages import page_of, report_of
 
+from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import simulation
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import advice
 
 

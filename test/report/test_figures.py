@@ -10,18 +10,15 @@ from measured import TRUE
 from pages import page_of, problem_of, report_of
 from plotly import graph_objects
 
+from calib_ros import Observations, Settings, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
 from calib_ros.decision.validation import compare
-from calib_ros.estimation.observations import Observations
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.report.figures import against_noise, coverage, cumulated, drives
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.settings import Settings
 
 UR10E = load_chain('ur10e')
 WAVES = tuple(f'shoulder_lift_joint.{wave}_17' for wave in ('sin', 'cos'))

@@ -14,13 +14,10 @@ from measured import TEST, TRAIN, TRUE, UR, measured
 from pages import Page, page_of, problem_of, report_of
 from plotly import graph_objects
 
+from calib_ros import Calibration, Problem, identify, verify
 from calib_ros.apply import simulation
-from calib_ros.apply.verification import verify
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.estimation.problem import Problem
-from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import verification_report, workspace_report

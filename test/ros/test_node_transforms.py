@@ -19,15 +19,12 @@ from recorded import write
 from ros_cell import LATCHED, Cell, assert_same, direct, header, joint_messages, stamp_ns
 from tf2_msgs.msg import TFMessage
 
+from calib_ros import CalibrationSession, Settings, load_chain, replay
 from calib_ros.errors import ConfigError
-from calib_ros.files.bags import replay
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros.inputs import Hearing, deserialised
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, parse_sources
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 TYPES = {'/tf': TRANSFORMS, '/tf_static': TRANSFORMS, '/joint_states': JOINT_STATE}
 SOURCE = '/tf parent=tracker child=tool'

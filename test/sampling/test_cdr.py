@@ -84,19 +84,6 @@ def joint_blob(names, positions, frame_id='', stamp_ns=10**9, velocities=()):
     return bytes(TYPESTORE.serialize_cdr(given_, JOINT_STATE))
 
 
-def test_messages_of_one_length_are_told_apart_by_their_names():
-    one, other = joint_blob(['a', 'b'], [1.0, 2.0]), joint_blob(['b', 'a'], [1.0, 2.0])
-    in_frame = joint_blob(['a', 'b'], [1.0, 2.0], 'x')
-    assert len(one) == len(other) == len(in_frame)
-    known = {}
-    for _ in range(2):
-        found = alike(JOINT_STATE, [one, other, one, in_frame], known)
-        assert [each.which.tolist() for each in found] == [[0, 2], [1], [3]]
-        strings = [('', 'a', 'b'), ('', 'b', 'a'), ('x', 'a', 'b')]
-        assert [each.of(0).strings for each in found] == strings
-    assert [len(each) for each in known.values()] == [3]
-
-
 def test_of_more_layouts_than_there_are_names_the_others_are_left():
     blobs = [joint_blob([f'{k:03d}'], [float(k)]) for k in range(60)]
     found = alike(JOINT_STATE, blobs, {})

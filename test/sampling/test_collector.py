@@ -109,21 +109,6 @@ def test_joints_are_those_of_the_time_of_the_measurements():
 # Every measurement
 
 
-def test_in_continuous_mode_every_measurement_is_a_sample():
-    motion = sweep(2, np.random.default_rng(2))
-    made = collector(mode='continuous')
-    samples = play(made, joint_events(motion, 5.1), pose_events(motion, 5.0))
-    assert len(samples) == 250
-    times = np.array([1e-9 * (each.stamp_ns - START) for each in samples])
-    joints = np.array([each.joints for each in samples])
-    np.testing.assert_allclose(joints[1:], motion(times[1:]), atol=1e-6)
-    speed = (motion(times + 1e-5) - motion(times - 1e-5)) / 2e-5
-    inner = slice(2, -2)
-    np.testing.assert_allclose([s.velocity for s in samples][inner], speed[inner], atol=1e-3)
-    assert {each.count for each in samples} == {1}
-    assert made.dropped == made.unused == {}
-
-
 def test_in_continuous_mode_samples_come_while_the_arm_moves():
     motion = sweep(2, np.random.default_rng(2))
     made = collector(mode='continuous', lateness=0.3)

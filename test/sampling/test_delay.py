@@ -10,11 +10,9 @@ from hypothesis import given, strategies as st
 from scipy.signal import find_peaks
 from streams import START, S, hear, stamps, stops, sweep
 
+from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.delay import LEAST_MOTION, find_delay, peaks
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 UR10E = load_chain('ur10e')
 NOISE = (5e-5, 2e-4)

@@ -10,14 +10,12 @@ import pytest
 from sessions import session
 from streams import POSE, START, TRACKER, S, hear, pose, stamps, stops, sweep, take
 
+from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import PICTURES, Readings, Source
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 UR5E = load_chain('ur5e')
 TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from recorded import TYPESTORE, joint_state, point_stamped, pose_stamped
 
+from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
-from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.intake import Stream, feed
 from calib_ros.sampling.messages import JOINT_STATE, Source
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 ARM = load_chain('ur10e')
 POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'

@@ -7,13 +7,11 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E
 from sessions import seen
 
+from calib_ros import CalibrationSession, Chain, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, random_frame
-from calib_ros.identification.identification import identify
-from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain import Joint
 from calib_ros.sampling import live as live_module
 from calib_ros.sampling.live import START, LiveEstimate, barely_moved
-from calib_ros.sampling.session import CalibrationSession
-from calib_ros.settings import Settings
 
 
 def session(**settings):

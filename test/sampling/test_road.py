@@ -19,11 +19,9 @@ from streams import (
     take,
 )
 
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.sampling.road import STRAY, Gate
-from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
-from calib_ros.settings import Settings
 
 ARM = load_chain('ur5e')
 POSE_KEY = StreamKey('', '', False, False, False)

@@ -8,7 +8,6 @@ from hypothesis import given, strategies as st
 from tracked import BOTH, MAX_GAP, MS, add, at, came, causes, fill, filled, track
 
 from calib_ros.sampling.interpolation import MOVED
-from calib_ros.sampling.slices import Rows
 from calib_ros.sampling.track import CAUSES
 
 
@@ -310,17 +309,3 @@ def test_a_full_track_is_halved(capacity):
     assert held.tolist() == [k * MS for k in range(500 - len(held), 500)] or capacity == 1
     if capacity > 3:
         assert capacity // 2 <= len(held) <= capacity
-
-
-def test_rows_grow_beyond_their_first_block_and_keep_their_order():
-    count = 3000
-    rows = Rows(1, count)
-    order = list(range(count))
-    random.Random(1).shuffle(order)
-    for k in order:
-        assert not rows.full
-        rows.extend(np.array([k]), np.array([[0.5 * k]]))
-    assert rows.full
-    assert rows.sort() == 0
-    np.testing.assert_array_equal(rows.stamps, np.arange(count))
-    np.testing.assert_array_equal(rows.values[:, 0], 0.5 * np.arange(count))

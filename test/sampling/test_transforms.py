@@ -79,23 +79,6 @@ def poses_of(path, *sources):
     return se3.transform(observations.rotations, observations.positions), session
 
 
-@storages
-@pytest.mark.parametrize('with_robot', [False, True])
-def test_a_link_between_two_frames_is_a_measurement(tmp_path, rng, storage, with_robot):
-    expected = [frame(rng) for _ in TIMES]
-    moving = [tf(link('world', 'tool', ms * MS, t)) for ms, t in zip(TIMES, expected, strict=True)]
-    path = record(tmp_path / 'bag', events(rng, moving, with_robot=with_robot), storage)
-    found, session = poses_of(path)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
-    (sample, *_) = session.samples
-    assert (sample.frame_id, sample.target) == ('world', 'tool')
-    assert [each.stamp_ns for each in session.samples] == [ms * MS for ms in TIMES]
-    joints = session.problem().observations.joints
-    np.testing.assert_allclose(joints, [[0.1, 0.2, 0.3]] * len(TIMES), atol=1e-15)
-    assert session.account().poses == len(TIMES)
-    assert session.account().dropped == session.account().unused == {}
-
-
 CHAINS = {
     'direct': ([], [('world', 'tool')]),
     'turned round': ([], [('tool', 'world')]),
