@@ -12,7 +12,9 @@ hold the truth: per parameter, and for predicted positions at poses that were no
 ones, so that the noise is found from the residuals.
 
 `incomplete`: arms with an effect that the model lacks, 60 full poses, default sigmas; the coverage
-of positions, and the median ratio of actual to stated RMS error of positions over the joint range.
+of parameters and of positions, and the median ratio of actual to stated RMS error of positions
+over the joint range. `claimed`: share of these arms of which `compare` claims a change after a
+second session at other poses.
 """
 
 import argparse
@@ -28,6 +30,8 @@ from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.leastsquares import triangular_factor
 from calib_ros.estimation.problem import Problem
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.difference import difference
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain_file import load_chain
@@ -58,13 +62,18 @@ def one_run(nominal, seed, oriented, poses, told=1.0):
     bound = identifiability.covariance(
         triangular_factor(true, result.names, problem.system([seen]))
     )
-    deviation = np.array([result.chain.offset(name, true) for name in result.names])
-    width = {p.name: p.half_width() / p.std for p in result.parameters if p.std is not None}
-    limit = np.array([width[name] for name in result.names])
-    hits = np.abs(deviation) <= limit * np.sqrt(np.diag(result.covariance))
+    deviation, hits = off(result, true)
     unseen = nominal.random_joints(50, rng)
     error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
     return deviation**2 / np.diag(bound), hits, within(result, unseen, error)
+
+
+def off(result, true):
+    """Return how far (P,) parameters are from the true ones, and whether within their limits."""
+    deviation = np.array([result.chain.offset(name, true) for name in result.names])
+    width = {p.name: p.half_width() / p.std for p in result.parameters if p.std is not None}
+    limit = np.array([width[name] for name in result.names])
+    return deviation, np.abs(deviation) <= limit * np.sqrt(np.diag(result.covariance))
 
 
 def lacking(kind, true, rng):
@@ -97,21 +106,31 @@ def lacking(kind, true, rng):
 
 
 def incomplete(nominal, kind, seed, poses=60):
-    """Return hits of positions (M,), their RMS error, and that stated [m]."""
+    """Return hits of parameters (P,) and positions (M,), whether a change is claimed, and errors.
+
+    These are RMS errors of positions [m], actual and stated.
+    """
     rng = np.random.default_rng([seed, LACKING.index(kind)])
     true = faulty(nominal, Cell(), rng)
-    off, q = lacking(kind, true, rng), nominal.random_joints(poses + 1, rng)
-    seen = measure(true, q[1:], rng, SIGMA_POSITION, SIGMA_ORIENTATION)
-    more = off(q[1:], np.sign(np.diff(q, axis=0)))
-    turned = se3.exp_rotation(more[:, 3:]) @ seen.rotations
-    seen = replace(seen, positions=seen.positions + more[:, :3], rotations=turned)
-    result = identify(Problem(nominal, seen, held_out=seen.select(np.arange(2))))
+    moved = lacking(kind, true, rng)
+
+    def session():
+        q = nominal.random_joints(poses + 1, rng)
+        seen = measure(true, q[1:], rng, SIGMA_POSITION, SIGMA_ORIENTATION)
+        more = moved(q[1:], np.sign(np.diff(q, axis=0)))
+        turned = se3.exp_rotation(more[:, 3:]) @ seen.rotations
+        seen = replace(seen, positions=seen.positions + more[:, :3], rotations=turned)
+        return identify(Problem(nominal, seen, held_out=seen.select(np.arange(2))))
+
+    result = session()
+    claimed = not difference(Calibration.of(result), Calibration.of(session())).same
     unseen = nominal.random_joints(50, rng)
     error = (result.chain.forward(unseen) - true.forward(unseen))[:, :3, 3]
-    error -= off(unseen, rng.choice([-1.0, 1.0], unseen.shape))[:, :3]
+    error -= moved(unseen, rng.choice([-1.0, 1.0], unseen.shape))[:, :3]
     stated = np.trace(result.pose_covariance(unseen)[:, :3, :3], axis1=1, axis2=2).mean()
     actual = np.mean((error**2).sum(axis=1))
-    return within(result, unseen, error), np.sqrt(actual), np.sqrt(stated)
+    hits = off(result, true)[1], within(result, unseen, error)
+    return *hits, claimed, np.sqrt(actual), np.sqrt(stated)
 
 
 def within(result, q, error):
@@ -152,9 +171,11 @@ def main():
     found['incomplete'] = {}
     for kind in LACKING:
         rows = [incomplete(nominal, kind, seed) for seed in range(runs // 10)]
-        hits, actual, stated = (np.array(column) for column in zip(*rows, strict=True))
+        hits, places, claimed, actual, stated = map(np.array, zip(*rows, strict=True))
         found['incomplete'][kind] = {
-            'positions': float(hits.mean()),
+            'parameters': float(hits.mean()),
+            'positions': float(places.mean()),
+            'claimed': float(claimed.mean()),
             'ratio': float(np.median(actual / stated)),
         }
     if options.json:
@@ -165,7 +186,7 @@ def main():
         print(f'{kind:9} MSE / CRLB {found["mse_over_crlb"][kind]:.3f}; 95 % coverage: {coverage}')
     few = found['few_unknown_noise']
     for kind, row in found['incomplete'].items():
-        print(f'{kind:9} lacking: coverage {row["positions"]:.3f}, ratio {row["ratio"]:.2f}')
+        print(f'{kind:9} lacking:', ', '.join(f'{k} {v:.3f}' for k, v in row.items()))
     print(f'few, noise unknown: coverage {few["parameters"]:.3f}, {few["positions"]:.3f}')
 
 

@@ -239,9 +239,9 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
 class Uncertainty(Shown):
     """Covariance of the fitted parameters, by source of error.
 
-    `parts` (K, P, P) belong to position, orientation, priors, and parameters held at nominal, or
-    to all of these; `freedom` (K,) are the degrees of freedom of each, infinite if the noise is
-    known.
+    `parts` (K, P, P) belong to position, orientation and priors, or to all of these, to parameters
+    held at nominal, and to what no parameter explains; `freedom` (K,) are the degrees of freedom
+    of each, infinite if the noise is known.
     """
 
     parts: FloatArray
@@ -251,6 +251,11 @@ class Uncertainty(Shown):
     def covariance(self) -> FloatArray:
         """Return the covariance (P, P) by all sources."""
         return np.asarray(self.parts.sum(axis=0))
+
+    def with_part(self, part: FloatArray) -> Uncertainty:
+        """Return the uncertainty with a further source (P, P) of known size."""
+        parts = np.concatenate([self.parts, part[np.newaxis]])
+        return Uncertainty(parts, np.append(self.freedom, np.inf))
 
     @property
     def overall(self) -> float:

@@ -12,6 +12,11 @@ of its covariance, its residuals r have the covariance B V B + B - B^2, B = I - 
 K holds the products, stop by stop, of the columns of turns of all joints about their axes, or of
 tilts. If a test finds r^T K r larger than white noise allows, sizes v >= 0 equate these forms with
 their expected values (MINQUE, Rao 1971).
+
+They move the fitted parameters too. Turns, as of gears, average out like noise. Tilts, as of
+bearings, change slowly with the value of their joint, as exp(-distance) on the unit circle [m if
+prismatic], and add H^-1 (J^T v_3 K J) H^-1. Considered effects (`evidence.py`) of expected squares
+S add G S G^T if the fitted parameters follow them by G.
 """
 
 from __future__ import annotations
@@ -20,13 +25,16 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy import special
+from scipy.spatial.distance import cdist
 
 from calib_ros.estimation.evidence import Posterior, turns_and_tilts
+from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.shared_errors import gathered, nonnegative
 from calib_ros.estimation.sizes import solved
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
 
@@ -55,6 +63,44 @@ def unmodelled_errors(posterior: Posterior, system: System) -> tuple[float, floa
     kernels += [columns @ np.swapaxes(columns, 1, 2) for columns in turned]
     turn, tilt = _sizes(np.array(kernels), rows[..., : len(names)] @ root, residual).tolist()
     return turn, tilt
+
+
+def moved_by_unmodelled(posterior: Posterior, factor: FloatArray, system: System) -> FloatArray:
+    """Return the expected squares (P, P) that unmodelled errors add to P fitted parameters.
+
+    `factor` (P, P) is that of the fit; the parameters are the first of the posterior's names.
+    Those held at nominal have no prior: the fit includes them already.
+    """
+    names, others = posterior.names[: len(factor)], posterior.names[len(factor) :]
+    rest = [len(names) + k for k, name in enumerate(others) if name in posterior.priors]
+    scale = np.sqrt(np.diag(posterior.covariance)[rest])
+    scaled = posterior.covariance[rest] / scale[:, np.newaxis]
+    slopes = np.linalg.solve(scaled[:, rest] / scale, scaled[:, : len(names)]).T / scale
+    square = slopes @ posterior.square[np.ix_(rest, rest)] @ slopes.T
+    if tilt := posterior.unmodelled[1]:
+        square += tilt**2 * covariance(factor, _tilted(posterior.chain, names, system))
+    return np.asarray(square)
+
+
+def _tilted(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
+    """Return J^T K J (P, P) of tilts of all joints."""
+    tilts = turns_and_tilts(chain)[1]
+    every = tuple(dict.fromkeys((*names, *tilts)))
+    units, share = gathered(chain, every, system, SOME_POSES)
+    circular = np.array([joint.type == 'revolute' for joint in chain.joints])
+    one, other = np.flatnonzero(circular), np.flatnonzero(~circular)
+    joint_of = np.concatenate([one, one, other, [-1]])  # columns of their places
+    middle = np.zeros((len(names), len(names)))
+    for tilt in tilts:
+        place = units.place[:, joint_of == chain.joint_names.index(tilt.owner)]
+        kernel = share**2 * np.exp(-cdist(place, place))
+        np.fill_diagonal(kernel, share)
+        rows = sum(
+            np.einsum('cn,pcn->np', part[every.index(tilt)], part[: len(names)])
+            for part in units.parts
+        )
+        middle += rows.T @ kernel @ rows
+    return middle
 
 
 def _explained(

@@ -8,11 +8,10 @@ The parameter difference d is tested by d^T C^-1 d with C = C_1 + C_2; then the 
 are searched for (`changes.py`). The difference of predicted positions, in the best frames, is a
 quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
-Unmodelled effects, and smooth errors of a moved device (`considered.py`), give differences if
-other poses were measured. Only expected squares of errors include them (`region.py`): a difference
-that is significant only by the noise covariances is reported as such. If a calibration held DH
-parameters at nominal, its fitted ones absorb part of their errors, so its expected squares replace
-its covariance.
+Smooth errors of a moved device (`considered.py`) give differences if other poses were measured.
+Only expected squares of errors include them (`region.py`): a difference that is significant
+without them is reported as such. If a calibration held DH parameters at nominal, its fitted ones
+absorb part of their errors, so its expected squares replace its covariance.
 """
 
 from __future__ import annotations
@@ -137,10 +136,10 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         own = whole = _in_names(each.chain, names, each.names, each.covariance)
         region = each.region
         if region is not None:
-            either = region.square + region.device @ region.device.T
-            whole = _in_names(region.chain, names, region.names, either)
+            arm, device = region.square, region.device @ region.device.T
             if any(Parameter(n).of_dh and n not in each.names for n in region.names):
-                own = whole
+                own = _in_names(region.chain, names, region.names, arm)
+            whole = own + _in_names(region.chain, names, region.names, device)
         square += own
         lacking += whole
     freedom = min(first.freedom, second.freedom)

@@ -32,11 +32,12 @@ from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitting import SOME, Fitted, ParameterRow, Simpler, fit, parameter_rows
+from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.levels import SCALE, SEVERAL
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
-from calib_ros.estimation.unmodelled import unmodelled_errors
+from calib_ros.estimation.unmodelled import moved_by_unmodelled, unmodelled_errors
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -83,13 +84,12 @@ def _identified(
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
-    parameters = parameter_rows(problem, chain, structural, names, fitted.uncertainty)
     coarse = rounded(problem)
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
-    posterior = fitted.posterior(size, more, doubts)
-    posterior = replace(posterior, unmodelled=unmodelled_errors(posterior, robust.system))
+    posterior, uncertainty = _with_unmodelled(fitted, fitted.posterior(size, more, doubts))
+    parameters = parameter_rows(problem, chain, structural, names, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
     step = find_step(problem, names, robust)
     result = Identification(
@@ -97,7 +97,7 @@ def _identified(
         before=before.chain,
         parameters=parameters,
         names=names,
-        uncertainty=fitted.uncertainty,
+        uncertainty=uncertainty,
         fitted=compare(before.chain, chain, problem.sets, ~robust.outliers),
         validation=validation,
         validated_by=validated_by,
@@ -127,6 +127,14 @@ def _identified(
     named = mistakes.remarked(problem, result)
     found = suspicions.remarked(problem, named, another=named is result)
     return lag.remarked(problem, found)
+
+
+def _with_unmodelled(fitted: Fitted, posterior: Posterior) -> tuple[Posterior, Uncertainty]:
+    """Return the posterior with unmodelled errors, and the uncertainty with what they add."""
+    system = fitted.system
+    posterior = replace(posterior, unmodelled=unmodelled_errors(posterior, system))
+    moved = moved_by_unmodelled(posterior, fitted.factor, system)
+    return posterior, fitted.uncertainty.with_part(moved)
 
 
 def _region(

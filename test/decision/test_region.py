@@ -165,32 +165,56 @@ def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
     assert np.sqrt(np.mean(np.sum(turned**2, axis=0)) / np.mean(known**2)) < 1.25
 
 
-@pytest.mark.parametrize('kind', ['theta', 'alpha'])
+def off_by(kind, true, q, rng):
+    """Return pose errors (N, 6) by some waves a turn of the joints, about or across their axes."""
+    owner = 'theta' if kind == 'teeth' else kind
+    model = ErrorModel(true, [f'{name}.{owner}' for name in true.joint_names])
+    sizes, order = 3e-4 * rng.uniform(0.3, 1.0, 6), {'teeth': 50, 'alpha': 2, 'theta': 1}[kind]
+    waves = sizes * np.sin(order * q + rng.uniform(0.0, 6.28, 6))
+    return np.einsum('nij,nj->ni', model.jacobian(q), waves)
+
+
+def moved_by(off, seen):
+    """Return observations with pose errors (N, 6)."""
+    turned = se3.exp_rotation(off[:, 3:]) @ seen.rotations
+    return replace(seen, positions=seen.positions + off[:, :3], rotations=turned)
+
+
+@pytest.mark.parametrize('kind', ['teeth', 'alpha'])
 def test_positions_are_within_the_ellipsoids_whatever_turns_or_tilts_the_joints(kind):
     """By 50 waves a turn, or twice a turn across the axis; the device's sigmas are not known."""
     inside = []
     for seed in range(3):
         rng = np.random.default_rng(seed)
         true, q = arm(seed), UR10E.random_joints(160, rng)
-        model = ErrorModel(true, [f'{name}.{kind}' for name in true.joint_names])
-        sizes = 3e-4 * rng.uniform(0.3, 1.0, 6)
-        waves = sizes * np.sin((50 if kind == 'theta' else 2) * q + rng.uniform(0.0, 6.28, 6))
-        off = np.einsum('nij,nj->ni', model.jacobian(q), waves)
-        seen = measure(true, q, rng, 5e-5, 2e-4)
-        seen = replace(
-            seen,
-            positions=seen.positions + off[:, :3],
-            rotations=se3.exp_rotation(off[:, 3:]) @ seen.rotations,
-        )
+        off = off_by(kind, true, q, rng)
+        seen = moved_by(off, measure(true, q, rng, 5e-5, 2e-4))
         found = identify(Problem(UR10E, seen.select(np.arange(60))))
         turn, tilt = found.posterior.unmodelled
-        assert (turn > tilt) == (kind == 'theta')
+        assert (turn > tilt) == (kind == 'teeth')
         error = found.chain.forward(q)[60:, :3, 3] - true.forward(q)[60:, :3, 3] - off[60:, :3]
         axes = found.confidence_ellipsoid(q[60:])
         along = np.einsum('nij,nj->ni', axes, error) / (axes**2).sum(axis=2)
         inside.append((along**2).sum(axis=1) <= 1.0)
         stated = np.trace(found.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)
         np.testing.assert_allclose(found.region.sigma(q) ** 2, stated)
+    assert np.mean(inside) > 0.9
+
+
+@pytest.mark.parametrize('kind', ['teeth', 'alpha', 'theta'])
+def test_parameters_are_within_their_limits_whatever_turns_or_tilts_the_joints(kind):
+    """Also by what moves all parameters alike, however many poses are measured."""
+    inside = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        true, q = arm(seed), rng.uniform(-2.0, 2.0, (200, 6))
+        seen = moved_by(off_by(kind, true, q, rng), measure(true, q, rng, 5e-5, 2e-4))
+        found = identify(Problem(UR10E, seen, held_out=seen.select(np.arange(2))))
+        inside += [
+            abs(p.offset - true.offset(p.name, UR10E)) < p.half_width()
+            for p in found.parameters
+            if p.std is not None and p.name.of_dh
+        ]
     assert np.mean(inside) > 0.9
 
 
