@@ -117,4 +117,4 @@ def _check(options: argparse.Namespace) -> None:
 
 
 def _page_beside(path: Path) -> Path:
-    return path.with_name(f'{path.stem}.report.html')
+    return path.parent / f'{path.stem}.report.html'

@@ -67,7 +67,7 @@ def _write_simulation(
     recording = Recording(
         chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
     )
-    truth = bag.with_name(f'{bag.name}_truth.yaml')
+    truth = bag.parent / f'{bag.name}_truth.yaml'
     beside = {truth: dump_chain(true, {'source': 'simulation'})}
     with screen.work('simulating') as work:
         write_bag(bag, recording, options.storage, beside, work)

@@ -46,7 +46,7 @@ from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_un
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.sample import Sample, check_settings, socket_place
+from calib_ros.sampling.sample import Sample, check_settings
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
@@ -168,8 +168,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             for each in changes:
                 if each.name in FILENAMES:
                     self._keeper.file_of(each.name, each.value)
-                if each.name == 'socket' and each.value:
-                    socket_place(each.value)
             check_settings(self.session.chain, changed(self.session.settings, changes))
         except CalibrationError as err:
             return SetParametersResult(successful=False, reason=str(err))

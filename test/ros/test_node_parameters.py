@@ -53,7 +53,6 @@ def test_the_parameter_file_holds_every_parameter_with_its_default(idle):
     [
         ('model', 'nonsense', 'unknown model "nonsense"'),
         ('model', 'auto+ratio', 'model auto stands alone'),
-        ('socket', 'A1', 'must be LOCATION/SOCKET'),
         ('model', 'gear', 'nothing to fit in "gear"'),
         ('loss', 'hubert', 'did you mean "huber"'),
         ('fixed', ['joint_7.a'], 'unknown parameter "joint_7.a"'),
