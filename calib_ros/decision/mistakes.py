@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from calib_ros.decision.lost_rows import lost
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.suspects import ORIENTATIONS, Sets, Suspect, dead, suspects
+from calib_ros.decision.suspects import ORIENTATIONS, Sets, Suspect, dead, signs, suspects
 from calib_ros.estimation.identifiability import excited
 from calib_ros.estimation.leastsquares import System, factor_of, minimise
 from calib_ros.estimation.levels import (
@@ -230,7 +230,8 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
     """Return simultaneous mistakes, each of which explains part of the errors.
 
     Beam search: another mistake is added to each of the best few, until the arm explains the rest
-    or another is no better. The first may be no better alone: two mistakes can hide each other.
+    or another is no better. The first may be no better alone: two mistakes can hide each other. So
+    the signs of two and three joints are tried together.
     """
     if given.error <= problem.largest_error:
         return None
@@ -239,17 +240,17 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
     largest, share = min(_largest(problem), NEARER * given.error), NEARER * min(given.share, 1.0)
     least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
-    for _ in range(SEVERAL + 1):  # several of joints, one of the poses
+    for number in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
-        for some in kept:
-            for each in options:
-                if each.part not in {one.part for one in some}:
-                    more = tuple(sorted((*some, each), key=lambda one: one.part != 'measured'))
-                    trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
-                    if trial is not None:  # keeps the first of equivalent ones
-                        found.setdefault(round(trial.share, 6), (trial, more))
+        together = [(*some, each) for some in kept for each in options]
+        for some in together if number else [*together, *signs(chain)]:
+            if len({one.part for one in some}) == len(some):
+                more = tuple(sorted(some, key=lambda one: one.part != 'measured'))
+                trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
+                if trial is not None:  # keeps the first of equivalent ones
+                    found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:TRIED]]
-        if not best or (len(best[0][1]) > 1 and best[0][0].share > CONFIDENT * least):
+        if not best or (number and best[0][0].share > CONFIDENT * least):
             return None
         least = best[0][0].share
         polished = _polished(problem, best[0][0])

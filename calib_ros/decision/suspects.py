@@ -242,6 +242,11 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
         published = 'swap them in joint_names'
         yield Suspect(what, remedy, (_joints(same[order]),), 2, published=published)
+    if len(names) > 3:
+        columns = ','.join(f'q{k}=q{len(names) + 1 - k}' for k in range(1, len(names) + 1))
+        what = 'the joints are in the order from tool to base'
+        published = 'reverse joint_names'
+        yield Suspect(what, f'--columns {columns}', (_joints(same[::-1]),), 2, published=published)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':
             coupled = same.copy()
@@ -249,6 +254,12 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
             yield Suspect(what, remedy, (_joints(coupled),), 2)
+
+
+def signs(chain: Chain) -> list[tuple[Suspect, ...]]:
+    """Return mistakes of the signs of two and three joints at once."""
+    each = [_of_joint(chain, k, -1.0, '', 0.0) for k in range(len(chain.joints))]
+    return [*combinations(each, 2), *combinations(each, 3)]
 
 
 def _of_one_unit(chain: Chain) -> Iterator[Suspect]:

@@ -93,7 +93,7 @@ def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
             Parameter(name, f'gravity_{other}') for name in revolute for other in behind[name]
         ],
         'compliance': [Parameter(name, group) for name in revolute],
-        'backlash': [Parameter(name, group) for name in revolute],
+        'backlash': [Parameter(name, group) for name in names],
     }
     if group not in found:
         raise UnknownNameError('group of effects', group, GROUPS)

@@ -9,6 +9,7 @@ import pytest
 from fits import SIGMAS, UR10E, measured_arm
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision.acceptance import refusals
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
@@ -31,6 +32,20 @@ def test_no_gain_is_claimed_where_there_is_none():
         assert ('; with 40 poses, chance' in text) == (after.rms_mm < before.rms_mm)
         by_chance += after.rms_mm < before.rms_mm
     assert by_chance
+
+
+def test_orientations_may_get_worse_by_what_it_costs_to_estimate():
+    """30 parameters from 360 equations: 4 %; the loss is the same in all poses."""
+    *_, seen = measured_arm(3, 60)
+    problem = Problem(UR10E, seen, **SIGMAS)
+    result = identify(problem)
+    assert (result.accepted, result.rank) == (True, 30)
+    held_out = result.validation
+    for loss, refused in ((1.035, False), (1.05, True)):
+        after = replace(held_out.after, orientation=loss * held_out.before.orientation)
+        judged = replace(result, validation=replace(held_out, after=after))
+        rules = [each.rule for each in refusals(problem, judged, None, False, True)]
+        assert rules == [Rule.ORIENTATION] * refused
 
 
 def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():

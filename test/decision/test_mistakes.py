@@ -112,6 +112,7 @@ SPOILT = {
     'sign': (joints(lambda q: SIGNS * q), 'q3=-q3'),
     'zero': (joints(lambda q: q + QUARTER), 'q4=q4-1.57079632679489'),
     'swapped': (joints(lambda q: q[:, [0, 1, 2, 4, 3, 5]]), 'q4=q5,q5=q4'),
+    'reversed': (joints(lambda q: q[:, ::-1]), '--columns q1=q6,q2=q5,q3=q4,q4=q3,q5=q2,q6=q1'),
     'coupled': (joints(lambda q: q @ COUPLED.T), 'q3=q3-q2'),
     'shift': (later, '--shift -1'),
 }
@@ -126,6 +127,7 @@ PUBLISHED = {
     'sign': 'sign: -1 in the chain file',
     'zero': 'theta -90 degrees in the chain file',
     'swapped': 'swap them in joint_names',
+    'reversed': 'reverse joint_names',
     'shift': 'check the stamps',
 }
 POSITIONS_TELL = ('mm', 'both, and a lost beam', 'left-handed', 'sign', 'coupled')
@@ -172,6 +174,10 @@ SEVERAL = {
         joints(lambda q: TWO_SIGNS * q),
         [f'{name} counts the other way round (sign: -1 in the chain file)' for name in TWO],
     ),
+    'signs that hide each other': (
+        joints(lambda q: q * [1.0, -1.0, -1.0, 1.0, -1.0, 1.0]),
+        [f'{name} counts the other way round' for name in (*TWO, 'elbow_joint')],
+    ),
     'two units': (
         joints(lambda q: TWO_UNITS * q),
         [f'{name} is in degrees, the other joints in radians' for name in TWO],
@@ -191,6 +197,7 @@ SEVERAL = {
     ('mistakes', 'oriented'),
     [
         ('two signs', True),
+        ('signs that hide each other', True),
         ('two units', True),
         ('two units', False),
         ('sign and zero, in mm', False),

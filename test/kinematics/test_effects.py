@@ -134,6 +134,15 @@ def test_effects_may_be_a_third_of_an_arc_minute_or_one_of_what_bends():
         assert sizes.pop() == pytest.approx(minute if bends else minute / 3.0, rel=0.05)
 
 
+def test_linear_joints_have_play_as_well():
+    chain = load_chain('ur10e_on_linear_axis')
+    names = effects.members(chain, 'backlash')
+    assert [name.owner for name in names] == list(chain.joint_names)
+    q, approach = np.zeros((2, 7)), np.array([[1.0] * 7, [-1.0] * 7])
+    moved = chain.with_effect_values({names[0]: 3e-4}).forward(q, approach)[:, :3, 3]
+    assert np.linalg.norm(moved[0] - moved[1]) == pytest.approx(6e-4)
+
+
 def test_couplings_are_those_of_the_last_three_joints():
     found = effects.members(load_chain('kuka_iiwa14'), 'coupling')
     pairs = [('joint_6', 'joint_5'), ('joint_7', 'joint_5'), ('joint_7', 'joint_6')]
