@@ -92,10 +92,9 @@ def freedom_of(moments: FloatArray) -> float:
 
 def moments_of(errors: FloatArray, group: Index) -> FloatArray:
     """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
-    each = errors[:, :, np.newaxis] * errors[:, np.newaxis]
-    sums = np.zeros((int(group.max()) + 1, 3, 3))
-    np.add.at(sums, group, each)
-    return sums / np.bincount(group)[:, np.newaxis, np.newaxis]
+    each = (errors[:, :, np.newaxis] * errors[:, np.newaxis]).reshape(-1, 9)
+    sums = np.stack([np.bincount(group, column) for column in each.T], axis=1)
+    return sums.reshape(-1, 3, 3) / np.bincount(group)[:, np.newaxis, np.newaxis]
 
 
 SLOPES = (0.5, 2.0)

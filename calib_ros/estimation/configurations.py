@@ -36,8 +36,8 @@ def stops(joints: FloatArray) -> Index:
 
 def _still(change: FloatArray) -> Flags:
     """Return which changes (N, n) of joint values are within STILL (N,), modulo a turn."""
-    change = np.abs(change) % (2.0 * np.pi)
-    return np.asarray(np.minimum(change, 2.0 * np.pi - change).max(axis=1) <= STILL)
+    left = np.abs(change - 2.0 * np.pi * np.rint(change / (2.0 * np.pi)))
+    return np.asarray(left.max(axis=1) <= STILL)
 
 
 def configurations(joints: FloatArray) -> Index:

@@ -241,9 +241,10 @@ def _places(model: ErrorModel, last: int) -> Places:
     place = np.append(np.where(model.order < last, model.order, -1), last)
     own = np.arange(len(place))[model.spread]
     rows = place[own]
-    effects = [(row, np.flatnonzero(rows == row)) for row in np.unique(rows[rows >= 0]).tolist()]
-    ordered = np.concatenate([np.zeros(0, np.intp), *(numbers for _, numbers in effects)])
-    place[own[ordered]] = last + 1 + np.arange(len(ordered))
+    effects = [(row, np.flatnonzero(rows == row)) for row in sorted({*rows.tolist()} - {-1})]
+    if effects:
+        ordered = own[np.concatenate([numbers for _, numbers in effects])]
+        place[ordered] = last + 1 + np.arange(len(ordered))
     return place, effects
 
 

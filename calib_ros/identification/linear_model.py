@@ -230,7 +230,8 @@ class LinearModel:
         return self._system.rows_of(self._with(names), names)
 
     def _with(self, names: Sequence[str]) -> Chain:
-        return self._chain.with_effects([name for name in names if name not in self._names])
+        known = {*self._names}
+        return self._chain.with_effects([name for name in names if name not in known])
 
     def _left_out(
         self, dealing: int, chosen: Sequence[str], new: Sequence[str] = (), size: float = 0.0
@@ -271,11 +272,11 @@ class LinearModel:
 
         Effects have the `given` size, else the usual one or that found in the data if larger.
         """
-        sigmas = self._problem.prior_sigmas
+        sigmas, fitted = self._problem.prior_sigmas, {*self._names}
         found = np.zeros(len(names))
         for k, name in enumerate(names):
             size = sigmas.get(name, 0.0)
-            if name not in self._names:
+            if name not in fitted:
                 group = str(group_of(self._chain, name))
                 usual = max(effects.expected(name), self._sizes.get(group, 0.0))
                 size = given or usual

@@ -262,7 +262,8 @@ class Chain(Shown):
             'effects': tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
         }
         same = all(new is old for new, old in zip(joints, self.joints, strict=True))
-        kept = ('joint_names', 'frame_names', *(('walk', '_joints') if same else ()))
+        names = ('joint_names', 'frame_names', '_all_parameters')
+        kept = (*names, *(('walk', '_joints') if same else ()))
         return _with(self, found, kept)
 
     def forward(

@@ -128,7 +128,8 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
     return (name,)
 
 
-def check(name: str, joints: Sequence[str]) -> None:
+@lru_cache(maxsize=1024)
+def check(name: str, joints: tuple[str, ...]) -> None:
     """Refuse an unknown effect."""
     first, rest = Parameter(name).effect
     if first in ('coupling', 'gravity'):

@@ -7,7 +7,6 @@ A parameter is its own name, so it serves as key, column heading and text in use
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import lru_cache
 
 DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
@@ -84,7 +83,8 @@ def _unit(name: Parameter) -> str:
     return _UNITS.get(name.kind) or _UNITS.get(name.effect[0], 'rad')
 
 
-def parameters_of(owner: str, kinds: Iterable[str] = FRAME_KINDS) -> tuple[Parameter, ...]:
+@lru_cache(maxsize=256)
+def parameters_of(owner: str, kinds: tuple[str, ...] = FRAME_KINDS) -> tuple[Parameter, ...]:
     """Return parameters of one owner, by default those of a frame's place."""
     return tuple(Parameter(owner, kind) for kind in kinds)
 
