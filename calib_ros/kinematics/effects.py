@@ -10,7 +10,8 @@ that of the joint's motion times phi. An effect is a parameter named after its j
     joint_2.sin_1, .cos_1       phi = sin(1 q_2), cos(1 q_2)                       [rad or m]
     joint_2.gravity_joint_4     phi = torque on joint 2 of unit weight at joint 4's end  [rad/m]
     joint_2.compliance          phi = torque on joint 2 of the given masses [N m]  [rad/(N m)]
-    joint_2.backlash            phi = sign of the approach: -1, 0 or 1             [rad or m]
+    joint_2.backlash            phi = sign of the approach: -1, 0 or 1             [rad]
+    rail.play                   the same of a linear joint                         [m]
 
 Eccentricities of gears and encoders are harmonics 1 and 2; a harmonic drive has harmonics near its
 ratio and twice that. With unknown masses, torques of weights at the joints' ends span the torques
@@ -75,7 +76,7 @@ def group_of(name: str) -> str:
     first, rest = Parameter(name).effect
     if first in ('sin', 'cos'):
         return 'eccentricity' if rest in ('1', '2') else 'gear'
-    return first
+    return 'backlash' if first == 'play' else first
 
 
 def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
@@ -93,7 +94,10 @@ def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
             Parameter(name, f'gravity_{other}') for name in revolute for other in behind[name]
         ],
         'compliance': [Parameter(name, group) for name in revolute],
-        'backlash': [Parameter(name, group) for name in names],
+        'backlash': [
+            Parameter(joint.name, group if joint.type == 'revolute' else 'play')
+            for joint in chain.joints
+        ],
     }
     if group not in found:
         raise UnknownNameError('group of effects', group, GROUPS)
@@ -106,6 +110,7 @@ def couplings(joints: Sequence[str]) -> list[Parameter]:
 
 
 WAVES = ('sin', 'cos')
+PLAY = ('backlash', 'play')  # of a revolute and of a linear joint
 
 
 def waves(joint: str, harmonic: float) -> tuple[Parameter, ...]:
@@ -125,6 +130,8 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
             raise UnknownNameError('model', name, (*alone, *GROUPS))
         raise UnknownNameError(f'joint in effect {name}', joint, chain.joint_names)
     check(name, chain.joint_names)
+    if Parameter(name).kind in PLAY and name not in (known := members(chain, 'backlash')):
+        raise UnknownNameError('effect', name, known)
     return (name,)
 
 
@@ -142,7 +149,7 @@ def check(name: str, joints: tuple[str, ...]) -> None:
             known = False
         if not known:
             raise UnknownNameError(f'harmonic in effect {name}', rest, ('1', '2', '...'))
-    elif first not in ('ratio', 'compliance', 'backlash') or rest:
+    elif first not in ('ratio', 'compliance', *PLAY) or rest:
         raise UnknownNameError('effect', name, GROUPS)
 
 
@@ -176,7 +183,7 @@ def basis(
                 own = np.flatnonzero(joints == joint)
                 wave = _wave(q[joint], others[own], circles, joint)
                 phi[rows[own]] = wave.imag if kind == 'sin' else wave.real
-        elif kind == 'backlash' and approach is not None:
+        elif kind in PLAY and approach is not None:
             phi[rows] = approach[joints]
         elif kind in ('gravity', 'compliance'):
             phi[rows] = _torques(chain, q, joints, others if kind == 'gravity' else None)

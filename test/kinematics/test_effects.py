@@ -138,6 +138,9 @@ def test_linear_joints_have_play_as_well():
     chain = load_chain('ur10e_on_linear_axis')
     names = effects.members(chain, 'backlash')
     assert [name.owner for name in names] == list(chain.joint_names)
+    assert [name.unit for name in names] == ['m', *['rad'] * 6]
+    with pytest.raises(UnknownNameError):
+        effects.resolve(chain, f'{names[0].owner}.backlash')
     q, approach = np.zeros((2, 7)), np.array([[1.0] * 7, [-1.0] * 7])
     moved = chain.with_effect_values({names[0]: 3e-4}).forward(q, approach)[:, :3, 3]
     assert np.linalg.norm(moved[0] - moved[1]) == pytest.approx(6e-4)
