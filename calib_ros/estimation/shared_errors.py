@@ -65,7 +65,7 @@ class Shared:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stops:
+class Stops:
     """Rows of stops, summed over the samples of each.
 
     `parts` are (P + 1, c, n), by position and orientation, zero if not measured; `count` (n,)
@@ -82,6 +82,7 @@ class _Stops:
         return len(self.count)
 
     def distances(self, kind: str) -> FloatArray:
+        """Return the distances (n, n) between stops for a kind of kernel."""
         if kind == 'near':
             return np.asarray(cdist(self.place, self.place))
         return np.asarray(np.abs(self.time[:, np.newaxis] - self.time))
@@ -154,7 +155,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
 class _Forms:
     """Quadratic forms of residuals, and their moments."""
 
-    def __init__(self, units: _Stops, extra: FloatArray) -> None:
+    def __init__(self, units: Stops, extra: FloatArray) -> None:
         self._units = units
         width = extra.shape[1]
         rows = [part.reshape(width + 1, -1).T for part in units.parts]
@@ -256,14 +257,14 @@ def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
 
 
-def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[_Stops, int]:
+def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:
     """Return the stops of all sets, or of every k-th run of `most` / 20 if there are more; k."""
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // most))
     return _gather(chain, names, system, share, most // 20), share
 
 
-def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> _Stops:
+def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> Stops:
     """Return the stops of all sets; of many, every `share`-th run of `run` stops."""
     widths = (max(samples.width for samples in system.sets), 3)
     parts: list[list[FloatArray]] = [[], []]
@@ -296,14 +297,14 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
         times.append(numbers[begins] + ELSEWHERE * number)
         counts.append(count)
     if not counts:
-        return _Stops([], np.zeros(0), np.zeros((0, 0)), np.zeros(0))
-    return _Stops(
+        return Stops([], np.zeros(0), np.zeros((0, 0)), np.zeros(0))
+    return Stops(
         [np.concatenate(part, axis=2) for part in parts],
         *(np.concatenate(each) for each in (counts, places, times)),
     )
 
 
-def _near(units: _Stops, part: int, length: float, share: int) -> FloatArray:
+def _near(units: Stops, part: int, length: float, share: int) -> FloatArray:
     """Return J^T K J of errors fading in joint space, by every `share`-th stop: pairs are many."""
     kernel = units.kernel('near', length)
     own = np.diag(kernel) * (share - share**2)

@@ -15,8 +15,8 @@ their expected values (MINQUE, Rao 1971).
 
 They move the fitted parameters too. Turns, as of gears, average out like noise. Tilts, as of
 bearings, change slowly with the value of their joint, as exp(-distance) on the unit circle [m if
-prismatic], and add H^-1 (J^T v_3 K J) H^-1. Considered effects (`evidence.py`) of expected squares
-S add G S G^T if the fitted parameters follow them by G.
+prismatic], and add H^-1 (J^T v_3 K J) H^-1. Considered effects (`evidence.py`) of columns A and
+expected squares S add H^-1 (J^T A S A^T J) H^-1.
 """
 
 from __future__ import annotations
@@ -32,73 +32,73 @@ from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.shared_errors import gathered, nonnegative
+from calib_ros.estimation.shared_errors import Stops, gathered, nonnegative
 from calib_ros.estimation.sizes import solved
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 
 
-def unmodelled_errors(posterior: Posterior, system: System) -> tuple[float, float]:
+def unmodelled_errors(
+    posterior: Posterior, factor: FloatArray, system: System
+) -> tuple[tuple[float, float], FloatArray]:
     """Return the sizes [rad] of random turns and tilts of the joints, zero without evidence.
 
-    Those of a prismatic joint along its axis [m] count as turns.
+    Those of a prismatic joint along its axis [m] count as turns. Then follow the expected squares
+    (F, F) that unmodelled errors add to the F parameters of the fit with that `factor` (F, F), the
+    first of the posterior's names. Parameters held at nominal have no prior: the fit includes them
+    already.
     """
-    names, groups = posterior.names, turns_and_tilts(posterior.chain)
+    chain, names = posterior.chain, posterior.names
+    groups, fitted = turns_and_tilts(chain), np.s_[: len(factor)]
     every = tuple(dict.fromkeys((*names, *groups[0], *groups[1])))
-    units, _ = gathered(posterior.chain, every, system, SOME_POSES)
-    if len(units) < TELLING:
-        return 0.0, 0.0
-    parts = [part for part in units.parts if part.any()]
-    found = _explained(posterior, [part[[*range(len(names)), -1]] for part in parts])
+    units, share = gathered(chain, every, system, SOME_POSES)
+    sizes = (0.0, 0.0)
+    if len(units) >= TELLING:
+        columns = [[every.index(name) for name in group] for group in groups]
+        sizes = _found(posterior, [part for part in units.parts if part.any()], columns)
+    rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= len(factor)]
+    each = (np.einsum('pcn,qcn->pq', part[fitted], part[rest]) for part in units.parts)
+    along = share * sum(each, np.zeros((len(factor), len(rest))))
+    middle = along @ posterior.square[np.ix_(rest, rest)] @ along.T
+    if sizes[1]:
+        middle += sizes[1] ** 2 * _tilted(chain, every, len(factor), units, share)
+    return sizes, covariance(factor, middle)
+
+
+def _found(
+    posterior: Posterior, parts: Sequence[FloatArray], groups: Sequence[Sequence[int]]
+) -> tuple[float, float]:
+    """Return the sizes of turns and tilts, whose columns are the `groups`, by weighted rows."""
+    count = len(posterior.names)
+    found = _explained(posterior, [part[[*range(count), -1]] for part in parts])
     if found is None:
         return 0.0, 0.0
     step, root, scales = found
     parts = [part / scale for part, scale in zip(parts, scales, strict=True)]
     rows = np.concatenate(parts, axis=1).transpose(2, 1, 0)  # (n, c, P)
-    residual = rows[..., -1] + rows[..., : len(names)] @ step
+    residual = rows[..., -1] + rows[..., :count] @ step
     part_of = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
     whites = rows.any(axis=2) & (part_of == np.arange(len(parts))[:, np.newaxis, np.newaxis])
-    turned = [rows[..., [every.index(name) for name in group]] for group in groups]
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
-    kernels += [columns @ np.swapaxes(columns, 1, 2) for columns in turned]
-    turn, tilt = _sizes(np.array(kernels), rows[..., : len(names)] @ root, residual).tolist()
+    kernels += [rows[..., group] @ np.swapaxes(rows[..., group], 1, 2) for group in groups]
+    turn, tilt = _sizes(np.array(kernels), rows[..., :count] @ root, residual).tolist()
     return turn, tilt
 
 
-def moved_by_unmodelled(posterior: Posterior, factor: FloatArray, system: System) -> FloatArray:
-    """Return the expected squares (P, P) that unmodelled errors add to P fitted parameters.
-
-    `factor` (P, P) is that of the fit; the parameters are the first of the posterior's names.
-    Those held at nominal have no prior: the fit includes them already.
-    """
-    names, others = posterior.names[: len(factor)], posterior.names[len(factor) :]
-    rest = [len(names) + k for k, name in enumerate(others) if name in posterior.priors]
-    scale = np.sqrt(np.diag(posterior.covariance)[rest])
-    scaled = posterior.covariance[rest] / scale[:, np.newaxis]
-    slopes = np.linalg.solve(scaled[:, rest] / scale, scaled[:, : len(names)]).T / scale
-    square = slopes @ posterior.square[np.ix_(rest, rest)] @ slopes.T
-    if tilt := posterior.unmodelled[1]:
-        square += tilt**2 * covariance(factor, _tilted(posterior.chain, names, system))
-    return np.asarray(square)
-
-
-def _tilted(chain: Chain, names: Sequence[str], system: System) -> FloatArray:
-    """Return J^T K J (P, P) of tilts of all joints."""
-    tilts = turns_and_tilts(chain)[1]
-    every = tuple(dict.fromkeys((*names, *tilts)))
-    units, share = gathered(chain, every, system, SOME_POSES)
+def _tilted(
+    chain: Chain, names: Sequence[str], count: int, units: Stops, share: int
+) -> FloatArray:
+    """Return J^T K J (P, P) of tilts of all joints, for the first `count` of the names."""
     circular = np.array([joint.type == 'revolute' for joint in chain.joints])
     one, other = np.flatnonzero(circular), np.flatnonzero(~circular)
     joint_of = np.concatenate([one, one, other, [-1]])  # columns of their places
-    middle = np.zeros((len(names), len(names)))
-    for tilt in tilts:
+    middle = np.zeros((count, count))
+    for tilt in turns_and_tilts(chain)[1]:
         place = units.place[:, joint_of == chain.joint_names.index(tilt.owner)]
         kernel = share**2 * np.exp(-cdist(place, place))
         np.fill_diagonal(kernel, share)
-        rows = sum(
-            np.einsum('cn,pcn->np', part[every.index(tilt)], part[: len(names)])
-            for part in units.parts
-        )
+        own = names.index(tilt)
+        rows = sum(np.einsum('cn,pcn->np', part[own], part[:count]) for part in units.parts)
         middle += rows.T @ kernel @ rows
     return middle
 

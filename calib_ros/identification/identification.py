@@ -32,12 +32,11 @@ from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.fitting import SOME, Fitted, ParameterRow, Simpler, fit, parameter_rows
-from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.levels import SCALE, SEVERAL
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import Robust
-from calib_ros.estimation.unmodelled import moved_by_unmodelled, unmodelled_errors
+from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -88,7 +87,10 @@ def _identified(
     share = suspicions.lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
-    posterior, uncertainty = _with_unmodelled(fitted, fitted.posterior(size, more, doubts))
+    posterior = fitted.posterior(size, more, doubts)
+    sizes, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
+    posterior = replace(posterior, unmodelled=sizes)
+    uncertainty = fitted.uncertainty.with_part(moved)
     parameters = parameter_rows(problem, chain, structural, names, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
     step = find_step(problem, names, robust)
@@ -125,16 +127,7 @@ def _identified(
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
-    found = suspicions.remarked(problem, named, another=named is result)
-    return lag.remarked(problem, found)
-
-
-def _with_unmodelled(fitted: Fitted, posterior: Posterior) -> tuple[Posterior, Uncertainty]:
-    """Return the posterior with unmodelled errors, and the uncertainty with what they add."""
-    system = fitted.system
-    posterior = replace(posterior, unmodelled=unmodelled_errors(posterior, system))
-    moved = moved_by_unmodelled(posterior, fitted.factor, system)
-    return posterior, fitted.uncertainty.with_part(moved)
+    return lag.remarked(problem, suspicions.remarked(problem, named, another=named is result))
 
 
 def _region(

@@ -195,7 +195,7 @@ def test_the_ellipsoid_is_that_of_the_covariance_of_a_position(size, level, rng)
     found = np.swapaxes(axes, 1, 2) @ axes
     squares = [stats.chi2.ppf(level, 3)] * 2
     if size > 1.0:
-        squares = [3.0 * stats.f.ppf(level, 3, each) for each in (180.0, 60.0)]
+        squares = [3.0 * stats.f.ppf(level, 3, each) for each in (240.0, 60.0)]  # numbers in all
     posterior, expected = result.posterior, result.pose_covariance(q)[:, :3, :3]
     mean = ErrorModel(posterior.chain, posterior.names).jacobian(q)[:, :3] @ posterior.shift
     expected -= mean[:, :, None] * mean[:, None] - (mean**2).mean(axis=1)[:, None, None] * np.eye(
