@@ -16,6 +16,9 @@ show the ratio of its sides; the arm absorbs the scale of both together, which i
 Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
 leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
 
+Order. If one joint only goes one way during the session, what drifts with time is fitted as its
+error, and no test can tell them apart.
+
 Sigmas. In millimetres instead of metres they leave the arm no room: all errors are below them, and
 the poses add nothing to the priors.
 """
@@ -39,7 +42,7 @@ from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.identifiability import growth
 from calib_ros.estimation.leastsquares import stacked
-from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, chance_of
+from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
@@ -50,7 +53,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.parameter import IN_A_FRAME, LENS_KINDS, parameters_of
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION
 
 LEAST_SCALE = 0.5 * SCALE
@@ -99,7 +102,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    found = (scale, sister, lens, board, gravity, coupled, motion, sigmas)
+    found = (scale, sister, lens, board, gravity, coupled, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return replace(result, remarks=remarks, refusals=tuple(refusals))
 
@@ -214,6 +217,22 @@ def _motion(problem: Problem, result: Identification) -> str:
                     f'errors grow with the {what} of the arm: stamps jitter, clocks drift, or the '
                     'device or the joint states are smoothed. Stop at each pose (mode dwell)'
                 )
+    return ''
+
+
+def _order(problem: Problem) -> str:
+    """Return that one joint turned steadily in the order of the poses."""
+    for each in problem.sets:
+        first = np.sort(np.unique(each.configurations, return_index=True)[1])
+        q, time = each.joints[first], np.arange(len(first)) - 0.5 * (len(first) - 1)
+        q = q - q.mean(axis=0)
+        alike = np.abs(time @ q) / np.maximum(np.linalg.norm(time) * norms(q.T), 1e-300)
+        if len(first) >= TELLING and alike.max() > 1.0 - EXCEPTION:
+            name = problem.chain.joint_names[int(alike.argmax())]
+            return (
+                f'{name} moves in one direction from the first pose to the last, so drift of the '
+                'device looks like an error of this joint: next time mix the order of the poses'
+            )
     return ''
 
 

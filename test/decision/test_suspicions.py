@@ -65,6 +65,17 @@ def test_growth_that_arms_have_is_said_and_not_refused():
     assert as_document(result, {})['remarks'] == [remark]
 
 
+def test_a_joint_that_only_goes_one_way_is_named():
+    seen = seen_of(arm(), count=40)
+    steady = seen.select(np.argsort(seen.joints[:, 2]))
+    said = [
+        [each for each in identify(Problem(UR, s)).remarks if 'mix' in each]
+        for s in (seen, steady)
+    ]
+    assert [len(each) for each in said] == [0, 1]
+    assert said[1][0].startswith('elbow_joint moves in one direction')
+
+
 def test_offsets_that_scatter_hide_a_scale():
     """The scale is as uncertain as the arm's own offsets make it, and honestly so."""
     rng, held = np.random.default_rng(0), []
