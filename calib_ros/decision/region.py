@@ -257,8 +257,8 @@ class _Judge:
         gain = float(slope @ self._offsets)
         weights, means, covariances = doubts
         margins = means @ slope - 0.5 * gain
-        along = (covariances.reshape(-1, len(slope)) @ slope).reshape(means.shape)
-        spreads = np.sqrt(np.maximum(along @ slope, 0.0))
+        along = covariances.reshape(means.size, len(slope)) @ slope
+        spreads = np.sqrt(np.maximum(along.reshape(means.shape) @ slope, 0.0))
         with np.errstate(divide='ignore', invalid='ignore'):
             risks = special.stdtr(min(self._freedom, KNOWN), -margins / spreads)
         return float(weights @ np.where(spreads > 0.0, risks, margins <= 0.0))

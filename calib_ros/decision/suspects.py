@@ -342,8 +342,9 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
             yield Suspect(what, remedy, rank=3, chain=arm, published=remedy)
     types = [joint.type for joint in chain.joints]
     for ours in shipped_chains():
-        alike = [joint.type for joint in ours.joints] == types
-        if alike and not np.allclose(ours.table, chain.table, atol=1e-6):
+        if [joint.type for joint in ours.joints] != types:
+            continue
+        if ours.columns != chain.columns or not np.allclose(ours.table, chain.table, atol=1e-6):
             what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'
             if ours.name == chain.name:
                 what = f'the DH table is not that of a {ours.name}'

@@ -113,7 +113,7 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
     Zero degrees of freedom with fewer than three lengths.
     """
     chain, first = result.chain, problem.sets[0]
-    arm = [n for n in chain.parameter_names if n.is_length and not chain.owns_frame(n)]
+    arm = [n for n in chain.parameter_names if n.is_length and n.of_dh]
     lengths: dict[str, float] = {n: problem.model.value(n) for n in arm if chain.value(n) != 0.0}
     fitted = [i for i, n in enumerate(result.names) if n in arm]
     if len(fitted) < 3 or not lengths:

@@ -158,7 +158,7 @@ class Evidence:
         (unscented transform, Julier and Uhlmann 1997), weighted by their evidence. Groups of size
         zero stay so, and so does the scale of the device.
         """
-        arms = np.array([name in TYPICAL for name in self._names])
+        arms = np.array([name in TYPICAL for name in self._names], dtype=bool)
         some = np.flatnonzero(arms & (size > self._typical + np.log(LEAST_SIZE)))
         if not len(some):
             return [(1.0, size)]

@@ -150,7 +150,8 @@ class Chain(Shown):
         cameras = [name for name in frames if frames[name].lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         parallel = frozenset(self.parallel or ())
-        coincident = parallel.intersection(self._joining(nearly_coincident))
+        shifted = (joint.name for joint in self.joints if joint.b)  # by a fit, perhaps further
+        coincident = parallel.intersection((*self._joining(nearly_coincident), *shifted))
         for joint in self.joints:
             beside = joint.name in coincident  # theta comes last: it trades against beta and b
             left_out = 'd' if joint.name in parallel else 'beta', '' if beside else 'b'

@@ -189,7 +189,8 @@ def refuse_ignored(command: Sequence[str], node: str) -> None:
             yield from nodes(below, name) if 'ros__parameters' not in below else (name,)
 
     paths = [path for flag, path in pairwise(command) if flag == '--params-file']
-    keys = [key for path in paths for key in nodes(yaml.safe_load(Path(path).read_bytes()), '')]
+    found = (yaml.safe_load(Path(path).read_bytes()) or {} for path in paths)
+    keys = [key for each in found for key in nodes(each, '')]
     if keys and not any(fnmatchcase(node, key.replace('/**', '*')) for key in keys):
         raise ConfigError(
             f'{" and ".join(paths)} has no parameters of {node}, but of {", ".join(some(keys))}: '

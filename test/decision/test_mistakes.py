@@ -240,7 +240,10 @@ def test_linear_joints_in_millimetres_are_named(travel, positions, remedy):
 
 def test_another_robot_and_the_other_convention_are_named():
     seen = seen_of()
-    assert '--chain ur10e' in str(explained(Problem(load_chain('ur5e'), seen)))
+    sister = load_chain('ur5e')
+    shifted = replace(sister, joints=(replace(sister.joints[0], b=1e-3), *sister.joints[1:]))
+    for chain in (sister, shifted):
+        assert '--chain ur10e' in str(explained(Problem(chain, seen)))
     other = replace(UR, convention='modified', parallel=None)
     assert 'convention: standard' in str(explained(Problem(other, seen)))
 

@@ -16,6 +16,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
@@ -37,6 +38,19 @@ def found():
 def document(found):
     """Return what its file holds, without the region, which takes long to read."""
     return yaml.safe_load(replace(found, record={**found.record, 'region': None}).dump())
+
+
+@pytest.mark.parametrize(('a', 'true'), [(0.043, 0.045), (0.045, 0.043)])
+def test_axes_that_coincide_in_one_of_two_arms_keep_the_parameters_of_the_nominal_one(a, true):
+    rng = np.random.default_rng(1)
+    nominal = Chain('arm', 'standard', (Joint('table', a=a, d=0.3), *UR.joints))
+    real = nominal.with_offsets({'table.a': true - a, 'table.b': 4e-4, 'elbow_joint.a': 5e-4})
+    seen = measure(real, real.random_joints(60, rng), rng, 5e-5, 2e-4)
+    result = identify(Problem(nominal, seen))
+    assert result.accepted
+    assert tuple(each.name for each in result.parameters) == nominal.parameter_names
+    read = parse_calibration(Calibration.of(result).dump(), 'c.yaml', nominal)
+    assert read.names == result.names
 
 
 @pytest.mark.parametrize('nominal', [UR, None])

@@ -229,6 +229,14 @@ def test_the_model_is_complete_for_every_architecture(convention, joints):
     assert np.abs(lengths).max() < 0.02  # nothing absurd
 
 
+def test_a_single_linear_joint_has_no_parameter_beside_its_frames():
+    rng = np.random.default_rng(3)
+    rail = Chain('rail', 'standard', (Joint('rail', 'prismatic'),))
+    result = identify(Problem(rail, measure(rail, rail.random_joints(30, rng), rng, 1e-5, 1e-4)))
+    assert not any(name.of_dh for name in result.names)
+    assert not result.accepted
+
+
 @pytest.mark.parametrize(
     ('setting', 'value'),
     [

@@ -66,6 +66,9 @@ def test_axes_that_coincide_may_be_shifted_both_ways(a, degrees, kinds, conventi
     assert chain.table.shape == (2, 5)
     table = chain.with_offsets({'j1.b': 0.1}).table
     assert table[:, 5].tolist() == [0.1, 0.0]
+    if 'b' in kinds:  # a shift that was found has its parameter, however far the axes are apart
+        moved = chain.with_offsets({f'{row}.a': 0.1, f'{row}.b': 1e-3})
+        assert moved.parameter_names == chain.parameter_names
 
 
 @pytest.mark.parametrize(

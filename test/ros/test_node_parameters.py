@@ -207,8 +207,10 @@ def test_a_serial_number_is_text(word, meant):
     ],
 )
 def test_a_parameter_file_of_other_nodes_is_refused(tmp_path, keys, applies):
-    """ROS ignores it: the node would run with its defaults."""
+    """ROS ignores it: the node would run with its defaults. One of comments only is none."""
     path = tmp_path / 'parameters.yaml'
+    path.write_text('# chain: ur10e')
+    refuse_ignored(['node', '--ros-args', '--params-file', str(path)], '/calibration_node')
     path.write_text(yaml.safe_dump({key: {'ros__parameters': {'chain': 'ur10e'}} for key in keys}))
     words = ['--params-file', str(path), '-r', '__ns:=/cell_1']
     assert ('chain' in parameters_of(words)) == applies
