@@ -54,7 +54,7 @@ def refusals(
     gained = tuple(_of_the_gain(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
-    return (*failed, *gained, *_of_harm(result, validation, may_be_rounding, helps))
+    return (*failed, *gained, *_of_harm(validation, may_be_rounding, helps))
 
 
 def _of_the_fit(
@@ -153,9 +153,7 @@ def percent(share: float) -> str:
     return np.format_float_positional(100.0 * share, 2, fractional=False, trim='-')
 
 
-def _of_harm(
-    result: Identification, validation: Comparison, may_be_rounding: bool, helps: bool
-) -> Iterator[Reason]:
+def _of_harm(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iterator[Reason]:
     if helps and validation.outliers:
         first, second = validation.figures_of_all
         gain, limit = _gain(validation, 'position', validation.counting, CERTAIN)
@@ -173,10 +171,7 @@ def _of_harm(
     before, after = validation.figures
     if after.rms_mrad is not None:
         gain, limit = _gain(validation, 'orientation', validation.deciding)
-        fitted = result.fitted.after
-        equations = np.isfinite([fitted.position, fitted.orientation]).sum()
-        # what it costs to estimate even true parameters
-        if gain < -max(limit, 0.5 * result.rank / equations):
+        if gain < -max(limit, COUNTS):
             yield Reason(
                 Rule.ORIENTATION,
                 f'the orientation got worse on held-out poses (RMS {before.rms_mrad:.3f} mrad '

@@ -34,14 +34,13 @@ def test_no_gain_is_claimed_where_there_is_none():
     assert by_chance
 
 
-def test_orientations_may_get_worse_by_what_it_costs_to_estimate():
-    """30 parameters from 360 equations: 4 %; the loss is the same in all poses."""
+def test_orientations_may_get_worse_by_half_a_per_cent():
+    """As those of a gantry, which turns no pose: the loss is the same in all poses."""
     *_, seen = measured_arm(3, 60)
     problem = Problem(UR10E, seen, **SIGMAS)
     result = identify(problem)
-    assert (result.accepted, result.rank) == (True, 30)
     held_out = result.validation
-    for loss, refused in ((1.035, False), (1.05, True)):
+    for loss, refused in ((1.004, False), (1.006, True)):
         after = replace(held_out.after, orientation=loss * held_out.before.orientation)
         judged = replace(result, validation=replace(held_out, after=after))
         rules = [each.rule for each in refusals(problem, judged, None, False, True)]
