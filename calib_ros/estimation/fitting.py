@@ -323,7 +323,7 @@ def parameter_rows(
     freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
     free = set(problem.free)
     rows = []
-    for name in chain.parameter_names:
+    for name in problem.model.parameter_names:
         if name in std:
             status = 'fitted'
         elif name in structural:

@@ -150,9 +150,9 @@ class Chain(Shown):
         cameras = [name for name in frames if frames[name].lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         parallel = frozenset(self.parallel or ())
-        coincident = parallel.intersection(self._joining(nearly_coincident))
-        for joint in self.joints:
-            beside = joint.name in coincident  # theta comes last: it trades against beta and b
+        coincident = self._joining(nearly_coincident)
+        for joint in self.joints:  # theta comes last if it trades against beta and b
+            beside = joint.name in parallel and (joint.name in coincident or joint.b != 0.0)
             left_out = 'd' if joint.name in parallel else 'beta', '' if beside else 'b'
             own = [name for name in joint.parameters if name.kind not in left_out]
             names += sorted(own, key=lambda name: name.kind == 'theta') if beside else own
