@@ -85,7 +85,7 @@ def exports(
     q = anywhere(chain)
     arm = replace(chain, effects=())
     wanted = arm.forward(q)
-    lost = _distance(chain.forward(q), replace(chain, effects=nominal.effects).forward(q))
+    lost = distance(chain, replace(chain, effects=nominal.effects), q)
     counting = ', with the effects of the nominal chain' * bool(nominal.effects)
     digest = table_hash(chain)
     found = []
@@ -108,7 +108,7 @@ def exports(
         ('joint_offsets.csv', ('zero',), 'nominal table with corrected joint offsets only'),
     ):
         best = _approximated(chain, nominal, kinds, region)
-        error = _distance(best.forward(region), chain.forward(region))
+        error = distance(best, chain, region)
         text = _csv(best, f'{nominal.convention} {what}{counting}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
@@ -267,8 +267,11 @@ def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: f
     return Export(name, text, lost)
 
 
-def _distance(first: FloatArray, second: FloatArray) -> float:
-    return float(np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max())
+def distance(first: Chain, second: Chain, joints: FloatArray) -> float:
+    """Return the largest distance [m] of two arms at joint values (N, n), by any last moves."""
+    moves = np.random.default_rng(0).choice([-1.0, 1.0], joints.shape)
+    apart = first.forward(joints, moves)[:, :3, 3] - second.forward(joints, moves)[:, :3, 3]
+    return float(se3.norms(apart).max())
 
 
 def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: FloatArray) -> Chain:

@@ -224,7 +224,7 @@ class Chain(Shown):
         for name, _ in added:
             if name.partition('.')[0] not in self._joints:
                 raise UnknownNameError('parameter', name, self.parameter_names)
-            effects.check(name, self.joint_names)
+            effects.resolve(self, name)
         kept = ('joint_names', 'frame_names', 'walk', 'all_frames', '_joints')
         return _with(self, {'effects': (*self.effects, *added)}, kept)
 

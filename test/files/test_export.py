@@ -182,9 +182,10 @@ def test_kinematics_with_prismatic_and_reversed_joints():
     np.testing.assert_allclose(poses, chain.forward(q), rtol=0, atol=1e-12)
 
 
-def test_what_a_table_cannot_say_is_said_at_its_head():
+@pytest.mark.parametrize('effect', ['ratio', 'backlash'])
+def test_what_a_table_cannot_say_is_said_at_its_head(effect):
     nominal, chain = corrected('ur10e')
-    chain = replace(chain, effects=(('elbow_joint.ratio', 1e-3),))
+    chain = replace(chain, effects=((f'elbow_joint.{effect}', 1e-3),))
     table = next(each for each in exports(chain, nominal) if each.name == 'dh_standard.csv')
     assert table.error > 1e-4
     assert 'off the calibrated arm' in table.content.splitlines()[0]
