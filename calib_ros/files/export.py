@@ -125,6 +125,9 @@ def converted(chain: Chain, convention: Convention) -> Chain:
         return chain
     tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
     none, base, tool = dict.fromkeys(TAIL, 0.0), chain.frame('base'), chain.frame('tool')
+    names = chain.joint_names
+    ends = {'modified': (names, names[1:]), 'standard': (names[1:], names)}[convention]
+    moved = dict(zip(*ends, strict=False))
     if convention == 'modified':
         tool = replace(tool, matrix=_tail(**tails[-1]) @ tool.matrix)
         tails = [none, *tails[:-1]]
@@ -132,8 +135,9 @@ def converted(chain: Chain, convention: Convention) -> Chain:
         base = replace(base, matrix=base.matrix @ _tail(**tails[0]))
         tails = [*tails[1:], none]
     joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))
-    frames: dict[str, Any] = {'base': base, 'tool': tool, 'frames': ()}
-    return replace(chain, convention=convention, joints=joints, parallel=None, **frames)
+    parallel = tuple(moved[name] for name in chain.parallel or () if name in moved)
+    more: dict[str, Any] = {'base': base, 'tool': tool, 'frames': (), 'parallel': parallel}
+    return replace(chain, convention=convention, joints=joints, **more)
 
 
 def cut_off(chain: Chain, convention: Convention) -> str:

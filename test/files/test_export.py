@@ -3,6 +3,7 @@
 import csv
 import re
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from calib_ros.files.export import (
     pose_matrix,
 )
 from calib_ros.files.programs import joints_csv
-from calib_ros.kinematics.chain import Chain, Frame, Joint
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.chain_file import (
     dump_chain,
     load_chain,
@@ -69,6 +70,18 @@ def test_axes_that_coincide_are_exact_in_every_form_with_b(convention):
     assert max(by_name[name].error for name in exact) == 0.0
     assert by_name['dh_standard.csv'].content.splitlines()[1].endswith(',beta,b')
     assert 1e-5 < by_name['dh_without_beta.csv'].error < 0.02
+
+
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_the_other_convention_has_the_same_parameters(convention):
+    rows = (Joint('table', alpha=np.radians(14.97)), *load_chain('puma560').joints)
+    nominal = converted(Chain('turned', 'standard', rows), convention)
+    chain = nominal.with_offsets({'table.alpha': 1e-3, 'joint_1.alpha': 1e-3})  # 15.03 degrees
+    kinds = []
+    for each in get_args(Convention):
+        form = converted(chain, each)
+        kinds.append(sorted(n.kind for n in form.parameter_names if n.of_dh))
+    assert kinds[0] == kinds[1]
 
 
 @pytest.mark.parametrize('convention', ['standard', 'modified'])
