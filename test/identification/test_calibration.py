@@ -16,6 +16,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.records import nominal_document
+from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.settings import Settings
@@ -66,6 +67,16 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
         assert getattr(read, name) == getattr(found, name)
     np.testing.assert_allclose(read.before.table, found.before.table, atol=1e-15)
     assert read.record['robot_serial'] == '7'
+
+
+def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
+    rows = (Joint('table'), *UR.joints)
+    nominal = Chain('turned', 'standard', rows)
+    record = {'accepted': True, 'nominal': nominal_document(nominal)}
+    text = dump_chain(nominal.with_offsets({'table.b': 1e-3}), record)
+    assert parse_calibration(text, 'c.yaml').before.value('table.b') == 0.0
+    with pytest.raises(ConfigError, match=r'another nominal chain, with table\.b 0 and not 0\.3'):
+        parse_calibration(text, 'c.yaml', nominal.with_offsets({'table.b': 0.3}))
 
 
 @pytest.mark.parametrize(
