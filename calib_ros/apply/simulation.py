@@ -67,9 +67,13 @@ def measure(
     noise_position: float = 0.0,
     noise_orientation: float = 0.0,
     oriented: bool = True,
+    approach: FloatArray | None = None,
 ) -> Observations:
-    """Measure the poses of a chain at joint values (N, n) with Gaussian noise."""
-    poses = chain.forward(joints)
+    """Measure the poses of a chain at joint values (N, n) with Gaussian noise.
+
+    `approach` (N, n) holds the signs of the preceding moves, for backlash.
+    """
+    poses = chain.forward(joints, approach)
     positions = poses[:, :3, 3] + rng.normal(scale=noise_position, size=(len(joints), 3))
     turns = se3.exp_rotation(rng.normal(scale=noise_orientation, size=(len(joints), 3)))
     return Observations.from_arrays(

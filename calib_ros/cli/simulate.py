@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import common, given
@@ -63,7 +64,8 @@ def _write_simulation(
     configurations = chain.random_joints(options.poses, rng)
     joint_stamps, joints, pose_stamps = drive(configurations, cell, 1_700_000_000_000_000_000)
     standing = np.repeat(configurations, cell.poses_per_dwell, axis=0)
-    poses = measure(true, standing, rng, cell.noise_position, cell.noise_orientation)
+    noise = cell.noise_position, cell.noise_orientation
+    poses = measure(true, standing, rng, *noise, approach=approaches(standing))
     recording = Recording(
         chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
     )

@@ -27,10 +27,11 @@ from calib_ros.sampling.sample import gathered
 from calib_ros.shown import rounded
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
+EARLIER = ('verification.txt',)  # of earlier versions: no verdict stays beside a newer one
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
-    with common.results(options, VERIFICATION_FILES) as contents:
+    with common.results(options, (*VERIFICATION_FILES, *EARLIER)) as contents:
         status = _verified(options, screen, contents)
     if options.out is not None:
         screen.say(common.written(options.out, contents))

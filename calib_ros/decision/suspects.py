@@ -322,7 +322,8 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
-    small = [replace(j, a=SCALES['mm'] * j.a, d=SCALES['mm'] * j.d) for j in chain.joints]
+    size = SCALES['mm']
+    small = [replace(j, a=size * j.a, b=size * j.b, d=size * j.d) for j in chain.joints]
     what = 'the lengths of the chain file are in mm, not metres'
     remedy = 'give a and d in metres there'
     arm = replace(chain, joints=tuple(small))

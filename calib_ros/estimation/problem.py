@@ -139,7 +139,7 @@ class Problem(Shown):
         """
         reach = TOOL
         for joint in self.chain.joints:
-            reach += abs(joint.a) + abs(joint.d)
+            reach += joint.apart + abs(joint.d)
             if joint.type == 'prismatic':
                 ends = joint.lower, joint.upper
                 reach += max(np.inf if end is None else abs(end) for end in ends)

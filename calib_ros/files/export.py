@@ -85,7 +85,7 @@ def exports(
     q = anywhere(chain)
     arm = replace(chain, effects=())
     wanted = arm.forward(q)
-    lost = _distance(chain.forward(q), replace(chain, effects=nominal.effects).forward(q))
+    lost = distance(chain, replace(chain, effects=nominal.effects), q)
     counting = ', with the effects of the nominal chain' * bool(nominal.effects)
     digest = table_hash(chain)
     found = []
@@ -108,7 +108,7 @@ def exports(
         ('joint_offsets.csv', ('zero',), 'nominal table with corrected joint offsets only'),
     ):
         best = _approximated(chain, nominal, kinds, region)
-        error = _distance(best.forward(region), chain.forward(region))
+        error = distance(best, chain, region)
         text = _csv(best, f'{nominal.convention} {what}{counting}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
@@ -125,6 +125,9 @@ def converted(chain: Chain, convention: Convention) -> Chain:
         return chain
     tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
     none, base, tool = dict.fromkeys(TAIL, 0.0), chain.frame('base'), chain.frame('tool')
+    names = chain.joint_names
+    ends = {'modified': (names, names[1:]), 'standard': (names[1:], names)}[convention]
+    moved = dict(zip(*ends, strict=False))
     if convention == 'modified':
         tool = replace(tool, matrix=_tail(**tails[-1]) @ tool.matrix)
         tails = [none, *tails[:-1]]
@@ -132,8 +135,9 @@ def converted(chain: Chain, convention: Convention) -> Chain:
         base = replace(base, matrix=base.matrix @ _tail(**tails[0]))
         tails = [*tails[1:], none]
     joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))
-    frames: dict[str, Any] = {'base': base, 'tool': tool, 'frames': ()}
-    return replace(chain, convention=convention, joints=joints, parallel=None, **frames)
+    parallel = tuple(moved[name] for name in chain.parallel or () if name in moved)
+    more: dict[str, Any] = {'base': base, 'tool': tool, 'frames': (), 'parallel': parallel}
+    return replace(chain, convention=convention, joints=joints, **more)
 
 
 def cut_off(chain: Chain, convention: Convention) -> str:
@@ -267,8 +271,11 @@ def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: f
     return Export(name, text, lost)
 
 
-def _distance(first: FloatArray, second: FloatArray) -> float:
-    return float(np.linalg.norm(first[:, :3, 3] - second[:, :3, 3], axis=1).max())
+def distance(first: Chain, second: Chain, joints: FloatArray) -> float:
+    """Return the largest distance [m] of two arms at joint values (N, n), by any last moves."""
+    moves = np.random.default_rng(0).choice([-1.0, 1.0], joints.shape)
+    apart = first.forward(joints, moves)[:, :3, 3] - second.forward(joints, moves)[:, :3, 3]
+    return float(se3.norms(apart).max())
 
 
 def _approximated(chain: Chain, nominal: Chain, kinds: Sequence[str], joints: FloatArray) -> Chain:

@@ -131,8 +131,7 @@ def vendor_files(
             continue
         places, reference = layouts[1]
         q = export.anywhere(chain)
-        shift = chain.forward(q)[:, :3, 3] - arm.forward(q)[:, :3, 3]
-        lost = float(np.linalg.norm(shift, axis=1).max())
+        lost = export.distance(chain, arm, q)
         text = export.head(chain, 'kinematics', lost, table_hash(chain))
         text += _document(vendor, places, origin, checksum)
         again = forward_of(text, vendor, q)

@@ -112,7 +112,7 @@ class Record:
             row = rows.get(name)
             kinds = ROW_KINDS if isinstance(row, list) and len(row) > len(DH_KINDS) else DH_KINDS
             numbers = parse_numbers(row, len(kinds), f'{self.where}: nominal {name}')
-            found[name] = dict(zip(kinds, numbers.tolist(), strict=True))
+            found[name] = {'b': 0.0, **dict(zip(kinds, numbers.tolist(), strict=True))}
         return found
 
     def nominal(self, chain: Chain) -> Chain:

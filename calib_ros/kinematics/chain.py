@@ -150,10 +150,9 @@ class Chain(Shown):
         cameras = [name for name in frames if frames[name].lens is not None]
         names += [name for camera in cameras for name in parameters_of(camera, LENS_KINDS)]
         parallel = frozenset(self.parallel or ())
-        shifted = (joint.name for joint in self.joints if joint.b)  # by a fit, perhaps further
-        coincident = parallel.intersection((*self._joining(nearly_coincident), *shifted))
-        for joint in self.joints:
-            beside = joint.name in coincident  # theta comes last: it trades against beta and b
+        coincident = self._joining(nearly_coincident)
+        for joint in self.joints:  # theta comes last if it trades against beta and b
+            beside = joint.name in parallel and (joint.name in coincident or joint.b != 0.0)
             left_out = 'd' if joint.name in parallel else 'beta', '' if beside else 'b'
             own = [name for name in joint.parameters if name.kind not in left_out]
             names += sorted(own, key=lambda name: name.kind == 'theta') if beside else own
@@ -225,7 +224,7 @@ class Chain(Shown):
         for name, _ in added:
             if name.partition('.')[0] not in self._joints:
                 raise UnknownNameError('parameter', name, self.parameter_names)
-            effects.check(name, self.joint_names)
+            effects.resolve(self, name)
         kept = ('joint_names', 'frame_names', 'walk', 'all_frames', '_joints')
         return _with(self, {'effects': (*self.effects, *added)}, kept)
 

@@ -182,18 +182,20 @@ def _first_frame(joint: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def with_common_normals(chain: Chain) -> Chain:
-    """Return the same arm without beta, except between axes closer than PARALLEL_TOLERANCE."""
+    """Return the same arm without b, and beta only between axes closer than PARALLEL_TOLERANCE."""
     rows = list(chain.joints)
     for i in range(len(rows) - 1):
         k = i if chain.convention == 'standard' else i + 1  # row of the bend
-        row = replace(rows[i], a=rows[k].a, alpha=rows[k].alpha, beta=rows[k].beta)
-        if not row.beta or row.tilt < np.sin(PARALLEL_TOLERANCE):
+        bend = rows[k]
+        row = replace(rows[i], a=bend.a, alpha=bend.alpha, beta=bend.beta, b=bend.b)
+        close = row.tilt < np.sin(PARALLEL_TOLERANCE)
+        if not row.b and (close or not row.beta):
             continue
         end = _ends(Chain('row', 'standard', (row,)))[0]
-        plain = _towards(row, np.eye(4), end[:3, 2], end[:3, 3], common_normal=True)
+        plain = _towards(row, np.eye(4), end[:3, 2], end[:3, 3], common_normal=not close)
         rest = se3.invert(_ends(Chain('row', 'standard', (plain,)))[0]) @ end
         rows[i] = replace(rows[i], theta=plain.theta, d=plain.d)
-        rows[k] = replace(rows[k], a=plain.a, alpha=plain.alpha, beta=0.0)
+        rows[k] = replace(rows[k], a=plain.a, alpha=plain.alpha, beta=plain.beta, b=0.0)
         turn = float(np.arctan2(rest[1, 0], rest[0, 0]))
         later = rows[i + 1]
         rows[i + 1] = replace(later, theta=later.theta + turn, d=later.d + float(rest[2, 3]))
@@ -235,6 +237,7 @@ def _towards(
         a=_clean(a),
         alpha=_clean_angle(float(np.arctan2(-across, z[2]))),
         beta=_clean_angle(float(np.arcsin(along))) if parallel else 0.0,
+        b=0.0,
     )
 
 

@@ -335,10 +335,11 @@ def priors_in_words(result: Identification) -> list[str]:
         for name, sigma in result.priors.items()
         if name not in known
     ]
-    groups: dict[str, list[str]] = {}
+    groups: dict[tuple[str, str], list[str]] = {}
     for name in known:
-        groups.setdefault(effects.group_of(name), []).append(name)
-    for group, names in groups.items():
+        key = effects.group_of(name), Parameter(name).unit
+        groups.setdefault(key, []).append(name)
+    for (group, _), names in groups.items():
         size = _in_thousandths(names[0], result.priors[names[0]])
         lines.append(f'prior on {len(names)} parameters of {group}: {size}')
     return lines

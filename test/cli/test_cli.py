@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from calib_ros.cli.common import SETTINGS, Status
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
 from calib_ros.identification.calibration import load_calibration
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.settings import Settings
 
 
@@ -159,6 +160,21 @@ def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
         run('simulate', bag, '--chain', 'ur5e', '--poses', 3, '--seed', seed)
         truths[name] = (tmp_path / f'{name}_truth.yaml').read_text()
     assert truths['a'] == truths['b'] != truths['c']
+
+
+def test_a_simulated_arm_has_the_backlash_of_its_chain(run, tmp_path):
+    slack = load_chain('ur10e_on_linear_axis')
+    slack = slack.with_effects(['linear_axis_joint.play', 'elbow_joint.backlash'])
+    (tmp_path / 'slack.yaml').write_text(dump_chain(slack))
+    bag, out = tmp_path / 'bag', tmp_path / 'result'
+    run('simulate', bag, '--chain', tmp_path / 'slack.yaml')
+    run('identify', bag, '--chain', 'ur10e_on_linear_axis', '--model', 'backlash', '--out', out)
+    truth, found = load_chain(tmp_path / 'bag_truth.yaml'), load_chain(out / 'calibration.yaml')
+    for name, value in truth.effects:
+        assert found.value(name) == pytest.approx(value, abs=5e-5), name
+    report = (out / 'report.md').read_text()
+    for size in ('prior on 1 parameters of backlash: .* mm', '6 parameters of backlash: .* mrad'):
+        assert re.search(size, report)
 
 
 def test_demo_shows_the_whole_way(run, tmp_path):

@@ -248,9 +248,12 @@ def test_another_robot_and_the_other_convention_are_named():
     assert 'convention: standard' in str(explained(Problem(other, seen)))
 
 
-def test_a_chain_file_in_millimetres_is_named():
-    rows = tuple(replace(joint, a=1e3 * joint.a, d=1e3 * joint.d) for joint in UR.joints)
-    named = identify(Problem(replace(UR, joints=rows), seen_of())).refusals[0]
+@pytest.mark.parametrize('b', [0.0, 0.3])
+def test_a_chain_file_in_millimetres_is_named(b):
+    first, *others = UR.joints
+    arm = replace(UR, joints=(replace(first, b=b), *others))
+    rows = tuple(replace(j, a=1e3 * j.a, b=1e3 * j.b, d=1e3 * j.d) for j in arm.joints)
+    named = identify(Problem(replace(arm, joints=rows), seen_of(arm))).refusals[0]
     assert 'the lengths of the chain file are in mm, not metres' in named
 
 

@@ -3,6 +3,7 @@
 import csv
 import re
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from calib_ros.files.export import (
     pose_matrix,
 )
 from calib_ros.files.programs import joints_csv
-from calib_ros.kinematics.chain import Chain, Frame, Joint
+from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.chain_file import (
     dump_chain,
     load_chain,
@@ -69,6 +70,18 @@ def test_axes_that_coincide_are_exact_in_every_form_with_b(convention):
     assert max(by_name[name].error for name in exact) == 0.0
     assert by_name['dh_standard.csv'].content.splitlines()[1].endswith(',beta,b')
     assert 1e-5 < by_name['dh_without_beta.csv'].error < 0.02
+
+
+@pytest.mark.parametrize('convention', ['standard', 'modified'])
+def test_the_other_convention_has_the_same_parameters(convention):
+    rows = (Joint('table', alpha=np.radians(14.97)), *load_chain('puma560').joints)
+    nominal = converted(Chain('turned', 'standard', rows), convention)
+    chain = nominal.with_offsets({'table.alpha': 1e-3, 'joint_1.alpha': 1e-3})  # 15.03 degrees
+    kinds = []
+    for each in get_args(Convention):
+        form = converted(chain, each)
+        kinds.append(sorted(n.kind for n in form.parameter_names if n.of_dh))
+    assert kinds[0] == kinds[1]
 
 
 @pytest.mark.parametrize('convention', ['standard', 'modified'])
@@ -182,9 +195,10 @@ def test_kinematics_with_prismatic_and_reversed_joints():
     np.testing.assert_allclose(poses, chain.forward(q), rtol=0, atol=1e-12)
 
 
-def test_what_a_table_cannot_say_is_said_at_its_head():
+@pytest.mark.parametrize('effect', ['ratio', 'backlash'])
+def test_what_a_table_cannot_say_is_said_at_its_head(effect):
     nominal, chain = corrected('ur10e')
-    chain = replace(chain, effects=(('elbow_joint.ratio', 1e-3),))
+    chain = replace(chain, effects=((f'elbow_joint.{effect}', 1e-3),))
     table = next(each for each in exports(chain, nominal) if each.name == 'dh_standard.csv')
     assert table.error > 1e-4
     assert 'off the calibrated arm' in table.content.splitlines()[0]

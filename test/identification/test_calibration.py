@@ -82,6 +82,16 @@ def test_a_calibration_that_was_loaded_knows_what_the_one_saved_knew(found, nomi
     assert read.record['robot_serial'] == '7'
 
 
+def test_the_nominal_chain_of_axes_that_coincide_has_no_b():
+    rows = (Joint('table'), *UR.joints)
+    nominal = Chain('turned', 'standard', rows)
+    record = {'accepted': True, 'nominal': nominal_document(nominal)}
+    text = dump_chain(nominal.with_offsets({'table.b': 1e-3}), record)
+    assert parse_calibration(text, 'c.yaml').before.value('table.b') == 0.0
+    with pytest.raises(ConfigError, match=r'another nominal chain, with table\.b 0 and not 0\.3'):
+        parse_calibration(text, 'c.yaml', nominal.with_offsets({'table.b': 0.3}))
+
+
 @pytest.mark.parametrize(
     ('key', 'change'),
     [

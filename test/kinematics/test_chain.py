@@ -72,6 +72,22 @@ def test_axes_that_coincide_may_be_shifted_both_ways(a, degrees, kinds, conventi
 
 
 @pytest.mark.parametrize(
+    ('given', 'offsets'),
+    [
+        ({'b': 0.3}, {}),
+        ({'a': 0.0434, 'b': 0.0}, {'j1.a': 5e-4, 'j1.b': 5e-4}),
+        ({'alpha': np.radians(14.97)}, {'j1.alpha': 1e-3, 'j1.b': 5e-4}),
+    ],
+    ids=['given', 'further apart', 'more tilted'],
+)
+def test_a_shift_b_of_parallel_axes_stays_a_parameter(given, offsets):
+    rows = (Joint('j1', **given), Joint('j2', alpha=np.pi / 2))
+    chain = Chain('arm', 'standard', rows).with_offsets(offsets)
+    own = [n.kind for n in chain.parameter_names if n.owner == 'j1']
+    assert own == ['a', 'alpha', 'beta', 'b', 'theta']
+
+
+@pytest.mark.parametrize(
     ('kind', 'lower', 'upper', 'expected'),
     [
         ('revolute', None, None, (-np.pi, np.pi)),

@@ -244,6 +244,12 @@ def test_unknown_effects_are_named_with_the_alternatives(name, alternative):
     assert alternative in str(caught.value).partition('valid:')[2]
 
 
+@pytest.mark.parametrize('name', ['linear_axis_joint.backlash', 'elbow_joint.play'])
+def test_play_is_that_of_the_joints_type(name):
+    with pytest.raises(UnknownNameError, match='did you mean'):
+        load_chain('ur10e_on_linear_axis').with_effect_values({name: 1e-4})
+
+
 def rich(rng):
     """Return a chain with everything that a chain file can hold."""
     chain = faulty(loaded(UR10E, rng), Cell(), rng)

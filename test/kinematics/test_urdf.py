@@ -30,9 +30,9 @@ from calib_ros.cli.main import main
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain
+from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
-from calib_ros.kinematics.urdf import chain_from_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf, with_common_normals
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
@@ -103,6 +103,20 @@ def test_lengths_stay_small_at_every_angle_between_axes(angle, heading, half, se
     assert bool(chain.parallel) == (chain.joints[0].d == 0.0)
     largest = 4.0 if chain.parallel else 4.0 / np.sin(angle)
     assert np.abs(chain.table[:, [0, 2]]).max() < largest
+
+
+@pytest.mark.parametrize(
+    ('b', 'beta', 'left'), [(0.1, 0.2, 0.0), (0.1, 0.0, 0.0), (0.3, 1e-3, 1e-3)]
+)
+@pytest.mark.parametrize('convention', CONVENTIONS)
+def test_common_normals_take_in_b_and_beta(convention, b, beta, left):
+    rows = (Joint('j1'), Joint('j2', b=b, beta=beta), Joint('j3', alpha=1.1, d=0.1))
+    chain = Chain('arm', convention, rows)
+    found = with_common_normals(chain)
+    q = chain.random_joints(20, np.random.default_rng(0))
+    assert found.forward(q) == pytest.approx(chain.forward(q), abs=1e-12)
+    assert max(abs(joint.b) for joint in found.joints) == 0.0
+    assert max(abs(joint.beta) for joint in found.joints) <= left
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
