@@ -147,11 +147,7 @@ def _widened(fitted: Fitted, held: tuple[str, ...]) -> Fitted:
     slopes = -solve_triangular(factor[:count, :count], factor[:count, count:])
     stds = fitted.posterior(fitted.size, judging=False).stds_of(held)
     shared = (slopes * stds**2) @ slopes.T
-    uncertainty = identifiability.Uncertainty(
-        np.concatenate([fitted.uncertainty.parts, shared[np.newaxis]]),
-        np.append(fitted.uncertainty.freedom, np.inf),
-    )
-    return replace(fitted, uncertainty=uncertainty, held=(held, slopes))
+    return replace(fitted, uncertainty=fitted.uncertainty.with_part(shared), held=(held, slopes))
 
 
 def _excited_names(

@@ -35,7 +35,7 @@ from calib_ros.estimation.leastsquares import Fit, System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -262,6 +262,13 @@ def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> t
     total = sum(int(samples.observations.stops[-1]) + 1 for samples in system.sets)
     share = max(1, -(-total // most))
     return _gather(chain, names, system, share, most // 20), share
+
+
+def joints_of_places(chain: Chain) -> Index:
+    """Return the joint (D,) of each column of the places of stops, -1 for that of their set."""
+    circular = np.array([joint.type == 'revolute' for joint in chain.joints])
+    one, other = np.flatnonzero(circular), np.flatnonzero(~circular)
+    return np.concatenate([one, one, other, [-1]])
 
 
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> Stops:

@@ -32,7 +32,7 @@ from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.shared_errors import Stops, gathered, nonnegative
+from calib_ros.estimation.shared_errors import Stops, gathered, joints_of_places, nonnegative
 from calib_ros.estimation.sizes import solved
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
@@ -89,12 +89,9 @@ def _tilted(
     chain: Chain, names: Sequence[str], count: int, units: Stops, share: int
 ) -> FloatArray:
     """Return J^T K J (P, P) of tilts of all joints, for the first `count` of the names."""
-    circular = np.array([joint.type == 'revolute' for joint in chain.joints])
-    one, other = np.flatnonzero(circular), np.flatnonzero(~circular)
-    joint_of = np.concatenate([one, one, other, [-1]])  # columns of their places
     middle = np.zeros((count, count))
     for tilt in turns_and_tilts(chain)[1]:
-        place = units.place[:, joint_of == chain.joint_names.index(tilt.owner)]
+        place = units.place[:, joints_of_places(chain) == chain.joint_names.index(tilt.owner)]
         kernel = share**2 * np.exp(-cdist(place, place))
         np.fill_diagonal(kernel, share)
         own = names.index(tilt)

@@ -66,8 +66,8 @@ GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 
 twice that; others are found from data (`identify_model`). `coupling` is that of the wrist, the
 last three joints."""
 EXPECTED = dict.fromkeys(GROUPS, 1e-4) | dict.fromkeys(('gravity', 'compliance', 'backlash'), 3e-4)
-"""Typical size [rad] of an effect by group: a third of an arc minute for drives, an arc minute for
-bending (at a torque arm of a metre) and play."""
+"""Typical size [rad or m] of an effect by group: a third of an arc minute for drives, an arc
+minute for bending (at a torque arm of a metre) and play; 0.3 mm for that of linear joints."""
 
 
 @lru_cache(maxsize=1024)
