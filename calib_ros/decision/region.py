@@ -22,8 +22,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.drift import inverse_root
-from calib_ros.decision.packing import damaged, packed, parse_rows, unpacked
-from calib_ros.errors import UnknownNameError
+from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.evidence import Mixed, Posterior, with_unmodelled
 from calib_ros.estimation.levels import KNOWN, UNUSUAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
@@ -31,7 +30,7 @@ from calib_ros.estimation.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import Flags, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray
 from calib_ros.shown import Shown
 
 RISK = 0.02
@@ -131,6 +130,43 @@ def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
     flat = rows.reshape(-1, rows.shape[2])
     squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+
+
+def packed(square: FloatArray) -> list[str]:
+    """Return the rows of the lower Cholesky factor of a positive matrix (P, P) as text."""
+    scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
+    scaled = square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+    root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
+    return [' '.join(f'{x:.9e}' for x in row[: k + 1]) for k, row in enumerate(root)]
+
+
+def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:
+    """Return the matrix (P, K) of rows of numbers, up to the diagonal if `triangular`.
+
+    Raises ValueError if the number or length of the rows is wrong, or a value is not finite.
+    """
+    numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
+    widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
+    matrix = np.zeros((count, max(widths, default=0)))
+    whole = True
+    for row, given, width in zip(matrix, numbers, widths, strict=True):
+        whole = whole and len(given) == width
+        row[:width] = given if whole else np.nan
+    if not np.isfinite(matrix).all():
+        raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
+    return matrix
+
+
+def unpacked(rows: Sequence[str], size: int) -> FloatArray:
+    """Return the matrix (P, P) from the rows of `packed`."""
+    root = parse_rows(rows, size, triangular=True)
+    return np.asarray(root @ root.T)
+
+
+def damaged(key: str, where: str, err: Exception | None = None) -> ConfigError:
+    """Return the error for a damaged part of a record."""
+    kind = '' if err is None else f' ({type(err).__name__})'
+    return ConfigError(f'{where}: calibration.{key} is damaged{kind}: identify again')
 
 
 def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Region | None:

@@ -26,8 +26,7 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.decision.packing import packed
-from calib_ros.decision.region import Region, region_of_record, sigma_of
+from calib_ros.decision.region import Region, packed, region_of_record, sigma_of
 from calib_ros.decision.result import Identification
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.estimation.levels import ALIKE

@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.packing import damaged, unpacked
+from calib_ros.decision.region import damaged, unpacked
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations

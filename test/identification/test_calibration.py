@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.packing import unpacked
+from calib_ros.decision.region import unpacked
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
