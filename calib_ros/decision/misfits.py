@@ -1,21 +1,26 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Are the outliers of a robust fit gross errors, or the arm's own behaviour (docs/model.md)?"""
+"""What a fit leaves: gross errors, or behaviour of the arm that its model lacks."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import special
 
 from calib_ros.decision.drift import chance
+from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL, stops
+from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import CERTAIN, FEW, SURE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, Robust
+from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS, Robust
 from calib_ros.estimation.samples import residual_arrays
+from calib_ros.kinematics import effects
+from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
 
@@ -120,3 +125,34 @@ def _with_a_joint(problem: Problem, joints: FloatArray, outliers: Flags) -> tupl
     variance = off.sum() * (1.0 - off.mean())  # of each wave for random outliers
     anywhere = len(names) * float(np.exp(-0.5 * shifted[most, 0] / variance))
     return names[most], max(anywhere, chance(shifted.max(axis=0)))
+
+
+def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:
+    """Return the share of the residuals that couplings of the wrist explain, if most of it.
+
+    `noise` is the size of the residuals [sigma given].
+    """
+    known = [name for name, _ in chain.effects]
+    added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
+    if not added or noise < SUSPICIOUS:  # nothing is left to explain
+        return 0.0
+    share = explained(problem, chain.with_effects([*known, *added]), names, added)
+    return share if share >= EXPLAINED else 0.0
+
+
+def explained(
+    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
+) -> float:
+    """Return the share of the residual squares that added parameters explain, linearly."""
+    few = [each.spread() for each in problem.sets]
+    rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
+    count = len(fitted)
+    if len(rows) - count - len(added) < len(rows) // 3:
+        return 0.0
+    scale = np.linalg.norm(rows, axis=0)
+    scale[scale == 0.0] = 1.0
+    factor = np.asarray(np.linalg.qr(rows / scale, mode='r'))
+    rest = factor[count:, count:]  # beyond the fitted parameters
+    left = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
+    total = float(rest[:, -1] @ rest[:, -1])
+    return 1.0 - float(left @ left) / total if total > 0.0 else 0.0

@@ -16,6 +16,10 @@ show the ratio of its sides; the arm absorbs the scale of both together, which i
 Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
 leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
 
+Lag. A device that smooths, late stamps or a creeping arm measure each pose towards the previous
+stop, at joint values q_i - w (q_i - q_i-1): a delay w with the last move as velocity. The arm
+imitates what depends on q_i alone, and may become worse; the rest is most of the residuals.
+
 Order. If one joint only goes one way during the session, what drifts with time is fitted as its
 error, and no test can tell them apart.
 
@@ -26,13 +30,13 @@ the poses add nothing to the priors.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy import special
 
 from calib_ros.decision.acceptance import grown, out_of_scale, percent
+from calib_ros.decision.misfits import explained
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
@@ -40,19 +44,24 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.identifiability import growth
-from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.identifiability import followed
 from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, TELLING, chance_of
-from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
+from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.samples import seen_residuals
 from calib_ros.estimation.sizes import SPREAD, TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.parameter import IN_A_FRAME, LENS_KINDS, parameters_of
+from calib_ros.kinematics.parameter import (
+    DELAY,
+    IN_A_FRAME,
+    LENS_KINDS,
+    Parameter,
+    parameters_of,
+)
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION
 
@@ -104,7 +113,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
     found = (scale, sister, lens, board, gravity, coupled, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
-    return replace(result, remarks=remarks, refusals=tuple(refusals))
+    return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
 
 def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:
@@ -119,9 +128,11 @@ def scale_of(problem: Problem, result: Identification) -> tuple[float, float, fl
     if len(fitted) < 3 or not lengths:
         return 0.0, np.inf, 0.0
     ends, joints = (first.base, first.tool), first.spread().joints
-    grown = growth(chain, result.names, lengths, ends, joints, bool(first.oriented.any()))
+    lever = float(first.oriented.any())  # rotations count if they were measured
+    changes, _, _ = followed(chain, result.names, [*lengths], joints, lever, ends)
+    growth = changes @ [*lengths.values()]
     offsets = np.array([chain.offset(result.names[i], problem.model) for i in fitted])
-    return _common(offsets, grown[fitted], result.covariance[np.ix_(fitted, fitted)])
+    return _common(offsets, growth[fitted], result.covariance[np.ix_(fitted, fitted)])
 
 
 def _common(
@@ -236,6 +247,39 @@ def _order(problem: Problem) -> str:
     return ''
 
 
+def _lag(problem: Problem, result: Identification) -> Identification:
+    """Return the result with the lag that explains most of its residuals, refused if it harms."""
+    known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
+    first, *more = map(_with_moves, problem.sets)
+    stands = all(each.velocity is None and each.pixels is None for each in problem.sets)
+    bases = {each.base for each in (first, *more) if each.moving}
+    if result.noise.position <= 1.0 or known or not stands or not bases:
+        return result
+    late, chain = replace(problem, observations=first, more=more, held_out=()), result.chain
+    for name in bases:
+        chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
+    delays = [Parameter(name, DELAY) for name in sorted(bases)]
+    share = explained(late, chain, result.names, delays)
+    if share < EXPLAINED:
+        return result
+    text = (
+        f'poses lie towards the previous stop, which explains {100.0 * share:.0f} % of the '
+        'residuals: the device smooths, stamps are late, or the arm creeps. Set settle to the '
+        'time until measurements rest, and stop for longer'
+    )
+    if _imitated(late, result):
+        return replace(result, refusals=(Reason(Rule.LAG, text), *result.refusals))
+    return replace(result, remarks=(*result.remarks, text))
+
+
+def _with_moves(each: Observations) -> Observations:
+    """Return poses with the move from the previous stop (N, n) as velocity."""
+    order = np.argsort(each.stamps_ns, kind='stable')
+    moves = np.zeros_like(each.joints)
+    moves[order[1:]] = np.diff(each.joints[order], axis=0)
+    return replace(each, velocity=moves, delay=np.zeros(len(each)))
+
+
 def _sigmas(problem: Problem, result: Identification) -> str:
     noise, found = result.noise, []
     if noise.consistent or any(each.pixels is not None for each in problem.sets):
@@ -289,7 +333,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
             continue
         fitted = replace(frame, lens=replace(frame.lens, fixed=False))
         freed = replace(problem, chain=problem.chain.with_frame(camera, fitted))
-        imitates = imitated(freed, result)
+        imitates = _imitated(freed, result)
         share = 1.0 - left * freedom / rest
         if imitates or share > EXPLAINED:
             lens = 'lens=fitted in sources' if problem.of_messages else '--lens fitted'
@@ -299,7 +343,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
     return '', False
 
 
-def imitated(freed: Problem, result: Identification) -> bool:
+def _imitated(freed: Problem, result: Identification) -> bool:
     """Tell whether a fit with more freedom finds another arm, within the region of this one."""
     try:
         other = fit(freed)[2].chain
@@ -343,34 +387,3 @@ def _board(problem: Problem, result: Identification) -> str:
                 'unstretched, else the arm becomes as wrong'
             )
     return ''
-
-
-def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:
-    """Return the share of the residuals that couplings of the wrist explain, if most of it.
-
-    `noise` is the size of the residuals [sigma given].
-    """
-    known = [name for name, _ in chain.effects]
-    added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
-    if not added or noise < SUSPICIOUS:  # nothing is left to explain
-        return 0.0
-    share = explained(problem, chain.with_effects([*known, *added]), names, added)
-    return share if share >= EXPLAINED else 0.0
-
-
-def explained(
-    problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
-) -> float:
-    """Return the share of the residual squares that added parameters explain, linearly."""
-    few = [each.spread() for each in problem.sets]
-    rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
-    count = len(fitted)
-    if len(rows) - count - len(added) < len(rows) // 3:
-        return 0.0
-    scale = np.linalg.norm(rows, axis=0)
-    scale[scale == 0.0] = 1.0
-    factor = np.asarray(np.linalg.qr(rows / scale, mode='r'))
-    rest = factor[count:, count:]  # beyond the fitted parameters
-    left = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
-    total = float(rest[:, -1] @ rest[:, -1])
-    return 1.0 - float(left @ left) / total if total > 0.0 else 0.0

@@ -9,7 +9,7 @@ matrix, which squares the condition number.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -156,22 +156,6 @@ def identifiable_and_held(
         found = structurally_independent(chain, others, kinds, extra)
         held = [longest, *(name for name in visible if name not in (*found, longest))]
     return found, tuple(held)
-
-
-def growth(
-    chain: Chain,
-    names: Sequence[str],
-    lengths: Mapping[str, float],
-    ends: tuple[str, str],
-    joints: FloatArray,
-    oriented: bool,
-) -> FloatArray:
-    """Return the growth (P,) of named parameters as other `lengths` [m] of a chain grow.
-
-    By positions between the ends at joint values (N, n), and rotations if `oriented`.
-    """
-    changes, _, _ = followed(chain, names, [*lengths], joints, float(oriented), ends)
-    return np.asarray(changes @ [*lengths.values()])
 
 
 def followed(

@@ -17,10 +17,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.decision import lag, mistakes, suspicions
+from calib_ros.decision import mistakes, suspicions
 from calib_ros.decision.acceptance import refusals, remarks
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, outliers_of
+from calib_ros.decision.misfits import arms_own, lacking, outliers_of
 from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded, rounding_errors
@@ -84,7 +84,7 @@ def _identified(
     progress(2 / 3)
     validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
     coarse = rounded(problem)
-    share = suspicions.lacking(problem, chain, names, fitted.noise.position)
+    share = lacking(problem, chain, names, fitted.noise.position)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
     posterior = fitted.posterior(size, more, doubts)
@@ -127,7 +127,7 @@ def _identified(
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
-    return lag.remarked(problem, suspicions.remarked(problem, named, another=named is result))
+    return suspicions.remarked(problem, named, another=named is result)
 
 
 def _region(
