@@ -11,14 +11,22 @@ weights by distance until they converge (Holland and Welsch 1977):
     huber        w = min(1, INNER / distance)              (Huber 1964)
 
 If that finds outliers, or larger residuals than the given sigmas explain, the fit is repeated from
-the best half of the samples (`trimmed.py`): gross errors may agree with each other, and are then a
-second model.
+the best half of the samples: gross errors may agree with each other, and are then a second model.
+
+The best half: least trimmed squares (Rousseeuw 1984), found as in FAST-LTS (Rousseeuw and van
+Driessen 2006). Many fits are made to a few randomly drawn configurations. Concentration steps
+improve each: take the half with the shortest residuals, fit it, repeat. All fits share one
+linearised model and are computed at once as matrix products; the model is linearised again at the
+best fit until its half no longer changes. Half means half of every set, and slightly more: with P
+parameters and R equations (1 + P / R) / 2 of the samples, which tolerates the most gross errors
+(Rousseeuw and Leroy 1987).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal, TypeAlias, get_args
 
 import numpy as np
@@ -27,9 +35,8 @@ from scipy import special
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.estimation.levels import ALIKE, SURE
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.trimmed import trimmed_start, trimmed_sum, unknown
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDS, Flags, FloatArray, norms
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDS, Flags, FloatArray, norms
 
 Loss: TypeAlias = Literal['redescending', 'huber', 'none']
 LOSSES: tuple[str, ...] = get_args(Loss)
@@ -45,6 +52,9 @@ SUSPICIOUS = 1.2
 """Ratio of actual to expected residuals at which gross errors, or errors shared by a
 configuration, may hide in them; a convention, which benchmarks/outliers.py does not tell from
 1.5."""
+STARTS = 500  # as in FAST-LTS
+BEST = 10
+"""As in FAST-LTS, followed to convergence after two concentration steps from every start."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,3 +232,128 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
                 largest = np.maximum(largest, size[row])
         found.append(largest)
     return tuple(found)
+
+
+def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
+    """Return the chain fitted to the best half of the samples, found from `chain`.
+
+    Weights of the samples are ignored. A system without spare equations returns `chain`.
+    """
+    few = _thinned(system)
+    need = _need(names, few)
+    if need >= 1.0:
+        return chain
+    halves = _Halves(few, need)
+    masks = halves.draw(need)
+    linear = _Linear(chain, names, few)
+    for _ in range(2):
+        masks, sums = halves.concentrate(linear.squares(masks))
+    masks = masks[np.argsort(sums)[:BEST]]
+    half = masks[0]
+    for _ in range(ROUNDS):
+        for _ in range(ROUNDS):
+            before = masks
+            masks, sums = halves.concentrate(linear.squares(masks))
+            if np.array_equal(masks, before):
+                break
+        last, half = half, masks[np.argmin(sums)]
+        best = few.weighted([half[part].astype(float) for part in halves.parts])
+        chain = minimise(chain, names, best, tolerance=1e-3).chain
+        if np.array_equal(half, last):
+            break
+        linear = _Linear(chain, names, few)
+    return chain
+
+
+def trimmed_sum(chain: Chain, system: System) -> float:
+    """Return the sum of the shorter half of the squared residuals of every set, in sigma."""
+    total = 0.0
+    for samples in system.sets:
+        parts = [np.nan_to_num(part) for part in samples.whitened_residuals(chain)]
+        squares = np.sort(sum((part**2).sum(axis=1) for part in parts))
+        total += float(squares[: (samples.count + 1) // 2].sum())
+    return total
+
+
+def unknown(names: Sequence[str], system: System) -> int:
+    """Return the number of parameters without a prior."""
+    known = {} if system.prior is None else system.prior.sigmas
+    return sum(name not in known for name in names)
+
+
+def _thinned(system: System) -> System:
+    """Return SOME_POSES samples evenly spread, at least a tenth of them from each set."""
+    most = SOME_POSES // min(len(system.sets), 10)
+    return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
+
+
+def _need(names: Sequence[str], system: System) -> float:
+    """Return parameters without a prior per equation, with one sample per configuration."""
+    rows = sum(
+        samples.rows / samples.count * (samples.observations.configurations.max() + 1)
+        for samples in system.sets
+        if samples.count
+    )
+    return float(unknown(names, system) / rows)
+
+
+class _Halves:
+    """Samples of each set to draw and to keep; masks are (S, N) over all sets."""
+
+    def __init__(self, system: System, need: float) -> None:
+        ends = np.cumsum([0, *(samples.count for samples in system.sets)]).tolist()
+        self.parts = [slice(first, last) for first, last in pairwise(ends)]
+        self._groups = [samples.observations.configurations for samples in system.sets]
+        self._sizes = [int(np.ceil(0.5 * (1.0 + need) * s.count)) for s in system.sets]
+
+    def draw(self, need: float) -> Flags:
+        """Return seeded starts: of every set half the configurations that all parameters need.
+
+        Fewer make a start without gross errors likelier; priors resolve ties.
+        """
+        rng = np.random.default_rng(0)
+        masks = []
+        for group in self._groups:
+            count = int(group.max(initial=-1)) + 1
+            rank = np.argsort(rng.random((STARTS, count)), axis=1)
+            masks.append((rank < np.ceil(0.5 * need * count))[:, group])
+        return np.concatenate(masks, axis=1)
+
+    def concentrate(self, squares: FloatArray) -> tuple[Flags, FloatArray]:
+        """Return the samples with the shortest residuals, and the sums (S,) of their squares."""
+        masks = np.zeros(squares.shape, dtype=bool)
+        for part, size in zip(self.parts, self._sizes, strict=True):
+            if size:
+                index = np.argpartition(squares[:, part], size - 1, axis=1)[:, :size]
+                np.put_along_axis(masks[:, part], index, True, axis=1)
+        return masks, (squares * masks).sum(axis=1)
+
+
+class _Linear:
+    """The model linearised at a chain, for fits to many masks (S, N) at once."""
+
+    def __init__(self, chain: Chain, names: Sequence[str], system: System) -> None:
+        parts = system.rows_of(chain, names)
+        width = max(part.shape[1] for part in parts)
+        rows = np.concatenate(
+            [np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0))) for part in parts], axis=2
+        ).transpose(2, 1, 0)
+        columns, self._residual = rows[..., :-1], np.ascontiguousarray(rows[..., -1])
+        extra, offset = system.extra_rows(chain, names)
+        size = np.sqrt((columns**2).sum(axis=(0, 1)) + (extra**2).sum(axis=0))
+        scale = 1.0 / np.where(size > 0.0, size, 1.0)
+        self._columns, extra = np.ascontiguousarray(columns * scale), extra * scale
+        self._matrices = np.einsum('ncp,ncq->npq', self._columns, self._columns, optimize=True)
+        self._gradients = np.einsum('ncp,nc->np', self._columns, self._residual)
+        self._matrix = extra.T @ extra + HALF_THE_DIGITS * np.eye(len(names))
+        self._gradient = extra.T @ offset
+
+    def squares(self, masks: Flags) -> FloatArray:
+        """Return the squared residuals (S, N) of all samples after a fit to each mask."""
+        count, width, size = self._columns.shape
+        chosen = masks.astype(float)
+        matrices = (chosen @ self._matrices.reshape(count, -1)).reshape(-1, size, size)
+        gradients = chosen @ self._gradients + self._gradient
+        steps = np.linalg.solve(matrices + self._matrix, gradients[..., np.newaxis])[..., 0]
+        left = self._residual.ravel() - steps @ self._columns.reshape(-1, size).T
+        return np.asarray((left.reshape(-1, count, width) ** 2).sum(axis=2))
