@@ -19,10 +19,15 @@ from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
-from calib_ros.report.applied import standing, verification_report
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, likely, remarks
+from calib_ros.report.verdicts import (
+    each_in_words,
+    likely,
+    remarks,
+    standing,
+    verification_report,
+)
 from calib_ros.sampling.sample import gathered
 from calib_ros.shown import rounded
 

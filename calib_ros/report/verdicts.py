@@ -1,15 +1,78 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A verification in words."""
+"""A verification in words, and its page."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import astuple, replace
+
 from calib_ros.apply.verification import DECIDING, Verification
-from calib_ros.estimation.levels import NEARER
+from calib_ros.estimation.levels import ALIKE, NEARER
 from calib_ros.identification.records import reused_in_words
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import table_hash
+from calib_ros.report import sections
+from calib_ros.report.advice import SPREAD_OUT
+from calib_ros.report.page import Origin, Report, Section, Verdict, section
+from calib_ros.report.poses import Poses, explorer
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
 from calib_ros.shown import rounded
+
+SOMETHING_MOVED = (
+    'Check that measuring device, target and robot have not moved since the calibration; if one '
+    'has, use --new-base or --new-tool.'
+)
+COMPUTED = (
+    '"Before" is not measured but computed: the nominal arm in its best frames, at the same '
+    'joint values.'
+)
+TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
+STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
+    'PASS': (
+        Verdict('good', 'PASS: the arm is within the tolerance'),
+        ('Keep this page with the calibration. Verify again after a collision or repair.',),
+    ),
+    'FAIL': (
+        Verdict('bad', 'FAIL: the arm exceeds the tolerance'),
+        (
+            SOMETHING_MOVED,
+            'Check that the correction is active in the controller (--commanded shows it).',
+            'Calibrate again with new poses; try --model auto.',
+        ),
+    ),
+    'UNDECIDED': (
+        Verdict('open', 'UNDECIDED: too few measurements to tell'),
+        (f'Measure more poses, {SPREAD_OUT}, and verify again with all of them.',),
+    ),
+    'does not hold': (
+        Verdict('bad', 'The calibration no longer holds'),
+        (
+            SOMETHING_MOVED,
+            'Calibrate again with new poses, or update it with --previous and a few.',
+        ),
+    ),
+    'holds': (
+        Verdict('good', f'The calibration holds: at most {ALIKE:g} times its former error'),
+        (TOLERANCE,),
+    ),
+    'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
+}
+REUSED = (
+    Verdict('open', 'No verdict: the calibration was computed from these measurements'),
+    (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
+)
+
+
+def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict as a reader sees it first, and what to do next."""
+    if found.reused and found.verdict == 'no verdict':
+        return REUSED
+    state, steps = STANDINGS[found.verdict]
+    if not found.by_program:  # nor whether the correction reaches the arm
+        state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
+    return state, steps
 
 
 def likely(found: Verification) -> str:
@@ -81,3 +144,75 @@ def hints(found: Verification) -> list[str]:
             '--joint-angle, --columns), their rows, the robot, and the target (--new-tool)'
         )
     return lines
+
+
+def verification_report(
+    chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
+) -> Report:
+    """Return the report of a verification of a calibrated chain."""
+    between = interval_mm(1e3 * found.lower, 1e3 * found.upper)
+    text = [
+        'The RMS position error over poses like these, each counted once, is '
+        f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} % interval: {between} mm).'
+    ]
+    if found.fitted:
+        text.append('The interval allows for the refitted frames.')
+    if found.tolerance is not None:
+        text.append(
+            f'Tolerance: {1e3 * found.tolerance:g} mm. PASS: the whole interval is within it; '
+            'FAIL: the whole interval is beyond it.'
+        )
+    text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))
+    state, steps = standing(found)
+    gain = sections.gain(found.comparison, intervals=False)
+    title = 'Accuracy before and after the correction'
+    different = 'Different poses', f'{found.configurations:,}'
+    accuracy = sections.accuracy_section(
+        title,
+        found.comparison,
+        poses.things,
+        COMPUTED,
+        intervals=False,
+        error=sections.OF_THE_PROGRAM if found.by_program else sections.ERROR,
+    )
+    return Report(
+        kind='Verification of a calibrated arm',
+        robot=chain.name,
+        verdict=replace(state, text=tuple(text), gain=gain),
+        accuracy=accuracy,
+        picture=sections.distribution(poses),
+        steps=steps,
+        remarks=(*warnings, *hints(found)),
+        identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
+        explorer=explorer(chain, poses),
+        sections=(
+            *((_by_configuration(found),) if found.each else ()),
+            sections.coverage(chain, poses.joints, 'How far each joint was moved'),
+        ),
+        origin=origin,
+    )
+
+
+def _by_configuration(found: Verification) -> Section:
+    """Return the figures of the standard, or of errors at the joint values that were reported."""
+    title, names = 'Pose by pose (ISO 9283)', ('AP before [mm]', 'AP after [mm]', 'RP [mm]')
+    text = (
+        'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma. '
+        'The standard asks for 30 cycles.'
+    )
+    if not found.by_program:
+        title, names = 'Pose by pose', ('before [mm]', 'after [mm]', 'scatter [mm]')
+        text = (
+            'Errors at the joint values reported: of the mean over all cycles, and their scatter, '
+            'mean + 3 sigma. AP and RP of ISO 9283 need the program (--commanded).'
+        )
+    return section(
+        'configurations',
+        title,
+        text,
+        head=('pose', 'cycles', *names),
+        rows=tuple(
+            (f'P{k}', str(cycles), *('' if x is None else rounded(x) for x in values))
+            for k, (cycles, *values) in enumerate(map(astuple, found.each), 1)
+        ),
+    )
