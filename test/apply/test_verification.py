@@ -18,9 +18,9 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.se3 import invert
-from calib_ros.report.verdicts import _by_configuration, verification_report
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verdicts import _by_configuration, verification_report
 from calib_ros.shown import rounded
 
 _UNIT = ['(mean', '+', '3', 'sigma)']

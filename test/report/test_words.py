@@ -17,9 +17,9 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
-from calib_ros.report.verdicts import verification_report
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verdicts import verification_report
 from calib_ros.report.words import between, checked, verdict
 from calib_ros.shown import rounded
 
