@@ -176,7 +176,7 @@ def filing_of(
     settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.paths[0]
     read, changed = [samples_hash(sets)], None
     if unread.files and unread == Unread.of(*unread.paths):
-        read = [each.sha256 for each in page.inputs_of(unread.paths)]
+        read = [each.sha256 for each in page.inputs_of(*unread.paths)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     for name in (*OF_TABLES[1:], 'joints_preset'):  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result
@@ -192,7 +192,7 @@ def origin_of(
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     people = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
-    return page.Origin(page.inputs_of(known), settings=settings, command=options.typed, **people)
+    return page.Origin(page.inputs_of(*known), settings=settings, command=options.typed, **people)
 
 
 def page_of(

@@ -25,7 +25,7 @@ from calib_ros.files.history import (
 )
 from calib_ros.files.loading import TABLES, of_bag, of_table, replayed, table
 from calib_ros.fleet.plant import Robot
-from calib_ros.report.page import Origin, input_of, render
+from calib_ros.report.page import Origin, inputs_of, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 from calib_ros.report.words import configuration_yaml
@@ -111,7 +111,7 @@ def work(task: Task) -> Outcome:
 def _outcome(task: Task) -> Outcome:
     robot, source = task.robot, task.source
     with fetched(source.url) as path:
-        inputs = input_of(path)
+        inputs = inputs_of(path)
         content = content_hash([each.sha256 for each in inputs], source.session)
         if content in task.known:
             return Outcome(known=task.known[content])

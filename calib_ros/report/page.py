@@ -12,7 +12,7 @@ import hashlib
 import html
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -263,19 +263,15 @@ def files_of(path: Path) -> list[Path]:
     return sorted(each for each in (path, *path.rglob('*')) if each.is_file())
 
 
-def input_of(path: Path) -> tuple[Input, ...]:
-    """Return a file, or those of a folder such as a bag, with size and hash."""
+def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
+    """Return all files at some paths, or in folders such as bags, with size and hash."""
     found = []
-    for each in files_of(path):
-        digest = hashlib.sha256()
-        with each.open('rb') as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-        name, size = str(each.relative_to(path.parent)), each.stat().st_size
-        found.append(Input(name, size, digest.hexdigest()))
+    for path in filter(None, paths):
+        for each in files_of(path):
+            digest = hashlib.sha256()
+            with each.open('rb') as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+            name, size = str(each.relative_to(path.parent)), each.stat().st_size
+            found.append(Input(name, size, digest.hexdigest()))
     return tuple(found)
-
-
-def inputs_of(paths: Sequence[Path | None]) -> tuple[Input, ...]:
-    """Return the files at all given paths."""
-    return tuple(each for path in paths if path is not None for each in input_of(path))

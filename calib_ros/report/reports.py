@@ -57,7 +57,10 @@ def identification_report(
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
     limits = interval_of(judged, 1)
-    corrected = table_hash(result.chain) if result.accepted else 'none: not accepted'
+    corrected, notes = 'none: not accepted', words.remarks(result)
+    if result.accepted:
+        corrected = table_hash(result.chain)
+        notes = [*filter(None, (words.drift_in_words(result.noise),))]
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
@@ -76,7 +79,7 @@ def identification_report(
         ),
         picture=sections.distribution(poses),
         steps=_steps(result, reasons, limits, tolerance),
-        remarks=(*warnings, *_notes(result)),
+        remarks=(*warnings, *notes),
         identity=sections.identity_of(
             result.chain,
             origin,
@@ -164,13 +167,6 @@ def _refused(reasons: Sequence[Advice]) -> Verdict:
         return Verdict('info', heading, (tried,))
     whys = '. '.join(each.heading for each in reasons if each.steps)
     return Verdict('bad', 'Not accepted: the robot stays as it was', (f'Why: {whys}.', tried))
-
-
-def _notes(result: Identification) -> Iterator[str]:
-    if not result.accepted:
-        yield from words.remarks(result)
-    elif drift := words.drift_in_words(result.noise):
-        yield drift
 
 
 def _steps(

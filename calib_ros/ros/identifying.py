@@ -252,7 +252,7 @@ def _page(given: Snapshot, result: Identification) -> str | None:
     from calib_ros.report.reports import identification_report
 
     journal, serial = given.origin['journal'], given.origin['robot_serial']
-    files = inputs_of([Path(journal)] if journal else [])
+    files = inputs_of(Path(journal) if journal else None)
     origin = Origin(files, serial=serial, settings=given.configuration)
     poses = poses_of(given.problem, result)
     return render(identification_report(given.problem, result, poses, origin, given.warnings))
