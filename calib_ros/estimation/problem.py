@@ -274,10 +274,8 @@ class Problem(Shown):
         """Return a third of the largest offset [m, rad] of a faulty robot."""
         return (self.largest_length if Parameter(name).is_length else self.largest_angle) / 3.0
 
-    def system(self, sets: Sequence[Observations], learned: bool = True) -> System:
-        """Return sets and priors for the solver, without `learned` priors if asked."""
-        if not learned and self.learned is not None:
-            return replace(self, learned=None).system(sets)
+    def system(self, sets: Sequence[Observations]) -> System:
+        """Return sets and priors for the solver."""
         sigmas = self.prior_sigmas
         noise = 1.0 if self.learned is None else self.learned.noise
         prior = Prior(self.model, sigmas, noise) if sigmas else None

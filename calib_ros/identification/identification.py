@@ -182,7 +182,7 @@ def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robus
     ]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
-    return chance_of_gain(before, frames, arm, problem.system(sets, learned=False))
+    return chance_of_gain(before, frames, arm, replace(problem, learned=None).system(sets))
 
 
 def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ...]:
