@@ -123,13 +123,8 @@ def cell_integer(text: str, where: str) -> int:
     return number
 
 
-def covariance_fault(covariance: NDArray[np.float64]) -> str:
-    """Return the fault of a covariance (6, 6) of a measured pose; empty if valid."""
-    return str(covariance_faults(covariance[np.newaxis])[0])
-
-
 def covariance_faults(covariances: NDArray[np.float64]) -> NDArray[np.str_]:
-    """Return the fault of each covariance (N, 6, 6) of measured poses.
+    """Return the fault of each covariance (N, 6, 6) of measured poses; empty if valid.
 
     All zeros mean that none was measured. Zeros for the rotation mean that it was not measured, or
     that its covariance is unknown (trackers of positions).

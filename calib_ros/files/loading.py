@@ -111,7 +111,7 @@ def table(
 
 def of_table(found: Gathered, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return the problem of a table, with `given` arguments."""
-    problem = found.problem(chain, settings.socket_distance, **given, **settings.for_problem())
+    problem = found.problem(chain, settings, **given)
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))
     samples = {'samples': fitted, 'held_out': held_out, 'sets': len(found.fitted)}
     by_line, owners = found.by_line, found.owners

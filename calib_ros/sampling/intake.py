@@ -224,8 +224,7 @@ class Intake:
                 self.faults[JOINTS][str(err)] += 1
                 continue
             except Exception as err:  # damaged bytes fail in many ways
-                words = f'a message on {stream.topic} cannot be decoded: {err!r}'
-                self.problems.append(words)
+                self.problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
                 continue
             for strings, row in rows:
                 alike.setdefault((stream, strings, len(row[2])), []).append(row)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.kinematics.se3 import Flags, FloatArray
-from calib_ros.values import LARGEST, ROUNDED, covariance_fault
+from calib_ros.values import LARGEST, ROUNDED, covariance_faults
 
 JOINT_STATE = 'sensor_msgs/msg/JointState'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
@@ -149,7 +149,7 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
 
 @functools.lru_cache(maxsize=16)  # most devices repeat one
 def _fault(covariance: bytes) -> str:
-    return covariance_fault(np.frombuffer(covariance).reshape(6, 6))
+    return str(covariance_faults(np.frombuffer(covariance).reshape(1, 6, 6))[0])
 
 
 def transforms_in(message: Any, kind: str) -> Sequence[Any]:

@@ -300,17 +300,17 @@ class Gathered(Shown):
     warnings: tuple[str, ...] = ()
     by_line: bool = False  # stamps are the lines of a table, in seconds
 
-    def problem(
-        self, chain: Chain, sockets: float = Settings.socket_distance, **more: Any
-    ) -> Problem:
-        """Return the problem for a chain; two sockets of a location are `sockets` [m] apart."""
+    def problem(self, chain: Chain, settings: Settings, **more: Any) -> Problem:
+        """Return the problem for a chain, with `more` arguments."""
+        apart = settings.socket_distance
         return Problem(
             with_lenses(chain, self.lenses),
             self.fitted[0],
             self.held_out,
             more=self.fitted[1:],
-            separations=tuple((*pair, sockets) for pair in self.pairs),
+            separations=tuple((*pair, apart) for pair in self.pairs),
             world_frame=self.world_frame,
+            **settings.for_problem(),
             **more,
         )
 
@@ -336,8 +336,7 @@ def problem_of(
     if all(sample.validation for sample in samples):
         return None
     found = gathered(samples, (settings.sigma_position, settings.sigma_orientation), posed)
-    more = {'of_messages': True, **settings.for_problem()}
-    return found.problem(chain, settings.socket_distance, **more)
+    return found.problem(chain, settings, of_messages=True)
 
 
 def in_frames_of(
@@ -370,4 +369,4 @@ def problem_since(
     cameras = {each.camera for each in sets if each.pixels is not None}
     known = {name: calibration.chain.frame(name).lens for name in cameras}
     seen = {name: lens for name, lens in known.items() if lens}
-    return Gathered(sets, lenses=seen).problem(chain, **settings.for_problem())
+    return Gathered(sets, lenses=seen).problem(chain, settings)

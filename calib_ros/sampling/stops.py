@@ -129,7 +129,7 @@ class Schedule:
 
     def of_stands(
         self, stands: Stamps, until: int, newest: int | None, settings: Settings
-    ) -> Schedule:
+    ) -> None:
         """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there."""
         shortest, longest = (
             round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)
@@ -150,14 +150,13 @@ class Schedule:
                 continue
             last = min(end, begin + longest)
             if last > until or (goes_on and last == end):
-                return self  # not over yet
+                return  # not over yet
             if last - begin < shortest:
                 self.add(last, 'the stop was too short')
                 continue
             self.sample(begin, last)
             self.sampled(min(end, until))
         self.add(until, 'the arm was moving')
-        return self
 
 
 class Known:
