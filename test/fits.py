@@ -65,7 +65,7 @@ def fitted(problem):
     """
     known, start, fit = fitting.fit(problem)
     names = fit.names
-    found = fitting.parameter_rows(fit.problem, fit.chain, known, names, fit.uncertainty)
+    found = fitting.parameter_rows(fit, known, fit.uncertainty)
     frames = [name for name in names if start.owns_frame(name)]
     return SimpleNamespace(
         before=minimise(start, frames, fit.system).chain,

@@ -13,6 +13,7 @@ from scipy import special
 from calib_ros.decision.drift import chance
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL, stops
+from calib_ros.estimation.fitting import Fitted
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import CERTAIN, FEW, SURE
 from calib_ros.estimation.observations import SOME_POSES
@@ -43,21 +44,21 @@ class Outlier:
     size: float
 
 
-def outliers_of(problem: Problem, robust: Robust) -> tuple[Outlier, ...]:
+def outliers_of(fitted: Fitted) -> tuple[Outlier, ...]:
     """Return the samples that a robust fit excludes."""
-    if problem.loss == 'none':
+    if fitted.problem.loss == 'none':
         return ()
+    sets = zip(fitted.problem.sets, fitted.robust.distances, strict=True)
     return tuple(
         Outlier(number, k, int(each.stamps_ns[k]), float(distances[k]))
-        for number, (each, distances) in enumerate(
-            zip(problem.sets, robust.distances, strict=True)
-        )
+        for number, (each, distances) in enumerate(sets)
         for k in np.flatnonzero(distances > OUTLIER).tolist()
     )
 
 
-def arms_own(problem: Problem, robust: Robust) -> str | None:
+def arms_own(fitted: Fitted) -> str | None:
     """Return why outliers look like the arm's own behaviour, or None."""
+    problem, robust = fitted.problem, fitted.robust
     if not robust.outliers.any() or any(each.socket for each in problem.sets):
         return None
     joints, kept = np.concatenate([each.joints for each in problem.sets]), ~robust.outliers
@@ -127,16 +128,14 @@ def _with_a_joint(problem: Problem, joints: FloatArray, outliers: Flags) -> tupl
     return names[most], max(anywhere, chance(shifted.max(axis=0)))
 
 
-def lacking(problem: Problem, chain: Chain, names: Sequence[str], noise: float) -> float:
-    """Return the share of the residuals that couplings of the wrist explain, if most of it.
-
-    `noise` is the size of the residuals [sigma given].
-    """
+def lacking(fitted: Fitted) -> float:
+    """Return the share of the residuals that couplings of the wrist explain, if most of it."""
+    problem, chain = fitted.problem, fitted.chain
     known = [name for name, _ in chain.effects]
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
-    if not added or noise < SUSPICIOUS:  # nothing is left to explain
+    if not added or fitted.noise.position < SUSPICIOUS:  # nothing is left to explain
         return 0.0
-    share = explained(problem, chain.with_effects([*known, *added]), names, added)
+    share = explained(problem, chain.with_effects([*known, *added]), fitted.names, added)
     return share if share >= EXPLAINED else 0.0
 
 

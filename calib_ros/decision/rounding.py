@@ -12,18 +12,19 @@ would if rounding explained them all,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from scipy import linalg
 
 from calib_ros.decision.changes import Information
+from calib_ros.estimation.fitting import Fitted
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import Flags, FloatArray
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED
 
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
@@ -65,19 +66,14 @@ def _are_multiples(values: FloatArray, step: float) -> bool:
     return bool(np.abs(values / step - np.round(values / step)).max() < ROUNDED)
 
 
-def may_be_rounding(
-    problem: Problem,
-    before: Chain,
-    names: Sequence[str],
-    steps: Mapping[str, float],
-    good: Sequence[Flags],
-) -> bool:
+def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -> bool:
     """Tell whether rounding of joint values explains the nominal residuals as well.
 
-    `before` is the nominal chain with fitted frames, `names` are fitted, `steps` belong to rounded
-    joints, `good` (N,) excludes outliers of each set.
+    `before` is the nominal chain with fitted frames, `steps` belong to rounded joints.
     """
-    sets = [each.select(which).spread() for each, which in zip(problem.sets, good, strict=True)]
+    problem, names = fitted.problem, fitted.names
+    pairs = zip(problem.sets, fitted.robust.good, strict=True)
+    sets = [each.select(which).spread() for each, which in pairs]
     joints = np.concatenate([each.joints for each in sets])
     levels = {}
     for number, joint in enumerate(problem.chain.joints):

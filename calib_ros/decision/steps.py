@@ -14,7 +14,6 @@ Products of all columns are summed from the end of the session and serve every s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -23,12 +22,12 @@ import numpy as np
 from calib_ros.decision.drift import inverse_root, slow_cosines
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import stops
-from calib_ros.estimation.fitting import SOME
+from calib_ros.estimation.fitting import SOME, Fitted
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE, gram
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import Robust, weights_of
+from calib_ros.estimation.robust import weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index
@@ -88,12 +87,12 @@ class Step:
         return text
 
 
-def find_step(problem: Problem, names: Sequence[str], robust: Robust) -> Step | None:
+def find_step(fitted: Fitted) -> Step | None:
     """Return the step that explains more than half of the residuals of a fit, if any."""
-    scan = _Scan(problem, names, robust)
+    scan = _Scan(fitted)
     found = scan.best()
     if found is not None and scan.few_gross(found):
-        scan = _Scan(problem, names, robust, gross=False)
+        scan = _Scan(fitted, gross=False)
         found = scan.best()
     return None if found is None or scan.drifts(found) else scan.described(found)
 
@@ -138,9 +137,8 @@ class _Found:
 class _Scan:
     """The linear model at a fit, with columns of everything that may have moved."""
 
-    def __init__(
-        self, problem: Problem, names: Sequence[str], robust: Robust, gross: bool = True
-    ) -> None:
+    def __init__(self, fitted: Fitted, gross: bool = True) -> None:
+        problem, names, robust = fitted.problem, fitted.names, fitted.robust
         self._problem, self._chain = problem, robust.fit.chain
         self._groups = _groups(problem)
         self._fitted = len(names)

@@ -13,12 +13,13 @@ import numpy as np
 from scipy import special
 
 from calib_ros.estimation.configurations import distinct
+from calib_ros.estimation.fitting import Fitted
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import System, minimise, without_each
 from calib_ros.estimation.levels import CONFIDENT, TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, Robust, distances_of
+from calib_ros.estimation.robust import OUTLIER, distances_of
 from calib_ros.estimation.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
@@ -161,45 +162,39 @@ def compare(
 
 
 def validate(
-    problem: Problem,
-    before: Chain,
-    after: Chain,
-    names: Sequence[str],
-    robust: Robust,
-    explained: Flags | None = None,
+    fitted: Fitted, before: Chain, explained: Flags | None = None
 ) -> tuple[Comparison | None, str]:
-    """Judge both chains on pairs that were not fitted.
+    """Judge a fitted chain and that before on pairs that were not fitted.
 
     Held-out pairs are outliers if they are far from the prediction and not `explained` (N,) by a
     simpler model. In cross-validation, configurations are dealt to the folds one by one, so that
     none is on both sides. Outliers keep their weight of the whole fit in the folds; they are
     judged too.
     """
+    problem = fitted.problem
     repeated = _repeated(problem)
     if not repeated.all():
-        comparison = replace(compare(before, after, problem.judging), repeated=repeated)
+        comparison = replace(compare(before, fitted.chain, problem.judging), repeated=repeated)
         if distinct(comparison.after.configurations[~repeated]) > 1:
-            return _of_held_out(problem, comparison, after, names, explained)
+            return _of_held_out(fitted, comparison, explained)
     places = _places(problem)
     if len(places) > 1 and all(each.socket for each in problem.sets):
-        return _leave_one_place_out(problem, places, before, after, names, robust)
+        return _leave_one_place_out(fitted, before, places)
     note = ', because fewer than two held-out poses are new' if len(repeated) else ''
-    return _cross_validate(problem, before, after, names, robust, note)
+    return _cross_validate(fitted, before, note)
 
 
 def _of_held_out(
-    problem: Problem,
-    comparison: Comparison,
-    after: Chain,
-    names: Sequence[str],
-    explained: Flags | None,
+    fitted: Fitted, comparison: Comparison, explained: Flags | None
 ) -> tuple[Comparison, str]:
+    problem = fitted.problem
     if problem.loss != 'none':
         judged, new = ~comparison.counting, comparison.counting
         ends = np.cumsum([len(each) for each in problem.judging])[:-1]
         pairs = zip(problem.judging, np.split(new, ends), strict=True)
         sets = [each.select(rows) for each, rows in pairs if rows.any()]
-        judged[new] = np.concatenate(distances_of(after, names, problem.system(sets))) <= OUTLIER
+        far = distances_of(fitted.chain, fitted.names, problem.system(sets))
+        judged[new] = np.concatenate(far) <= OUTLIER
         judged |= np.False_ if explained is None else explained
         comparison = replace(comparison, judged=judged)
     text = f'{comparison.counting.sum():,} held-out poses{comparison.omitted}'
@@ -208,9 +203,8 @@ def _of_held_out(
     return comparison, text
 
 
-def _cross_validate(
-    problem: Problem, before: Chain, after: Chain, names: Sequence[str], robust: Robust, note: str
-) -> tuple[Comparison | None, str]:
+def _cross_validate(fitted: Fitted, before: Chain, note: str) -> tuple[Comparison | None, str]:
+    problem, names = fitted.problem, fitted.names
     groups = problem.configurations
     count = distinct(np.concatenate(groups))
     rows = sum(
@@ -222,14 +216,14 @@ def _cross_validate(
     frames = [name for name in names if before.owns_frame(name)]
     numbers = [group % folds for group in groups]
     order = [np.argsort(each, kind='stable') for each in numbers]  # once for both
-    system, dealt = robust.system.select(order), [np.sort(each) for each in numbers]
+    system, dealt = fitted.system.select(order), [np.sort(each) for each in numbers]
     chains = zip(
         without_each(before, frames, system, dealt),
-        without_each(after, names, system, dealt),
+        without_each(fitted.chain, names, system, dealt),
         strict=True,
     )
     first, second = left_out(chains, problem.sets, groups, numbers)
-    judged = Comparison(first, second, ~robust.outliers)
+    judged = Comparison(first, second, ~fitted.robust.outliers)
     over = f'{folds}-fold cross-validation over {count:,} different poses'
     return judged, f'{over}{note}{judged.omitted}'
 
@@ -308,25 +302,21 @@ def _places(problem: Problem) -> list[set[str]]:
 
 
 def _leave_one_place_out(
-    problem: Problem,
-    places: Sequence[set[str]],
-    before: Chain,
-    after: Chain,
-    names: Sequence[str],
-    robust: Robust,
+    fitted: Fitted, before: Chain, places: Sequence[set[str]]
 ) -> tuple[Comparison, str]:
     """Judge both chains on places of sockets that were not fitted.
 
     The unknown positions of a place's sockets are fitted to its own pairs, with arm and tool of
     the others. Outliers keep their weight of the whole fit.
     """
-    pairs = list(zip(problem.sets, robust.system.sets, strict=True))
+    problem, names = fitted.problem, fitted.names
+    pairs = list(zip(problem.sets, fitted.system.sets, strict=True))
 
     def part(place: set[str], inside: bool) -> System:
         chosen = [samples for each, samples in pairs if (each.base in place) == inside]
         known = {samples.observations.base for samples in chosen}
-        apart = tuple(pair for pair in robust.system.separations if {*pair[:2]} <= known)
-        return replace(robust.system, sets=tuple(chosen), separations=apart)
+        apart = tuple(pair for pair in fitted.system.separations if {*pair[:2]} <= known)
+        return replace(fitted.system, sets=tuple(chosen), separations=apart)
 
     frames = [name for name in names if before.owns_frame(name)]
     chains: list[list[Chain]] = [[], []]
@@ -334,8 +324,9 @@ def _leave_one_place_out(
         own = [n for base in sorted(place) for n in parameters_of(base)[:3] if n in problem.free]
         others, left = part(place, inside=False), part(place, inside=True)
         kinds = [kind for kind in problem.kinds if kind.base not in place]
-        for found, chain, fitted in zip(chains, (before, after), (frames, names), strict=True):
-            rest = [name for name in fitted if name not in own]
+        fits = (before, frames), (fitted.chain, names)
+        for found, (chain, wanted) in zip(chains, fits, strict=True):
+            rest = [name for name in wanted if name not in own]
             # without this place a gauge may be free
             determined = structurally_independent(
                 problem.model, rest, kinds, others.separation_rows
@@ -350,7 +341,7 @@ def _leave_one_place_out(
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
     first = _joined([part.before for part in parts], groups)
     second = _joined([part.after for part in parts], groups)
-    judged = Comparison(first, second, ~robust.outliers)
+    judged = Comparison(first, second, ~fitted.robust.outliers)
     return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'
 
 

@@ -306,13 +306,10 @@ def _require_enough(problem: Problem, names: Sequence[str]) -> None:
 
 
 def parameter_rows(
-    problem: Problem,
-    chain: Chain,
-    structural: Sequence[str],
-    names: Sequence[str],
-    uncertainty: identifiability.Uncertainty,
+    fitted: Fitted, structural: Sequence[str], uncertainty: identifiability.Uncertainty
 ) -> tuple[ParameterRow, ...]:
     """Return every parameter of a fitted chain, with its standard deviation if fitted."""
+    problem, chain, names = fitted.problem, fitted.chain, fitted.names
     change = _to_values(chain, names)
     variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
     std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))

@@ -35,7 +35,6 @@ from calib_ros.estimation.fitting import SOME, Fitted, ParameterRow, Simpler, fi
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.levels import SCALE, SEVERAL
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import Robust
 from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.kinematics import effects
@@ -82,18 +81,18 @@ def _identified(
     before = minimise(start, frames, robust.system, tolerance=1e-5)
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
-    validation, validated_by = validate(problem, before.chain, chain, names, robust, explained)
+    validation, validated_by = validate(fitted, before.chain, explained)
     coarse = rounded(problem)
-    share = lacking(problem, chain, names, fitted.noise.position)
+    share = lacking(fitted)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
     posterior = fitted.posterior(size, more, doubts)
     sizes, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
     posterior = replace(posterior, unmodelled=sizes)
     uncertainty = fitted.uncertainty.with_part(moved)
-    parameters = parameter_rows(problem, chain, structural, names, uncertainty)
+    parameters = parameter_rows(fitted, structural, uncertainty)
     region, scaled = _region(fitted, posterior, size, more, doubts)
-    step = find_step(problem, names, robust)
+    step = find_step(fitted)
     result = Identification(
         chain=chain,
         before=before.chain,
@@ -105,14 +104,14 @@ def _identified(
         validated_by=validated_by,
         noise=fitted.noise,
         distances=robust.distances,
-        outliers=outliers_of(problem, robust),
-        gauges=_gauges(problem, chain, names),
+        outliers=outliers_of(fitted),
+        gauges=_gauges(fitted),
         observability=identifiability.observability(fitted.factor, robust.system.count),
         priors=_priors(problem),
         world_frame=problem.world_frame,
         iterations=robust.iterations,
         converged=before.converged and robust.fit.converged and robust.settled,
-        chance=_chance(problem, before.chain, names, robust),
+        chance=_chance(fitted, before.chain),
         refusals=(),
         posterior=posterior,
         region=region,
@@ -122,8 +121,8 @@ def _identified(
         coupled=share > 0.0,
         images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
-    own_behaviour = None if step else arms_own(problem, robust)
-    rounding = may_be_rounding(problem, before.chain, names, coarse, robust.good)
+    own_behaviour = None if step else arms_own(fitted)
+    rounding = may_be_rounding(fitted, before.chain, coarse)
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
@@ -169,17 +168,16 @@ def _priors(problem: Problem) -> dict[str, float]:
     return {**known, **problem.given}
 
 
-def _chance(problem: Problem, before: Chain, names: Sequence[str], robust: Robust) -> float | None:
+def _chance(fitted: Fitted, before: Chain) -> float | None:
     """Return the probability that the arm's parameters explain only drift (`drift.py`).
 
     None for sockets: no device could drift.
     """
+    problem, names = fitted.problem, fitted.names
     if any(each.socket for each in problem.sets):
         return None
-    sets = [
-        each.select(np.flatnonzero(which)).spread(SOME)
-        for each, which in zip(problem.sets, robust.good, strict=True)
-    ]
+    pairs = zip(problem.sets, fitted.robust.good, strict=True)
+    sets = [each.select(np.flatnonzero(which)).spread(SOME) for each, which in pairs]
     frames = [name for name in names if before.owns_frame(name)]
     arm = [name for name in names if not before.owns_frame(name)]
     return chance_of_gain(before, frames, arm, replace(problem, learned=None).system(sets))
@@ -194,13 +192,13 @@ def _weak(problem: Problem, parameters: Sequence[ParameterRow]) -> tuple[str, ..
     return tuple(name for name, std in stds if std**2 > 0.5 * learned[name] ** 2)
 
 
-def _gauges(problem: Problem, chain: Chain, names: Sequence[str]) -> dict[str, list[str]]:
+def _gauges(fitted: Fitted) -> dict[str, list[str]]:
     """Return what each left-out parameter trades against, by a part of the pairs."""
-    free = problem.free
+    problem, names, free = fitted.problem, fitted.names, fitted.problem.free
     if len(names) == len(free):
         return {}
     few = problem.system([each.spread(SOME) for each in problem.sets])
-    normal = normal_equations(chain, free, System(few.sets))
+    normal = normal_equations(fitted.chain, free, System(few.sets))
     return identifiability.trades(normal.matrix, free, names)
 
 

@@ -3,6 +3,7 @@
 """What moved while it was measured is named, and nothing is accepted that a step has spoilt."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import fits
 import numpy as np
@@ -155,7 +156,7 @@ def test_a_step_of_which_samples_are_fitted_is_not_beside_the_fit():
     system = problem.system(problem.sets)
     fit = minimise(result.chain, result.names, system, iterations=0)
     robust = Robust(fit, system, (distances,), True, 0, problem.loss)
-    step = find_step(problem, result.names, robust)
+    step = find_step(SimpleNamespace(problem=problem, names=result.names, robust=robust))
     assert step.kind == 'base'
     assert not step.unused
     assert step.harmful
@@ -235,7 +236,7 @@ def test_nothing_moves_between_fewer_stops_than_a_step_has_on_both_sides():
     seen = measure(arm(rng), few, rng, *NOISE)
     problem = Problem(UR10E, seen, fixed=('*_joint.*',))
     _, _, fit = fitting.fit(problem)
-    assert find_step(problem, fit.names, fit.robust) is None
+    assert find_step(fit) is None
 
 
 @pytest.mark.parametrize(('seed', 'row'), [(8, -2), (11, 1)])

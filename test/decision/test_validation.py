@@ -210,9 +210,8 @@ def test_held_out_pairs_at_fitted_configurations_are_repeated():
     problem = Problem(UR10E, first, more=(replace(second, base='base_B'),), held_out=held_out)
     assert validation._repeated(problem).tolist() == [False, True, False, True, False]
     assert not len(validation._repeated(replace(problem, held_out=None)))
-    judged, text = validation.validate(
-        replace(problem, loss='none'), problem.model, problem.model, [], None
-    )
+    fitted = SimpleNamespace(problem=replace(problem, loss='none'), chain=problem.model)
+    judged, text = validation.validate(fitted, problem.model)
     said = '3 held-out poses; not counted because they repeat fitted poses: 2'
     assert text == said
     assert judged.deciding.tolist() == [True, False, True, False, True]

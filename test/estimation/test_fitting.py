@@ -107,7 +107,8 @@ def test_every_parameter_has_a_row_with_what_became_of_it():
     chain = UR10E.with_offsets({'elbow_joint.a': 2e-3})
     parts = np.array([np.diag([1.0, 4.0]), np.diag([0.0, 12.0])])
     uncertainty = Uncertainty(parts, np.array([10.0, np.inf]))
-    rows = parameter_rows(problem, chain, [*names, 'elbow_joint.theta'], names, uncertainty)
+    fitted = SimpleNamespace(problem=problem, chain=chain, names=names)
+    rows = parameter_rows(fitted, [*names, 'elbow_joint.theta'], uncertainty)
     assert [row.name for row in rows] == list(chain.parameter_names)
     found = {row.name: row for row in rows}
     assert found['elbow_joint.a'].offset == pytest.approx(2e-3)
