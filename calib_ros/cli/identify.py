@@ -350,7 +350,7 @@ def result_files(
     loaded, result = found.loaded, found.result
     with screen.work('writing the report') as work:
         work('residuals.csv, 1 of 3')
-        poses = poses_of(loaded.problem, result, loaded.lines, loaded.images)
+        poses = poses_of(loaded.problem, result, loaded.by_line, loaded.images)
         contents: dict[str, str | bytes] = {
             'result.json': _document(found) + '\n',
             'residuals.csv': poses.table(share_of(work, 0.0, 1 / 3)),

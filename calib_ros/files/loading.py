@@ -37,7 +37,7 @@ class Loaded:
     samples: dict[str, Any]  # counts of the input
     warnings: tuple[str, ...] = ()
     read: str = ''  # these counts as text
-    lines: bool = False  # stamps are the lines of a table
+    by_line: bool = False  # stamps are the lines of a table
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
     refusals: tuple[Reason, ...] = ()  # reasons not to accept any result
     instead: bool = False  # the refusals replace those of the result
@@ -115,4 +115,4 @@ def of_table(found: Gathered, chain: Chain, settings: Settings, **given: float) 
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))
     samples = {'samples': fitted, 'held_out': held_out, 'sets': len(found.fitted)}
     by_line, owners = found.by_line, found.owners
-    return Loaded(problem, samples, found.warnings, lines=by_line, owners=owners)
+    return Loaded(problem, samples, found.warnings, by_line=by_line, owners=owners)

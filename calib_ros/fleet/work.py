@@ -131,7 +131,7 @@ def _outcome(task: Task) -> Outcome:
         configuration = configuration_yaml(chain.name, settings)
         origin = Origin(inputs, serial=robot.serial, settings=configuration)
         wanted = None if robot.tolerance is None else 1e-3 * robot.tolerance
-        poses = poses_of(problem, result, loaded.lines)
+        poses = poses_of(problem, result, loaded.by_line)
         report = identification_report(problem, result, poses, origin, loaded.warnings, wanted)
         return Outcome(row, page=render(report, f'../../{PLOTLY}') or '')
 

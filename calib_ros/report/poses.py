@@ -70,7 +70,7 @@ class Poses:
     corner: Flags  # of a board in an image
     set: Index  # of observations, by its number
     tools: FloatArray  # (S, 4, 4) of the sets
-    lines: bool = False  # stamps are the lines of a table, in seconds
+    by_line: bool = False  # stamps are the lines of a table, in seconds
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
     repeats: bool = False  # some rows measure the same pose
 
@@ -100,26 +100,26 @@ class Poses:
         stamp = int(self.stamps_ns[row])
         if self.corner[row] and (name := self.images.get(stamp // 10**9)):
             return name
-        if self.lines:
+        if self.by_line:
             return f'line {stamp // 10**9}'
         return f'{stamp // 10**9}.{stamp % 10**9:09d} s'
 
     def select(self, rows: NDArray[np.generic]) -> Poses:
         """Return some poses by a mask (N,) or indices (K,)."""
-        of_all = ('tools', 'lines', 'images', 'repeats')
+        of_all = ('tools', 'by_line', 'images', 'repeats')
         names = (each.name for each in fields(self) if each.name not in of_all)
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def table(self, progress: Notify = quiet) -> str:
         """Return a CSV with a row for each pose, in metres and radians."""
-        names = ['line' if self.lines else 'stamp_ns', 'set', 'role', 'outlier', 'size']
+        names = ['line' if self.by_line else 'stamp_ns', 'set', 'role', 'outlier', 'size']
         names += [f'q{k + 1}' for k in range(self.joints.shape[1])]
         names += ['x', 'y', 'z', *(f'{when}_{axis}' for when in WHEN for axis in 'xyz')]
         blocks = [self.joints, self.position, self.before, self.after]
         if self.oriented:
             names += [f'{when}_r{axis}' for when in WHEN for axis in 'xyz']
             blocks += [self.turned_before, self.turned_after]
-        where = self.stamps_ns // 10**9 if self.lines else self.stamps_ns
+        where = self.stamps_ns // 10**9 if self.by_line else self.stamps_ns
         form = ','.join(['%d,%d,%s,%d,%.3f', *('%.9f' for _ in names[5:])])
         parts = [','.join(names)]
         for first in range(0, len(self), BLOCK):
@@ -136,7 +136,7 @@ class Poses:
 def _poses(
     chain: Chain,
     groups: Sequence[tuple[Sequence[Samples], Comparison, NDArray[np.str_], FloatArray]],
-    lines: bool,
+    by_line: bool,
     images: Mapping[int, str],
     repeats: bool = False,
 ) -> Poses:
@@ -178,13 +178,13 @@ def _poses(
     tools = arrays.pop('tools')
     order = np.argsort(arrays['stamps_ns'], kind='stable')
     ordered = {name: array[order] for name, array in arrays.items()}
-    return Poses(**ordered, tools=tools, lines=lines, images=images, repeats=repeats)
+    return Poses(**ordered, tools=tools, by_line=by_line, images=images, repeats=repeats)
 
 
 def poses_of(
     problem: Problem,
     result: Identification,
-    lines: bool = False,
+    by_line: bool = False,
     images: Mapping[int, str] = NAMELESS,
 ) -> Poses:
     """Return all poses of an identification, judged ones by a fit without them."""
@@ -198,11 +198,11 @@ def poses_of(
         role = np.where(judged.repeated, REPEATED, JUDGED)
         sets = problem.system(problem.judging).sets
         groups.append((sets, judged, role, np.full(len(role), np.nan)))
-    return _poses(result.chain, groups, lines, images)
+    return _poses(result.chain, groups, by_line, images)
 
 
 def poses_to_verify(
-    chain: Chain, sets: Sequence[Observations], comparison: Comparison, lines: bool = False
+    chain: Chain, sets: Sequence[Observations], comparison: Comparison, by_line: bool = False
 ) -> Poses:
     """Return the poses of new measurements, all judged."""
     count = len(comparison.judged)
@@ -210,7 +210,7 @@ def poses_to_verify(
     samples = [samples_of(each, sigmas, Settings.sigma_pixel) for each in sets]
     groups = [(samples, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     repeats = distinct(comparison.after.configurations) < count
-    return _poses(chain, groups, lines, NAMELESS, repeats)
+    return _poses(chain, groups, by_line, NAMELESS, repeats)
 
 
 def numbers(values: FloatArray, digits: int = 5) -> list[Any]:
@@ -261,7 +261,7 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'oriented': poses.oriented,
         'kinds': kinds,
         'number': (rows + 1).tolist() if many else None,
-        'lines': poses.lines,
+        'lines': poses.by_line,
         'things': poses.things,
         'images': [poses.source(row) if poses.corner[row] else '' for row in rows.tolist()]
         if poses.images

@@ -104,7 +104,7 @@ def identity_of(
 
 
 def _measured(poses: Poses | None) -> str:
-    if poses is None or not len(poses) or poses.lines or not is_time(poses.stamps_ns[0]):
+    if poses is None or not len(poses) or poses.by_line or not is_time(poses.stamps_ns[0]):
         return ''
     first, last = (
         datetime.fromtimestamp(int(stamp) // 10**9, timezone.utc).strftime('%Y-%m-%d %H:%M')
