@@ -166,7 +166,6 @@ class Settings:
         return chosen | {'priors': priors, 'effects': named}
 
     def __post_init__(self) -> None:
-        """Refuse values out of range."""
         if self.mode not in MODES:
             raise UnknownNameError('mode', self.mode, MODES)
         for item in fields(self):

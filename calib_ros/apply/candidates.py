@@ -32,7 +32,6 @@ class Visibility:
     world: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse an empty box and an axis without direction."""
         if self.box is not None and not (self.box[0] < self.box[1]).all():
             raise ConfigError(
                 f'the box from {self.box[0].tolist()} to {self.box[1].tolist()} is empty: give '

@@ -79,7 +79,6 @@ class Observations(Shown):
     """The distances are heights over the plane z = 0 of the world, zero where touched."""
 
     def __post_init__(self) -> None:
-        """Check that the arrays match and are finite."""
         if self.plane and self.distances is None:
             raise InputError('a plane needs the heights over it as distances, zero where touched')
         if (self.pixels is None) != (self.points is None):

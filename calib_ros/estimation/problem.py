@@ -90,7 +90,6 @@ class Problem(Shown):
     """True if the samples were messages, to which table options do not apply."""
 
     def __post_init__(self) -> None:
-        """Check the arguments."""
         priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
         for name, sigma in (self.sigmas | priors).items():
             if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:

@@ -62,7 +62,6 @@ class Board:
     legacy: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse boards that cannot be printed."""
         if self.type not in TYPES:
             raise UnknownNameError('type of board', self.type, TYPES)
         least = 2 if self.type == 'charuco' else 1

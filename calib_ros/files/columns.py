@@ -134,7 +134,6 @@ class MadeColumns(Columns):
     header: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        """Name the columns."""
         object.__setattr__(self, 'header', (*self.words, *self.values))
 
     def select(self, rows: NDArray[np.generic] | slice) -> MadeColumns:

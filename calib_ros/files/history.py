@@ -57,7 +57,6 @@ class Filing:
     fingerprint: str = ''  # cheap test that the source is unchanged
 
     def __post_init__(self) -> None:
-        """Refuse a serial number that cannot name a folder."""
         parse_serial(self.serial, 'the serial number')
 
 

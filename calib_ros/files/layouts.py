@@ -141,7 +141,6 @@ class Layout:
     sheet: str = ''  # of a workbook
 
     def __post_init__(self) -> None:
-        """Refuse invalid values."""
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name != 'columns' and type(value) is not type(item.default):

@@ -103,7 +103,6 @@ class Chain(Shown):
     """Acceleration of gravity [m/s^2] in the base frame, for compliance."""
 
     def __post_init__(self) -> None:
-        """Check the names, and find parallel axes if not given."""
         if self.convention not in get_args(Convention):
             raise UnknownNameError('convention', self.convention, get_args(Convention))
         if not self.joints:

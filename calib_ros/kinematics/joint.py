@@ -52,7 +52,6 @@ class Joint:
     b: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse an invalid row."""
         if not self.name or '.' in self.name:
             raise ConfigError(f'a joint needs a name without dots, not "{self.name}"')
         if self.type not in get_args(JointType):

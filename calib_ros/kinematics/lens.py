@@ -41,7 +41,6 @@ class Lens:
     fixed: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse invalid values."""
         for kind in LENS_KINDS:
             if not np.isfinite(getattr(self, kind)):
                 raise ConfigError(f'{kind} of a camera must be a finite number')

@@ -207,7 +207,6 @@ class Source:
     lens: str = 'given'  # by that topic, or `fitted` from there
 
     def __post_init__(self) -> None:
-        """Refuse values that bag and node cannot use."""
         if self.type and self.type not in TYPES:
             raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
         frames = {self.parent, self.child} - {''}
