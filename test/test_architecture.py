@@ -3,6 +3,7 @@
 """Who may import whom, as docs/architecture.md says."""
 
 import ast
+import re
 import subprocess
 import sys
 from functools import cache
@@ -73,6 +74,16 @@ def test_every_folder_has_its_place():
     assert {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()} == set(
         LEVEL
     )
+
+
+def test_the_page_names_modules_that_exist():
+    text = (PACKAGE.parent / 'docs/architecture.md').read_text()
+    rows = ' '.join(line for line in text.splitlines() if line.startswith('|'))
+    folder, named = '', re.findall(r'`(?:(\w+)/)?(\w+)\.py`', rows)
+    assert named
+    for given, name in named:  # without a folder: in that of the one before, or at the root
+        folder = given or folder
+        assert f'{folder}.{name}' in MODULES or (not given and name in MODULES), name
 
 
 @pytest.mark.parametrize('module', MODULES)
