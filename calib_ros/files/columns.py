@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns; errors name the line."""
+"""A table by columns; errors name the line, and what its header lacks."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
+from itertools import product, zip_longest
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import InputError
+from calib_ros.errors import ColumnsError, InputError
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import from_cell
@@ -222,3 +222,70 @@ def distinct(codes: Index) -> tuple[Index, Index]:
     rank = np.empty(len(order), dtype=np.intp)
     rank[order] = np.arange(len(order))
     return codes[first[order]], rank[number.reshape(-1)]
+
+
+def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
+    """Return columns; refuse those without rows or needed columns."""
+    missing = [name for name in needed if name not in found.header]
+    if missing:
+        refuse_separator(found.path, found.header)
+        raise InputError(
+            f'{found.path} has no column {", ".join(missing)}; expected {", ".join(needed)}; '
+            f'found {", ".join(found.header) or "nothing"}: name the columns in the first line'
+        )
+    if not len(found.lines):
+        raise InputError(f'{found.path} has no rows')
+    return found
+
+
+def refuse_separator(path: Path, header: Sequence[str]) -> None:
+    """Raise with advice if cells are not separated by commas."""
+    for name, mark in (('semicolon', ';'), ('tab', '\t')):
+        if any(mark in cell for cell in header):
+            raise ColumnsError(
+                f'the cells of {path} are separated by {name}s: save it with commas between cells '
+                'and points in numbers (measurements: calib_ros import)'
+            )
+
+
+def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
+    """Return --columns for the missing columns, with similar names of the header or NAME."""
+    if several := [name for name in missing if header.count(name) > 1]:
+        return f'Several columns are called {", ".join(several)}: rename all but one'
+    if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
+        numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
+        return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'
+    found = {
+        name: next((each for each in header if re.match(rf'{name}\b', each, re.I)), 'NAME')
+        for name in missing
+    }
+    of_joints = [f'q{k}' for k in range(1, joints + 1)]
+    whole = found.keys() >= {*of_joints}
+    lacking = found.keys() & {*of_joints}
+    fewer = bool(lacking) and 'q1' in header and 'q0' not in header
+    like = like_joints(header, joints) if lacking and not fewer else {}
+    more = '; joint values in another file: --joints FILE' if whole and not like else ''
+    if whole or like:
+        others = {name: found[name] for name in found if name not in of_joints}
+        found = {**(like or {'q*': 'NAME*'}), **others}
+    plain = {name: re.fullmatch(r'[\w.*]+', each) for name, each in found.items()}
+    given = (f'{name}={each if plain[name] else f"{{{each}}}"}' for name, each in found.items())
+    named = ' '.join(found.values())
+    units = ('length', 'mm'), ('length', 'cm'), ('angle', 'deg'), ('angle', '°')
+    for option, unit in reversed(units):
+        if re.search(rf'(?<!\w){unit}(?!\w)', named):
+            more = f' --{option} {unit.replace("°", "deg")}{more}'
+    options = f'Columns of other names: --columns "{",".join(given)}"{more}'
+    return f'Is it another arm (--chain)? {options}' if fewer else options
+
+
+def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
+    """Return the names in a header that count the joints, with a star for the number from 1."""
+    for name, first in product(header, (1, 0)):
+        for one in re.finditer(str(first), name):
+            before, after = name[: one.start()], name[one.end() :]
+            like = [f'{before}{k}{after}' for k in range(first, joints + first)]
+            if set(like) <= set(header):
+                count = {f'q{k}': each for k, each in enumerate(like, 1)}
+                return {'q*': f'{before}*{after}'} if first else count
+    return {}

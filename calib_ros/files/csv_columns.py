@@ -6,18 +6,25 @@ from __future__ import annotations
 
 import csv
 import io
-import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
-from calib_ros.files.columns import Codes, Columns, MadeColumns, Row, numbered, of_cells
+from calib_ros.files.columns import (
+    Codes,
+    Columns,
+    MadeColumns,
+    Row,
+    numbered,
+    of_cells,
+    refuse_separator,
+    with_rows,
+)
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, read_bytes
@@ -113,20 +120,6 @@ class TextColumns(Columns):
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
     """Return the columns of a CSV that has rows and the needed columns."""
     return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
-
-
-def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
-    """Return columns; refuse those without rows or needed columns."""
-    missing = [name for name in needed if name not in found.header]
-    if missing:
-        refuse_separator(found.path, found.header)
-        raise InputError(
-            f'{found.path} has no column {", ".join(missing)}; expected {", ".join(needed)}; '
-            f'found {", ".join(found.header) or "nothing"}: name the columns in the first line'
-        )
-    if not len(found.lines):
-        raise InputError(f'{found.path} has no rows')
-    return found
 
 
 def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0) -> Columns:
@@ -231,56 +224,3 @@ def csv_rows(
         raise InputError(
             f'cannot read {path} from line {line + 1}: {err}: are its quotation marks paired?'
         ) from err
-
-
-def refuse_separator(path: Path, header: Sequence[str]) -> None:
-    """Raise with advice if cells are not separated by commas."""
-    for name, mark in (('semicolon', ';'), ('tab', '\t')):
-        if any(mark in cell for cell in header):
-            raise ColumnsError(
-                f'the cells of {path} are separated by {name}s: save it with commas between cells '
-                'and points in numbers (measurements: calib_ros import)'
-            )
-
-
-def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
-    """Return --columns for the missing columns, with similar names of the header or NAME."""
-    if several := [name for name in missing if header.count(name) > 1]:
-        return f'Several columns are called {", ".join(several)}: rename all but one'
-    if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
-        numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
-        return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'
-    found = {
-        name: next((each for each in header if re.match(rf'{name}\b', each, re.I)), 'NAME')
-        for name in missing
-    }
-    of_joints = [f'q{k}' for k in range(1, joints + 1)]
-    whole = found.keys() >= {*of_joints}
-    lacking = found.keys() & {*of_joints}
-    fewer = bool(lacking) and 'q1' in header and 'q0' not in header
-    like = like_joints(header, joints) if lacking and not fewer else {}
-    more = '; joint values in another file: --joints FILE' if whole and not like else ''
-    if whole or like:
-        others = {name: found[name] for name in found if name not in of_joints}
-        found = {**(like or {'q*': 'NAME*'}), **others}
-    plain = {name: re.fullmatch(r'[\w.*]+', each) for name, each in found.items()}
-    given = (f'{name}={each if plain[name] else f"{{{each}}}"}' for name, each in found.items())
-    named = ' '.join(found.values())
-    units = ('length', 'mm'), ('length', 'cm'), ('angle', 'deg'), ('angle', '°')
-    for option, unit in reversed(units):
-        if re.search(rf'(?<!\w){unit}(?!\w)', named):
-            more = f' --{option} {unit.replace("°", "deg")}{more}'
-    options = f'Columns of other names: --columns "{",".join(given)}"{more}'
-    return f'Is it another arm (--chain)? {options}' if fewer else options
-
-
-def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
-    """Return the names in a header that count the joints, with a star for the number from 1."""
-    for name, first in product(header, (1, 0)):
-        for one in re.finditer(str(first), name):
-            before, after = name[: one.start()], name[one.end() :]
-            like = [f'{before}{k}{after}' for k in range(first, joints + first)]
-            if set(like) <= set(header):
-                count = {f'q{k}': each for k, each in enumerate(like, 1)}
-                return {'q*': f'{before}*{after}'} if first else count
-    return {}

@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.columns import MadeColumns, lines_in_words
-from calib_ros.files.csv_columns import like_joints, named_by_option
+from calib_ros.files.columns import MadeColumns, like_joints, lines_in_words, named_by_option
 from calib_ros.files.layouts import (
     ANGLES,
     COVARIANCE,

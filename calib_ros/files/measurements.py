@@ -22,9 +22,10 @@ from calib_ros.files.columns import (
     check_quaternions,
     distinct,
     lines_in_words,
+    named_by_option,
     numbered,
+    refuse_separator,
 )
-from calib_ros.files.csv_columns import named_by_option, refuse_separator
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
