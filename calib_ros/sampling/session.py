@@ -24,7 +24,7 @@ from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
 from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
-from calib_ros.sampling.road import Road
+from calib_ros.sampling.pipeline import Road
 from calib_ros.sampling.sample import (
     Sample,
     check_joint_names,

@@ -20,7 +20,7 @@ from streams import (
 )
 
 from calib_ros import CalibrationSession, Settings, load_chain
-from calib_ros.sampling.road import STRAY, Gate
+from calib_ros.sampling.pipeline import STRAY, Gate
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
 
 ARM = load_chain('ur5e')
