@@ -119,7 +119,7 @@ class Gate:
         return found
 
 
-class Road:
+class Pipeline:
     """Takes messages in slices up to joint states that require work.
 
     `taken` is called with new samples, and returns their total number.

@@ -24,7 +24,7 @@ from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
 from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
-from calib_ros.sampling.pipeline import Road
+from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import (
     Sample,
     check_joint_names,
@@ -76,8 +76,8 @@ class CalibrationSession:
         """Forget all samples and counts, not the last good calibration."""
         settings = self.settings
         self.made = 0  # samples, without restored ones
-        self._road = Road(self.chain, settings, self._take)
-        self._collector, self._clocks = self._road.collector, self._road.clocks
+        self._pipeline = Pipeline(self.chain, settings, self._take)
+        self._collector, self._clocks = self._pipeline.collector, self._pipeline.clocks
         self._frames = FrameNames()
         self._names = JointNames(self.joint_names)
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
@@ -108,7 +108,7 @@ class CalibrationSession:
         if len(self._frames.usual) != settled:
             self._kept.leave_out_strange()
         try:
-            self._road.take(pieces)
+            self._pipeline.take(pieces)
         finally:
             self._settle()
 
@@ -118,7 +118,7 @@ class CalibrationSession:
 
     def finish(self) -> None:
         """Make samples of all waiting messages; no more will arrive."""
-        self._road.finish()
+        self._pipeline.finish()
         self._settle(wait=True)
         self._kept.leave_out_strange()
 
@@ -143,7 +143,7 @@ class CalibrationSession:
             return 0, NOT_RECORDING
         count, why = self._collector.capture(socket_place(socket) if socket else '')
         before = len(self.samples)
-        self._road.hand_over()
+        self._pipeline.hand_over()
         self._settle(wait=True)
         taken = len(self.samples) - before
         if JOINTS in self._entry.refused:
@@ -206,13 +206,13 @@ class CalibrationSession:
         if self.settings.mode != 'continuous' and fitted:
             distinct = len(np.unique(configurations(np.array(fitted))))
         collector = self._collector
-        notes = self._road.notes + collector.notes
+        notes = self._pipeline.notes + collector.notes
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
         return Account(
             self.received[JOINTS],
             self.received[POSES],
-            collector.waiting.count + self._road.gate.held(POSES),
+            collector.waiting.count + self._pipeline.gate.held(POSES),
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
@@ -224,7 +224,7 @@ class CalibrationSession:
 
     @property
     def _dropped(self) -> Counter[str]:
-        gate, images = self._road.gate.dropped, self.pictures.dropped
+        gate, images = self._pipeline.gate.dropped, self.pictures.dropped
         return self._entry.dropped + self._collector.dropped + images + gate
 
     @property
@@ -241,10 +241,10 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        found += self._road.hints(self.received[POSES])
+        found += self._pipeline.hints(self.received[POSES])
         if any(hint.explains for hint in found):
             return found
-        return found + (losses(self.received, self._dropped) or self._road.unsettled())
+        return found + (losses(self.received, self._dropped) or self._pipeline.unsettled())
 
     @property
     def delay(self) -> Delay | None:
@@ -350,7 +350,7 @@ class CalibrationSession:
         return calibration, in_frames_of(calibration, since, self.usable, self.settings)
 
     def _flush(self) -> None:
-        self._road.flush()
+        self._pipeline.flush()
         self._settle(wait=True)
 
     def _settle(self, wait: bool = False) -> None:
