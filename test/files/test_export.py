@@ -24,6 +24,8 @@ from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.chain_file import (
     dump_chain,
     load_chain,
+    parse_chain,
+    parse_chain,
     shipped_robots,
 )
 from calib_ros.kinematics.parameter import DH_KINDS
