@@ -20,6 +20,7 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
+from calib_ros.settings import EXCEPTION
 from calib_ros.shown import some
 
 
@@ -72,15 +73,29 @@ def _of_the_fit(
         for each in missing:
             kinds.setdefault(each.owner, []).append(each.kind)
         named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
-        spans = np.ptp(np.concatenate([each.joints for each in problem.sets]), axis=0)
-        still = [problem.chain.joint_names[k] for k in np.flatnonzero(spans <= STILL)]
-        stood = f'{", ".join(still)} stood still (or was not recorded): ' if still else ''
-        yield Reason(Rule.EXCITATION, f'{stood}the poses do not determine {named}')
+        yield Reason(Rule.EXCITATION, f'{_together(problem)}the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
         text = f'{", ".join(far)} off, more than even a faulty robot of this kind'
         yield Reason(Rule.COMMON_SENSE, text)
+
+
+def _together(problem: Problem) -> str:
+    """Return which joints stood still, or only moved together, and a colon; empty if none."""
+    joints = np.concatenate([each.joints for each in problem.sets])
+    moved = np.ptp(joints, axis=0) > STILL
+    names, found = np.array(problem.chain.joint_names), ''
+    if not moved.all():
+        found = f'{", ".join(names[~moved])} stood still (or was not recorded): '
+    own = joints[:, moved] - joints[:, moved].mean(axis=0)
+    if len(own) > own.shape[1] > 1:
+        _, sizes, ways = np.linalg.svd(own, full_matrices=False)
+        alike = names[moved][np.abs(ways[-1]) > EXCEPTION]
+        if len(alike) > 1 and sizes[-1] <= STILL * np.sqrt(len(own)):
+            found += f'{", ".join(alike)} only moved together (if the arm couples them, give '
+            found += 'their couplings and equal limits in the chain file): '
+    return found
 
 
 def _gain(

@@ -182,15 +182,21 @@ def _placed(chain: Chain, base: FloatArray, tool: FloatArray) -> Chain:
 def _trilaterated(chain: Chain, arm: FloatArray, observations: Observations) -> Chain:
     """Return the chain placed by distances from the world's origin.
 
-    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2; distances do not determine the
-    orientation of the base, which stays parallel to the world.
+    L^2 = |p|^2 + 2 p b + |b|^2 is linear in b and |b|^2, which gives the height of b over an arm
+    that moves in a plane; distances do not determine the orientation of the base, which stays
+    parallel to the world.
     """
     assert observations.distances is not None
     tool = chain.frame('tool').matrix
     points = (arm @ tool)[:, :3, 3]
     columns = np.column_stack([2.0 * points, np.ones(len(points))])
     wanted = observations.distances**2 - (points**2).sum(axis=1)
-    place = np.linalg.lstsq(columns, wanted, rcond=None)[0][:3]
+    *flat, square = np.linalg.lstsq(columns, wanted, rcond=None)[0]
+    place = np.array(flat)
+    _, sizes, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    if sizes[-1] <= DEGENERATE * sizes[0]:  # at height zero nothing would change it
+        least = EXCEPTION**2 * np.mean(observations.distances**2)
+        place += axes[-1] * np.sqrt(max(square - place @ place, least))
     return _placed(chain, se3.transform(np.eye(3), place), tool)
 
 

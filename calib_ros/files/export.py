@@ -83,7 +83,8 @@ def exports(
     range. `origin` is recorded. Raises ExportError if a file read back differs from the chain.
     """
     q = anywhere(chain)
-    arm = replace(chain, effects=())
+    known = [each for each in nominal.effects if Parameter(each[0]).effect[0] == 'coupling']
+    arm = replace(chain, effects=tuple(known))
     wanted = arm.forward(q)
     lost = distance(chain, replace(chain, effects=nominal.effects), q)
     counting = ', with the effects of the nominal chain' * bool(nominal.effects)
@@ -180,7 +181,7 @@ def kinematics_yaml(chain: Chain, origin: Mapping[str, Any] | None = None) -> st
 
 def origins(form: Chain) -> FloatArray:
     """Return the frames (n + 1, 4, 4) of the joints of a modified chain, and the tool, at zero."""
-    rows = [replace(joint, sign=1) for joint in form.joints]
+    rows = [replace(joint, sign=1, lower=None, upper=None) for joint in form.joints]
     chains = [Chain(form.name, 'modified', (row,), parallel=()) for row in rows]
     places = [chain.forward(np.zeros((1, 1)))[0] for chain in chains]
     return np.array([*places, form.frame('tool').matrix])
@@ -194,7 +195,8 @@ def forward_of(text: str, chain: Chain, q: FloatArray) -> FloatArray:
     poses, signs = document['kinematics'], document['signs']
     places = [pose_matrix(poses[name]) for name in chain.joint_names]
     slides = [joint.type == 'prismatic' for joint in chain.joints]
-    moved = walked(places, q * [signs[name] for name in chain.joint_names], slides)
+    values = chain.effective(q.T).T
+    moved = walked(places, values * [signs[name] for name in chain.joint_names], slides)
     end = pose_matrix(poses['flange']) @ chain.frame('tool').matrix
     return np.asarray(chain.frame('base').matrix @ moved @ end)
 

@@ -141,6 +141,15 @@ class Chain(Shown):
         return tuple(joint.name for joint in self.joints)
 
     @cached_property
+    def held(self) -> Mapping[int, float]:
+        """Return the values [rad or m] of joints that only couplings move, by number.
+
+        Their limits are equal. Reported values of such joints count for nothing.
+        """
+        ends = ((k, joint.lower, joint.upper) for k, joint in enumerate(self.joints))
+        return {k: lower for k, lower, upper in ends if lower is not None and lower == upper}
+
+    @cached_property
     def parameter_names(self) -> tuple[Parameter, ...]:
         """Return the names of all parameters of the error model, frames first."""
         frames = {name: self.frame(name) for name in self.frame_names}
@@ -224,7 +233,7 @@ class Chain(Shown):
             if name.partition('.')[0] not in self._joints:
                 raise UnknownNameError('parameter', name, self.parameter_names)
             effects.resolve(self, name)
-        kept = ('joint_names', 'frame_names', 'walk', 'all_frames', '_joints')
+        kept = ('joint_names', 'frame_names', 'walk', 'all_frames', '_joints', 'held')
         return _with(self, {'effects': (*self.effects, *added)}, kept)
 
     def with_effect_values(self, values: Mapping[str, float]) -> Chain:
@@ -261,7 +270,7 @@ class Chain(Shown):
             'effects': tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
         }
         same = all(new is old for new, old in zip(joints, self.joints, strict=True))
-        names = ('joint_names', 'frame_names', '_all_parameters')
+        names = ('joint_names', 'frame_names', '_all_parameters', 'held')
         kept = (*names, *(('walk', '_joints') if same else ()))
         return _with(self, found, kept)
 

@@ -20,7 +20,7 @@ of any masses along the arm.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
@@ -44,6 +44,8 @@ class _Arm(Protocol):
     def joint_names(self) -> tuple[str, ...]: ...
     @property
     def effects(self) -> tuple[tuple[str, float], ...]: ...
+    @property
+    def held(self) -> Mapping[int, float]: ...
     @property
     def gravity(self) -> tuple[float, float, float]: ...
     @property
@@ -207,9 +209,13 @@ def _wave(
 
 
 def moved(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
-    """Return joint values (n, B) plus effects with phi (E, B)."""
+    """Return joint values (n, B) plus effects with phi (E, B); of held joints their limit."""
     known = dict(chain.effects)
     values = [known[name] for name in names]
+    if chain.held:
+        q = q.copy()
+        for k, end in chain.held.items():
+            q[k] = end
     if not any(values):
         return q
     shares = np.zeros((len(q), len(names)))

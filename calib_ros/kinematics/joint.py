@@ -61,9 +61,9 @@ class Joint:
         for kind in ROW_KINDS:
             if not math.isfinite(getattr(self, kind)):
                 raise ConfigError(f'{kind} of joint "{self.name}" must be a finite number')
-        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+        if self.lower is not None and self.upper is not None and not self.lower <= self.upper:
             raise ConfigError(
-                f'limits of joint "{self.name}": lower {self.lower} must be less than upper '
+                f'limits of joint "{self.name}": lower {self.lower} must not exceed upper '
                 f'{self.upper}'
             )
 

@@ -90,6 +90,9 @@ def chain_from_urdf(
         rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
     x, y, z = (_clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
+    led = [(joint.name, joint.follows) for joint in moving if joint.follows]
+    couplings = {f'{name}.coupling_{leader}': ratio for name, (leader, ratio) in led}
+    chain = chain.with_effect_values(couplings)
     ends = _ends(chain)
     return replace(
         chain,
@@ -120,7 +123,7 @@ def corrected_urdf(
     robot = parse_urdf(text)
     path = robot.path(base_link, tip_link)
     poses = robot.poses(path[0].parent)
-    tip = arm.forward(np.zeros((1, len(arm.joints))))[0]
+    tip = _ends(arm)[-1] @ arm.frame('tool').matrix
     shifts = dict(zip(arm.joint_names, _on_axes(arm) @ se3.invert(_on_axes(nominal)), strict=True))
 
     last, end = arm.joint_names[-1], path[-1].child
@@ -148,11 +151,12 @@ def corrected_urdf(
 
 def _refuse_others(arm: Chain, nominal: Chain) -> None:
     refuse_other_joints('the chain', arm, 'the URDF, between these links,', nominal)
-    effects = [name for name, value in arm.effects if value]
-    if effects:
+    known = dict(nominal.effects)
+    if effects := [name for name, value in arm.effects if value != known.get(name, 0.0)]:
         raise ConfigError(
             f'a URDF cannot represent the effects {", ".join(effects)}, and the chain is not '
-            'accurate without them: identify with the model "geometric"'
+            'accurate without them: identify with the model "geometric" (and --fixed '
+            '"*.coupling_*" if joints mimic others)'
         )
     q = nominal.random_joints(50, np.random.default_rng(0))
     found, expected = arm.forward(q), nominal.forward(q)

@@ -35,7 +35,10 @@ _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
 
 @dataclass(frozen=True, eq=False)
 class DescribedJoint:
-    """A joint of a URDF; `axis` is a unit vector in its frame, zero if fixed."""
+    """A joint of a URDF; `axis` is a unit vector in its frame, zero if fixed.
+
+    It `follows` another joint, times a multiplier, if it mimics one. Its limits then are equal.
+    """
 
     name: str
     type: str
@@ -45,7 +48,7 @@ class DescribedJoint:
     axis: FloatArray
     lower: float | None
     upper: float | None
-    mimics: bool
+    follows: tuple[str, float] | None
 
     @property
     def moves(self) -> bool:
@@ -85,13 +88,15 @@ class Description:
         path.reverse()
         if not any(joint.moves for joint in path):
             raise ConfigError(f'no joint moves between link "{base}" and link "{tip}"')
+        driven = [joint.name for joint in path if joint.moves and not joint.follows]
         for joint in path:
-            does = 'mimics another' if joint.mimics else f'is {joint.type}'
-            if joint.mimics or joint.type in ('floating', 'planar'):
+            lost = joint.follows is not None and joint.follows[0] not in driven
+            does = 'mimics another' if lost else f'is {joint.type}'
+            if lost or joint.type in ('floating', 'planar'):
                 raise ConfigError(
                     f'joint "{joint.name}" {does}: a serial chain has revolute, continuous, '
-                    'prismatic and fixed joints only, each driven by itself; choose base_link and '
-                    'tip_link on one side of it'
+                    'prismatic and fixed joints only, driven by themselves or another of them; '
+                    'choose base_link and tip_link on one side of it'
                 )
         return tuple(path)
 
@@ -207,8 +212,18 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     if kind in ('revolute', 'prismatic') and set(ENDS) & set(limit.keys()):
         ends = (_numbers(limit, key, f'limit of {where}', '0', 1, math.inf) for key in ENDS)
         lower, upper = (float(x[0]) if abs(x[0]) <= LARGEST else None for x in ends)
-    origin, mimics = _origin(element, where), element.find('mimic') is not None
-    return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, mimics)
+    follows, mimic = None, element.find('mimic')
+    if mimic is not None and kind in MOVING:
+        of = f'mimic of {where}'
+        ratio, lower = (
+            float(_numbers(mimic, key, of, default, 1)[0])
+            for key, default in (('multiplier', '1'), ('offset', '0'))
+        )
+        follows, upper = (mimic.get('joint', ''), ratio), lower
+    elif lower is not None and lower == upper:
+        raise ConfigError(f'limits of {where} are equal: it could not move')
+    origin = _origin(element, where)
+    return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, follows)
 
 
 def _inertial(link: ET.Element) -> tuple[float, FloatArray]:

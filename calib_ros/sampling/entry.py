@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -24,11 +24,12 @@ OTHERS = 'none of the joints in the message'
 class JointNames:
     """Finds the joints of a chain in messages that may name others, or only some of them.
 
-    `names` are the chain's joints as messages name them.
+    `names` are the chain's joints as messages name them. `held` ones need not be named; they have
+    this value.
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self._names = names
+    def __init__(self, names: Sequence[str], held: Mapping[int, float] | None = None) -> None:
+        self._names, self.held = names, held or {}
         self._layouts: dict[tuple[str, ...], Layout] = {}
         self.foreign: tuple[str, ...] = ()
         """Names received if some of the chain's joints are never named."""
@@ -38,10 +39,14 @@ class JointNames:
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
-            known = [(k, key.index(n)) for k, n in enumerate(self._names) if n in key]
-            index = np.array([i for _, i in known], dtype=np.intp)
-            self._layouts[key] = tuple(k for k, _ in known), index
+            known = {k: key.index(n) for k, n in enumerate(self._names) if n in key}
+            if known.keys() - self.held.keys():
+                known = dict(sorted({**dict.fromkeys(self.held, 0), **known}.items()))
+            else:
+                known = {}
+            self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
             named = {name for names in self._layouts for name in names}
+            named |= {self._names[k] for k in self.held}
             missing = [name for name in self._names if name not in named]
             self.foreign = tuple(sorted(named)) if missing else ()
         return self._layouts[key]
@@ -152,6 +157,8 @@ class Entry:
                 self.miss(JOINTS, len(stamps), OTHERS)
                 continue
             values = numbers[:, index]
+            for k, end in self._names.held.items():
+                values[:, columns.index(k)] = end
             size = np.abs(values).max(axis=1)
             good = size <= LARGEST
             if not good.all():

@@ -79,7 +79,7 @@ class CalibrationSession:
         self._pipeline = Pipeline(self.chain, settings, self._take)
         self._collector, self._clocks = self._pipeline.collector, self._pipeline.clocks
         self._frames = FrameNames()
-        self._names = JointNames(self.joint_names)
+        self._names = JointNames(self.joint_names, self.chain.held)
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
         self.pictures.clear()

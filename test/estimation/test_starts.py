@@ -17,7 +17,7 @@ from calib_ros.estimation.robust import _Halves, _Linear, trimmed_sum
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.start import _shortest, closed_forms, start_frames
 from calib_ros.kinematics import inverse, se3
-from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain import Chain, Frame, Joint
 from calib_ros.kinematics.se3 import norms
 
 
@@ -236,3 +236,21 @@ def test_distances_start_right_among_gross_errors_that_agree():
     left = np.linalg.norm(found.forward(q)[:, :3, 3], axis=1) - distances
     assert np.median(np.abs(left)) < 2e-3
     np.testing.assert_allclose(found.base.matrix[:3, :3], np.eye(3))  # no distance tells a turn
+
+
+@pytest.mark.parametrize('height', [0.05, 1.5])
+def test_distances_place_an_arm_that_moves_in_a_plane(height, rng):
+    """From its plane no small change shows: a start at height zero stayed there, 70 mm off."""
+    joints = tuple(Joint(f'j{k}', a=a, lower=-2.5, upper=2.5) for k, a in enumerate((0.4, 0.3)))
+    nominal = Chain('planar', 'standard', joints)
+    base, tool = (
+        se3.transform(np.eye(3), np.array(xyz)) for xyz in ((0.6, -2.0, 0.0), (0.1,) * 3)
+    )
+    base[2, 3] = height
+    true = replace(nominal, base=Frame(base), tool=Frame(tool))
+    seen = measure(true, nominal.random_joints(60, rng), rng)
+    wires = replace(seen, distances=np.linalg.norm(seen.positions, axis=1))
+    found = start_frames(nominal, [wires], 1e-4, 1e-4 / 0.3, 'redescending')
+    q = nominal.random_joints(50, rng)
+    left = [np.linalg.norm(each.forward(q)[:, :3, 3], axis=1) for each in (found, true)]
+    np.testing.assert_allclose(*left, rtol=0.0, atol=1e-5)

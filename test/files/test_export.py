@@ -24,6 +24,7 @@ from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
 from calib_ros.kinematics.chain_file import (
     dump_chain,
     load_chain,
+    parse_chain,
     shipped_robots,
 )
 from calib_ros.kinematics.parameter import DH_KINDS
@@ -211,6 +212,8 @@ def test_tables_count_on_effects_that_the_controller_knows():
     nominal, chain = (replace(each, effects=coupled) for each in (nominal, chain))
     *exact, without_beta, offsets = exports(chain, nominal)
     assert {each.error for each in exact} == {0.0}
+    files = [parse_chain(each.content) for each in exact if each.name.endswith('d.yaml')]
+    assert [each.effects for each in files] == [coupled, coupled]
     assert max(without_beta.error, offsets.error) < 0.02
     for table in (*exact[:4], without_beta, offsets):
         assert 'with the effects of the nominal chain' in table.content.splitlines()[0]

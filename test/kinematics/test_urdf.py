@@ -261,9 +261,10 @@ REFUSED = {
     ),
     'mimic': (
         edited(UR10E, ELBOW, f'{ELBOW}<mimic joint="wrist_1_joint"/>'),
-        {},
+        {'tip_link': 'forearm_link'},
         'joint "elbow_joint" mimics another',
     ),
+    'stuck': (edited(UR10E, ELBOW, f'{ELBOW}<limit lower="0" upper="0"/>'), {}, 'are equal'),
     'finger': (PANDA, {'tip_link': 'panda_rightfinger'}, '"panda_finger_joint2" mimics another'),
     'limits': (edited(UR10E, f'lower="{-PI!r}"', 'lower="9"'), {}, 'limits of joint "elbow'),
     'unknown child': (edited(UR10E, '<link name="tool0"/>', ''), {}, 'link at joint "flange'),

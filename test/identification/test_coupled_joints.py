@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A palletiser: parallelograms keep its hand level, so two of its six axes follow others."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS
+from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
+from urdfs import SCARA, ZERO, Z, limits, reference_forward, written
+
+from calib_ros import CalibrationSession, Problem, Settings, identify
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.errors import ConfigError
+from calib_ros.kinematics.chain_file import dump_chain, parse_chain
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+
+Y = (0, 1, 0)
+NAMES = ('turn', 'lower', 'upper', 'level_1', 'level_2', 'wrist')
+PALLETISER = written(
+    'palletiser',
+    ('turn', 'revolute', 'base', 'column', (0, 0, 0.5), ZERO, Z, limits(-2.5, 2.5)),
+    ('lower', 'revolute', 'column', 'arm_1', (0.26, 0, 0.24), ZERO, Y, limits(-0.7, 1.4)),
+    ('upper', 'revolute', 'arm_1', 'arm_2', (0, 0, 0.945), ZERO, Y, limits(-0.3, 2.0)),
+    ('level_1', 'revolute', 'arm_2', 'between', (1.025, 0, 0), ZERO, Y, limits(-2, 2)),
+    ('level_2', 'continuous', 'between', 'hand', ZERO, ZERO, Y),
+    ('wrist', 'revolute', 'hand', 'tool0', (0.22, 0, -0.2), ZERO, Z, limits(-2.5, 2.5)),
+)
+for _follower, _leader in (('level_1', 'lower'), ('level_2', 'upper')):
+    _head = (
+        f'<joint name="{_follower}" type="{"revolute" if _leader == "lower" else "continuous"}">'
+    )
+    assert _head in PALLETISER
+    _mimic = f'<mimic joint="{_leader}" multiplier="-1" offset="{0.1 * (_leader == "upper")}"/>'
+    PALLETISER = PALLETISER.replace(_head, _head + _mimic)
+CHAIN = chain_from_urdf(PALLETISER)
+
+
+def whole(q):
+    """Return the values of all joints by name, those of the followers as in the URDF."""
+    values = dict(zip(NAMES, q.tolist(), strict=True))
+    return values | {'level_1': -values['lower'], 'level_2': 0.1 - values['upper']}
+
+
+def test_mimicking_joints_follow_whatever_is_reported_of_them(rng):
+    q = CHAIN.random_joints(20, rng)
+    reported = q.copy()
+    reported[:, 3:5] = rng.normal(size=(20, 2))
+    expected = [reference_forward(PALLETISER, whole(row), 'base', 'tool0') for row in q]
+    np.testing.assert_allclose(CHAIN.forward(reported), expected, rtol=0.0, atol=1e-9)
+
+
+def test_a_corrected_urdf_keeps_them(rng):
+    true = faulty(CHAIN, Cell(), rng)
+    true = replace(true, effects=CHAIN.effects)
+    text = corrected_urdf(PALLETISER, true)
+    again = chain_from_urdf(text)
+    q = CHAIN.random_joints(20, rng)
+    arm = replace(true, base=again.base, tool=again.tool)
+    away = again.forward(q) @ np.linalg.inv(arm.forward(q))
+    assert np.ptp(away, axis=0).max() < 1e-9
+    assert again.effects == CHAIN.effects
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_what_the_coupled_joints_show_is_identified_and_the_rest_named_a_gauge(oriented, rng):
+    true = faulty(CHAIN, Cell(), rng)
+    q = CHAIN.random_joints(60, rng)
+    nominal = replace(CHAIN, base=None, tool=None)
+    seen = measure(true, q, rng, *NOISE, oriented=oriented)
+    result = identify(Problem(nominal, seen, **SIGMAS))
+    assert result.accepted
+    assert not result.not_excited
+    assert {'turn.a', 'level_2.theta'} <= result.gauges.keys()
+    fresh = CHAIN.random_joints(200, rng)
+    errors = [
+        (each.forward(fresh) - true.forward(fresh))[:, :3, 3]
+        for each in (result.before, result.chain)
+    ]
+    before, after = (float(np.sqrt((each**2).sum(axis=1).mean())) for each in errors)
+    assert after < 0.05 * before
+
+
+def test_without_couplings_in_the_chain_they_are_named(rng):
+    alone = replace(
+        CHAIN,
+        joints=tuple(replace(each, lower=-3.0, upper=3.0) for each in CHAIN.joints),
+        effects=(),
+    )
+    q = CHAIN.random_joints(60, rng)
+    q[:, 3:5] = [0.0, 0.1] - q[:, 1:3]
+    seen = measure(faulty(alone, Cell(), rng), q, rng, *NOISE)
+    refused = identify(Problem(replace(alone, base=None, tool=None), seen, **SIGMAS)).refusals
+    assert any('only moved together' in text and 'lower' in text for text in refused)
+
+
+def test_joint_states_need_not_name_them(rng):
+    true = faulty(CHAIN, Cell(), rng)
+    q = CHAIN.random_joints(5, rng)
+    motion, end = stops(q, 0.8, 0.8), 8.0
+    times = np.arange(0.0, end, 0.04)
+    made = CalibrationSession(CHAIN, Settings(**SIGMAS))
+    named = [0, 1, 2, 5]
+    for row, stamp in zip(motion(times), stamps(times).tolist(), strict=True):
+        found = true.forward(row[np.newaxis])[0]
+        message = joint_state(stamp, [NAMES[k] for k in named], row[named].tolist())
+        take(made, of_joints(message), (TRACKER, POSE, pose(stamp, found[:3, 3], found[:3, :3])))
+    made.finish()
+    np.testing.assert_allclose([each.joints for each in made.samples], q, atol=1e-3)
+
+
+def test_a_joint_that_nothing_moves_is_refused():
+    assert parse_chain(dump_chain(CHAIN)).held == CHAIN.held == {3: 0.0, 4: 0.1}
+    with pytest.raises(ConfigError, match='joint 4: cannot move'):
+        parse_chain(dump_chain(replace(CHAIN, effects=())))
+    stuck = SCARA.replace('lower="-3.0" upper="3.0"', 'lower="0.0" upper="0.0"')
+    with pytest.raises(ConfigError, match='limits of joint "wrist" are equal'):
+        chain_from_urdf(stuck)
