@@ -20,6 +20,7 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
+from calib_ros.settings import EXCEPTION
 from calib_ros.shown import some
 
 
@@ -72,15 +73,27 @@ def _of_the_fit(
         for each in missing:
             kinds.setdefault(each.owner, []).append(each.kind)
         named = ', '.join(f'{owner} ({", ".join(names)})' for owner, names in kinds.items())
-        spans = np.ptp(np.concatenate([each.joints for each in problem.sets]), axis=0)
-        still = [problem.chain.joint_names[k] for k in np.flatnonzero(spans <= STILL)]
-        stood = f'{", ".join(still)} stood still (or was not recorded): ' if still else ''
-        yield Reason(Rule.EXCITATION, f'{stood}the poses do not determine {named}')
+        yield Reason(Rule.EXCITATION, f'{_unmoved(problem)}the poses do not determine {named}')
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
         text = f'{", ".join(far)} off, more than even a faulty robot of this kind'
         yield Reason(Rule.COMMON_SENSE, text)
+
+
+def _unmoved(problem: Problem) -> str:
+    """Return which joints stood still or only moved together, in words."""
+    joints, names = np.concatenate([s.joints for s in problem.sets]), problem.chain.joint_names
+    moved = np.ptp(joints, axis=0) > STILL
+    if not moved.all():
+        still = [name for name, each in zip(names, moved, strict=True) if not each]
+        return f'{", ".join(still)} stood still (or was not recorded): '
+    centred = joints - joints.mean(axis=0)
+    axis = np.linalg.svd(centred, full_matrices=False)[2][-1]
+    if len(joints) <= len(names) or np.abs(centred @ axis).max() > STILL:
+        return ''
+    tied = [names[k] for k in np.flatnonzero(np.abs(axis) > EXCEPTION)]
+    return f'{", ".join(tied)} only moved in one fixed relation (is one passive?): '
 
 
 def _gain(

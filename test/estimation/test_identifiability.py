@@ -95,6 +95,20 @@ def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
     assert_trades_hold(result, q)
 
 
+def test_joints_that_only_move_together_are_named(rng):
+    """A linkage keeps a palletiser's wrist level, so its joint alone is never seen to move."""
+    q = UR10E.random_joints(60, rng)
+    q[:, 3] = 0.2 - q[:, 1] - q[:, 2]
+    result = identify(
+        Problem(UR10E, measure(faulty(UR10E, Cell(), rng), q, rng, *NOISE), **SIGMAS)
+    )
+    first = (
+        'shoulder_lift_joint, elbow_joint, wrist_1_joint only moved in one fixed relation (is one '
+        'passive?): the poses do not determine '
+    )
+    assert any(text.startswith(first) for text in result.refusals)
+
+
 def test_a_fixed_partner_makes_its_trade_identifiable(rng):
     tool = replace(random_frame(rng, 0.2), fixed=True)
     nominal = replace(UR10E, tool=tool)
