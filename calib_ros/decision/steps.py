@@ -71,12 +71,13 @@ class Step:
         return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
 
     def __str__(self) -> str:
+        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
+        where += f' of set {self.set + 1}' if self.set else ''
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
         line, fraction = divmod(self.stamp_ns, 10**9)
         if line < 10**6 and not fraction:  # row numbers instead of a clock
-            when = f'line {line}, if rows are in the order of measurement'
-        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
-        where += f' of set {self.set + 1}' if self.set else ''
+            where = f'line {line}' if self.image is None else f'{where}, line {line}'
+            when = 'if rows are in the order of measurement'
         size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
         thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':

@@ -37,10 +37,12 @@ def independent(
     `factor` (P, P) is the upper triangular factor of the weighted Jacobian, columns in the order
     of the names: of parameters that trade against each other, the last are left out and stay
     nominal. At least this share of a column must be left by those before it: `frame_tolerance` for
-    frames, HALF_THE_DIGITS for others.
+    frames, HALF_THE_DIGITS for others; and of the largest column more than rounding.
     """
     frames = [Parameter(name).kind in FRAME_KINDS for name in names]
-    least = np.where(frames, frame_tolerance, HALF_THE_DIGITS) * np.linalg.norm(factor, axis=0)
+    sizes = np.linalg.norm(factor, axis=0)
+    least = np.where(frames, frame_tolerance, HALF_THE_DIGITS) * sizes
+    least = np.maximum(least, ROUNDING * sizes.max(initial=0.0))  # less shows nowhere
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
         return tuple(names)  # the diagonal holds the rest of each column
     basis = np.zeros(factor.shape)
@@ -50,7 +52,7 @@ def independent(
         rest = column - known @ (known.T @ column)
         rest -= known @ (known.T @ rest)  # again: Gram-Schmidt loses orthogonality
         size = math.sqrt(rest @ rest)
-        if size > short and size > 0.0:
+        if size > short:
             basis[:, len(kept)] = rest / size
             kept.append(name)
     return tuple(kept)

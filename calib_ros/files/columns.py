@@ -252,7 +252,7 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     """Return --columns for the missing columns, with similar names of the header or NAME."""
     if several := [name for name in missing if header.count(name) > 1]:
         return f'Several columns are called {", ".join(several)}: rename all but one'
-    if header and all(re.fullmatch(r'-?[\d.]+(e-?\d+)?', name) for name in header):
+    if _only_numbers(header):
         numbers = ','.join(f'{name}=#{k}' for k, name in enumerate(missing, 1))
         return f'Its first line holds numbers, not names: --columns "{numbers}", in its order'
     found = {
@@ -279,8 +279,14 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     return f'Is it another arm (--chain)? {options}' if fewer else options
 
 
+def _only_numbers(header: Sequence[str]) -> bool:
+    return bool(header) and all(re.fullmatch(r'-?[\d.]+(e[+-]?\d+)?', name) for name in header)
+
+
 def like_joints(header: Sequence[str], joints: int) -> dict[str, str]:
     """Return the names in a header that count the joints, with a star for the number from 1."""
+    if _only_numbers(header):
+        return {'q*': '#*'}
     for name, first in product(header, (1, 0)):
         for one in re.finditer(str(first), name):
             before, after = name[: one.start()], name[one.end() :]

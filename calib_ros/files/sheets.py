@@ -183,14 +183,16 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
     lines = lines[-30:]  # mostly below the header
     if not lines:
         raise InputError(f'{path} has no rows')
-    best, most = 'comma', 0
+    best, most, cells = 'comma', 0, 1
     for name in ('tab', 'semicolon', 'comma', 'space'):
         mark = SEPARATORS[name]
-        counts = [len(line.split() if mark == ' ' else line.split(mark)) for line in lines]
+        rows = [line.split() if mark == ' ' else line.split(mark) for line in lines]
+        counts = [len(row) for row in rows]
         usual = max(set(counts), key=counts.count)
         agreed = counts.count(usual) if usual > 1 else 0
-        if agreed > 1.2 * most:
-            best, most = name, agreed
+        finer = agreed == len(lines) and usual > cells  # as if tabs are mixed with blanks
+        if agreed > 1.2 * most or (finer and all(_is_number(x, '.') for row in rows for x in row)):
+            best, most, cells = name, agreed, usual
     if best != 'comma':
         notes.append(f'cells are separated by {best}s (--separator)')
     return SEPARATORS[best]

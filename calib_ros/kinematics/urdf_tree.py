@@ -162,11 +162,14 @@ def _robot(text: str) -> ET.Element:
         )
     if len(text) > LARGEST_TEXT:
         raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()  # ROS declares no prefixes either
+    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     try:
-        root = ET.fromstring(text)
-    except (ET.ParseError, ValueError) as err:  # ValueError: not UTF-8
+        parser.Parse(text, True)
+    except (expat.ExpatError, ValueError) as err:  # ValueError: not UTF-8
         raise ConfigError(f'the URDF is not valid XML: {err}') from err
-    if any('xacro' in element.tag.rpartition('}')[0] for element in root.iter()):
+    root = builder.close()
+    if any('xacro:' in element.tag for element in root.iter()):
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
     if root.tag != 'robot':
         raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>')

@@ -176,9 +176,19 @@ def test_without_stamps_the_order_of_the_rows_is_said():
     true, seen = session(3)
     result = identify(Problem(UR10E, moved(seen, true, 'tool', 8e-4), **SIGMAS))
     assert result.refusals[0].startswith(
-        'the target moved by 0.8 mm (tool) before pose 27 (line 27, if rows are in the order of '
+        'the target moved by 0.8 mm (tool) before line 27 (if rows are in the order of '
         'measurement)'
     )
+
+
+def test_poses_of_several_targets_are_told_by_their_lines():
+    """Pose 14 of the first target would be line 27 of the table."""
+    true, seen = session(3)
+    seen = moved(seen, true, 'base', 2e-3)
+    even, odd = (seen.select(np.arange(k, COUNT, 2)) for k in (0, 1))
+    odd = replace(odd, tool='tool_1')
+    result = identify(Problem(UR10E, even, **SIGMAS, more=(odd,)))
+    assert f'before line {AT + 1} (if rows are in the order of' in str(result.step)
 
 
 def test_what_is_on_the_flange_is_named():

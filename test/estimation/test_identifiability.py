@@ -104,10 +104,14 @@ def test_a_fixed_partner_makes_its_trade_identifiable(rng):
     assert not {name for name in result.gauges if name.startswith('wrist_3')}
 
 
-def test_dependent_columns_by_hand():
-    """Columns of a, b, a + 2 b, nothing, c: the third trades against the first two."""
+@pytest.mark.parametrize('rounded', [0.0, 1e-16])
+def test_dependent_columns_by_hand(rounded):
+    """Columns of a, b, a + 2 b, nothing, c: the third trades against the first two.
+
+    A weight on the joint's own axis moves nothing, in a URDF by rounding only.
+    """
     a, b, c = np.eye(3)
-    matrix = np.stack([a, b, a + 2.0 * b, np.zeros(3), c], axis=1)
+    matrix = np.stack([a, b, a + 2.0 * b, rounded * c, c], axis=1)
     factor = np.zeros((5, 5))
     factor[:3] = matrix
     names = ('a', 'b', 'sum', 'nothing', 'c')

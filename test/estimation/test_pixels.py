@@ -204,7 +204,7 @@ def test_a_zoom_in_the_session_is_one_of_the_camera(on_flange, named):
     late, centre = seen.images >= 15, np.array([CAMERA.lens.cx, CAMERA.lens.cy])
     pixels = centre + (seen.pixels - centre) * np.where(late, 1.005, 1.0)[:, np.newaxis]
     result = identify(Problem(known(on_flange), replace(seen, pixels=pixels), sigma_pixel=SIGMA))
-    assert 'before image 16 ' in str(result.step)
+    assert 'before image 16' in str(result.step)
     assert named in str(result.step)
 
 

@@ -247,6 +247,17 @@ def test_a_log_of_universal_robots(tmp_path):
         read_table(tmp_path / 'table.csv', 2, foreign=foreign)
 
 
+def test_a_log_without_names_whose_cells_stand_apart_by_tabs_and_blanks(tmp_path):
+    log = tmp_path / 'log.txt'
+    log.write_text(''.join(f'7\t{q1!r}\t{q2!r} 1\n' for q1, q2 in JOINTS.tolist() * 4))
+    (tmp_path / 'table.csv').write_text(text_of(np.tile(PLACES, (4, 1)), names=['x', 'y', 'z']))
+    with pytest.raises(InputError, match=r'no column q1; .*: give --columns "q\*=#\*" or'):
+        read_table(tmp_path / 'table.csv', 2, foreign=Foreign(Layout(), None, log))
+    layout = Layout(columns={'q1': '#2', 'q2': '#3'})
+    found = read_table(tmp_path / 'table.csv', 2, foreign=Foreign(Layout(), None, log, layout))
+    np.testing.assert_array_equal(found.fitted[0].joints, np.tile(JOINTS, (4, 1)))
+
+
 def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):
     table = read(PLAIN + '0,0,,,\n', length='m', angle='rad')
     assert_same(table, None)

@@ -32,7 +32,7 @@ from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import PARALLEL_TOLERANCE, Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
-from calib_ros.kinematics.urdf import chain_from_urdf, with_common_normals
+from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf, with_common_normals
 
 
 @pytest.mark.parametrize('convention', CONVENTIONS)
@@ -209,6 +209,15 @@ def test_links_by_default():
 def edited(text, old, new):
     assert old in text
     return text.replace(old, new)
+
+
+def test_prefixes_need_no_declaration():
+    """Simulators add attributes of their own, such as drake:acceleration; ROS reads such files."""
+    limited = edited(UR10E, '<limit ', '<limit drake:acceleration="2.5" ')
+    chain = chain_from_urdf(limited)
+    named = edited(UR10E, '<robot ', '<robot xmlns="http://ros.org" ')
+    assert chain.joints == chain_from_urdf(named).joints == chain_from_urdf(UR10E).joints
+    assert corrected_urdf(limited, chain) == limited
 
 
 ELBOW = '<joint name="elbow_joint" type="revolute">'
