@@ -186,9 +186,13 @@ def _sister(problem: Problem, result: Identification) -> str:
 
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
-    """Return the RMS distance [m] of two arms at (N, n), in the best base and tool."""
+    """Return the RMS distance [m] of two arms at (N, n), in the best base and tool.
+
+    Like arms need four steps; unlike ones, whose distance does not matter, hundreds.
+    """
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
-    return fit_to_arm(start, [*parameters_of('base'), *parameters_of('tool')], found, joints)[1]
+    names = [*parameters_of('base'), *parameters_of('tool')]
+    return fit_to_arm(start, names, found, joints, iterations=12)[1]
 
 
 def _gravity(problem: Problem, result: Identification) -> str:

@@ -324,14 +324,13 @@ def _leave_one_place_out(
         own = [n for base in sorted(place) for n in parameters_of(base)[:3] if n in problem.free]
         others, left = part(place, inside=False), part(place, inside=True)
         kinds = [kind for kind in problem.kinds if kind.base not in place]
+        rest = [name for name in names if name not in own]
+        # without this place a gauge may be free; frames come first, so they are the same alone
+        known = structurally_independent(problem.model, rest, kinds, others.separation_rows)
+        kept = {*known, *problem.prior_sigmas}
         fits = (before, frames), (fitted.chain, names)
         for found, (chain, wanted) in zip(chains, fits, strict=True):
-            rest = [name for name in wanted if name not in own]
-            # without this place a gauge may be free
-            determined = structurally_independent(
-                problem.model, rest, kinds, others.separation_rows
-            )
-            rest = [name for name in rest if name in determined or name in problem.prior_sigmas]
+            rest = [name for name in wanted if name in kept and name not in own]
             found.append(minimise(minimise(chain, rest, others).chain, own, left).chain)
     number = {base: k for k, place in enumerate(places) for base in place}
     parts = [

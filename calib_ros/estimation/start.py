@@ -126,6 +126,7 @@ def fit_to_arm(
     arm: Chain,
     joints: FloatArray,
     sigma_orientation: float = Settings.sigma_orientation,
+    iterations: int = 1000,
 ) -> tuple[Chain, float]:
     """Return a chain fitted to an arm at joint values (N, n), and the RMS distance [m].
 
@@ -135,7 +136,8 @@ def fit_to_arm(
     poses = arm.forward(joints)
     seen = Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
     system = System((Samples(seen, Settings.sigma_position, sigma_orientation),))
-    fitted = minimise(chain, structurally_independent(chain, names), system).chain
+    independent = structurally_independent(chain, names)
+    fitted = minimise(chain, independent, system, iterations=iterations).chain
     left = fitted.forward(joints)[:, :3, 3] - seen.positions
     return fitted, float(np.sqrt((left**2).sum(axis=1).mean()))
 

@@ -65,7 +65,8 @@ def solve(
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
     def linearise(q: FloatArray, which: Index) -> Normal:
-        error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], lever)
+        turns = lever if part.stop > 3 else 0.0
+        error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], turns)
         error, columns = error[part], columns[:, part]
         normal = np.einsum('ikb,jkb->ijb', columns, columns)
         normal[np.diag_indices(len(q))] += ROUNDING
@@ -121,7 +122,7 @@ class Aim:
         columns[turning, 3:] = lever * self._signs[turning] * turn[model.order[turning]]
         if self._chain.effects:
             columns = np.einsum('jib,jkb->ikb', self._effects_slope(q, approach), columns)
-        turned = lever * orientation_error(axes, found)
+        turned = lever * orientation_error(axes, found) if lever else np.zeros_like(origin)
         return np.concatenate([positions - origin, turned]), columns
 
     def _effects_slope(self, q: FloatArray, approach: FloatArray | None) -> FloatArray:
