@@ -10,7 +10,7 @@ from surveyed import TASK, UR, calibrated, identified
 from calib_ros.apply import workspace
 from calib_ros.apply.workspace import SIDES, regions, survey
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.programs import csv_of, read_joints, read_poses
 from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.kinematics.chain import Frame
@@ -173,6 +173,9 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     values = np.column_stack([task[:, :3, 3], to_quat(task[:, :3, :3])])
     (tmp_path / 'task.csv').write_text(csv_of(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values))
     np.testing.assert_allclose(read_poses(tmp_path / 'task.csv'), task, atol=1e-8)
+    (tmp_path / 'long.csv').write_text('x,y,z,qx,qy,qz,qw\n1,2,3,1,0,0,1\n')
+    with pytest.raises(InputError, match='line 2: quaternion'):
+        read_poses(tmp_path / 'long.csv')
     status, out, err = run(
         'workspace',
         *(folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500, '--task', 'task.csv'),

@@ -325,6 +325,7 @@ def test_workbooks(tmp_path, monkeypatch):
     book.save(path)
     found = read_table(path, 2, foreign=Foreign(Layout()))
     assert_same(found, None)
+    assert 'there are no numbers in line 3: left out' in str(found.warnings)
     assert 'sheet "measured" is read, the first of 2 (--sheet)' in str(found.warnings)
     smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
     with zipfile.ZipFile(path) as whole, smaller:

@@ -321,11 +321,17 @@ def test_what_images_need_is_told(monkeypatch, board):
         cameras_of(sources(board, Image))
 
 
-def test_bayer_patterns_become_grey():
+def test_bayer_patterns_and_colours_become_grey():
     rng = np.random.default_rng(0)
     colours = rng.integers(0, 255, 3)
     for encoding, places in (('bayer_rggb8', 'rggb'), ('bayer_gbrg8', 'gbrg')):
         tile = np.array([colours['rgb'.index(each)] for each in places], np.uint8).reshape(2, 2)
         image = np.tile(tile, (8, 8))
         found = grey(image.ravel(), 16, 16, 16, encoding)[4:-4, 4:-4]
+        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0
+    for encoding in ('rgb8', 'bgr8', '8UC3', 'rgba8', 'bgra8'):
+        order = encoding.replace('8UC3', 'bgr').strip('8')
+        pixel = [0 if each == 'a' else colours['rgb'.index(each)] for each in order]
+        image = np.tile(np.array(pixel, np.uint8), (4, 6))
+        found = grey(image.ravel(), 4, 6, image.shape[1], encoding)
         assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0

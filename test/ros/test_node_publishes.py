@@ -53,19 +53,6 @@ def test_diagnostics_status_and_corrected_pose(tmp_path, recording, truth):
         assert 'enough for the accuracy wanted' in words[0].data
 
 
-def test_the_status_tells_what_the_arm_does(cell, recording):
-    joints = joint_messages(recording)
-    session = cell.node.session
-    assert session.state == 'waiting for joint states'
-    cell.play({'joint_states': joints[:15]})
-    assert session.state.startswith('the arm stands for 0.')
-    cell.play({'joint_states': joints[15:40]})
-    assert session.state == 'the arm is moving'
-    few = cell.listen(String, 'calibration_node/status')
-    cell.spin_until(lambda: few and 'the arm is moving' in few[-1].data)
-    assert few[-1].data == 'the arm is moving; no measurements received: check sources; 0 poses'
-
-
 def test_the_status_is_short_and_its_first_words_are_those_that_matter(
     monkeypatch, cell, recording
 ):
