@@ -37,6 +37,12 @@ def test_the_spread_is_that_of_one_coordinate(rng):
     assert np.mean(found) == pytest.approx(SIGMA, rel=0.05)
 
 
+def test_measurements_at_rest_are_all_used(rng):
+    """One in twenty thousand lies beyond the limit of a spike."""
+    left_out = sum((~average(noisy(rng))[0]).sum() for _ in range(200))
+    assert left_out == 0
+
+
 def with_spikes(rng, share, count=60):
     values = noisy(rng, count)
     hit = rng.choice(count, round(share * count), replace=False)
