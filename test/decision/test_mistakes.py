@@ -85,7 +85,10 @@ SPOILT = {
         lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)),
         '--columns qx=-qx,qy=-qy,qz=-qz',
     ),
-    'Euler order': (rewritten('XYZ', 'ZYX'), '--euler ZYX, '),
+    'Euler order': (
+        rewritten('XYZ', 'ZYX'),
+        'ZYX (xyz about fixed axes), not XYZ (zyx about fixed axes): --euler ZYX, ',
+    ),
     'Euler columns': (
         lambda e: replace(e, rotations=_in_turn(e.rotations)),
         '--euler ZYX with r1, r2, r3 (now rx, ry, rz)',
