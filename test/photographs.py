@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from calib_ros.files import boards
-from calib_ros.files.detector import marker_cells
+from calib_ros.files.detector import black_of
 
 CHARUCO = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_6X6_250')
 SCALE = 5000.0
@@ -21,19 +21,10 @@ def drawn(board):
     width, height = (round(side * SCALE) for side in board.size)
     page = np.full((height, width), 255, dtype=np.uint8)
 
-    def black(left, top, size):
-        first, last = np.round([[left, top], [left + size, top + size]]).astype(int)
-        page[first[1] : last[1], first[0] : last[0]] = 0
-
-    side = board.square * SCALE
-    if board.type == 'charuco':
-        for row, column in np.ndindex(board.rows, board.columns):
-            if (row + column) % 2 == 0:
-                black(column * side, row * side, side)
-    for cells, (left, top) in zip(marker_cells(board), board.markers * SCALE, strict=True):
-        size = board.marker * SCALE / len(cells)
-        for row, column in np.argwhere(cells):
-            black(left + column * size, top + row * size, size)
+    for left, top, wide, high in black_of(board):
+        edges = np.array([[top, top + high], [left, left + wide]])
+        (begin, end), (first, last) = np.round(SCALE * edges).astype(int)
+        page[begin:end, first:last] = 0
     return page
 
 

@@ -44,7 +44,8 @@ def test_a_result_is_a_data_frame():
     assert len(residuals) == 200
     found = plan(Design.of(PROBLEM), JOINTS, JOINTS[:20], 12)
     values = found.to_frame()
-    np.testing.assert_array_equal(values.filter(like='q'), found.joints[found.visit])
+    expected = np.column_stack([found.visit + 1, found.joints[found.visit]])
+    np.testing.assert_array_equal(values, expected)
 
 
 def test_without_pandas_that_is_said(monkeypatch):

@@ -4,7 +4,6 @@ from argparse import Namespace
 
 import numpy as np
 import pytest
-from surveyed import DOWN, TASK, calibrated, identified
 
 from calib_ros import Calibration, Chain, Problem, identify
 from calib_ros.apply import simulation, workspace
@@ -15,11 +14,17 @@ from calib_ros.kinematics.chain import Joint
 from calib_ros.kinematics.se3 import exp_rotation, transform
 from calib_ros.settings import MODELS
 
+DOWN = np.diag([1.0, -1.0, -1.0])
+ANGLE = 2.0 * np.pi * np.arange(12) / 12
+CIRCLE = np.column_stack([0.15 * np.cos(ANGLE), 0.15 * np.sin(ANGLE), np.zeros(12)])
+TASK = transform(np.tile(DOWN, (12, 1, 1)), CIRCLE)
+"""Twelve poses on a circle of 0.3 m, tool down."""
+
 
 @pytest.fixture(scope='module')
-def placed():
+def placed(arm):
     """Return the placements of the task by the nominal model."""
-    return place(calibrated(), TASK, 'mean', 'nominal', cells=6)
+    return place(arm, TASK, 'mean', 'nominal', cells=6)
 
 
 def wanted(chain, placements, which, task=TASK):
@@ -36,10 +41,9 @@ def true_errors(true, chain, placements, which):
 
 
 @pytest.mark.parametrize('aim', ['mean', 'worst'])
-def test_the_best_placement_beats_the_centre_on_the_true_arm(placed, aim):
+def test_the_best_placement_beats_the_centre_on_the_true_arm(cell, arm, placed, aim):
     """Commanded by the nominal model; what is expected comes true."""
-    true, _ = identified()
-    arm = calibrated()
+    true = cell[0]
     found = placed if aim == 'mean' else place(arm, TASK, aim, 'nominal', cells=6)
     over = np.mean if aim == 'mean' else np.max
     best, centre = (
@@ -52,9 +56,8 @@ def test_the_best_placement_beats_the_centre_on_the_true_arm(placed, aim):
         assert there == pytest.approx(expected, rel=0.15)
 
 
-def test_the_joint_values_bring_the_arm_to_the_placed_task():
+def test_the_joint_values_bring_the_arm_to_the_placed_task(arm):
     task = TASK[::4]
-    arm = calibrated()
     for model in MODELS:
         found = place(arm, task, 'mean', model, cells=4, turns=3)
         chain = arm.commanded_by(model)
@@ -76,23 +79,23 @@ def test_the_joint_values_bring_the_arm_to_the_placed_task():
         assert distance[found.centre] == pytest.approx(nearest)
 
 
-def test_the_arm_goes_on_from_pose_to_pose():
+def test_the_arm_goes_on_from_pose_to_pose(arm):
     """Round its base it turns its first joint and keeps its configuration."""
     angle = np.radians(np.linspace(-150.0, 150.0, 40))
     arc = np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle), np.zeros(40)])
     turns = exp_rotation(np.column_stack([np.zeros((40, 2)), angle]))
     region = np.array([[-0.05, -0.05, 0.0], [0.05, 0.05, 0.3]])
-    found = place(calibrated(), transform(turns @ DOWN, arc), region=region, cells=3)
+    found = place(arm, transform(turns @ DOWN, arc), region=region, cells=3)
     reached = ~np.isnan(found.errors)
     moves = np.abs(np.diff(found.joints[reached], axis=1)).max(axis=(1, 2))
     assert reached.mean() > 0.8
     assert np.median(moves) < 0.3
 
 
-def test_placements_keep_to_the_region(placed):
+def test_placements_keep_to_the_region(arm, placed):
     region = np.array([[0.3, -0.4, 0.1], [0.8, 0.4, 0.5]])
     told = []
-    found = place(calibrated(), TASK, 'mean', 'nominal', region, cells=4, progress=told.append)
+    found = place(arm, TASK, 'mean', 'nominal', region, cells=4, progress=told.append)
     assert told == sorted(told)  # how much of it is done never falls
     assert 0.0 < told[0] < 0.2
     assert told[-1] == 1.0
@@ -103,16 +106,15 @@ def test_placements_keep_to_the_region(placed):
     assert placed.errors[placed.best] < found.errors[found.best]
 
 
-def test_a_finer_search_does_not_find_much_more():
+def test_a_finer_search_does_not_find_much_more(arm):
     region = np.array([[0.3, -0.5, -0.3], [1.0, 0.5, 0.5]])
     coarse, fine = (
-        place(calibrated(), TASK[::3], 'mean', 'nominal', region, cells).errors for cells in (4, 8)
+        place(arm, TASK[::3], 'mean', 'nominal', region, cells).errors for cells in (4, 8)
     )
     assert np.nanmin(coarse) < 1.1 * np.nanmin(fine)
 
 
-def test_a_task_out_of_reach_is_refused():
-    arm = calibrated()
+def test_a_task_out_of_reach_is_refused(arm):
     far = TASK.copy()
     far[0, 0, 3] = 10.0
     with pytest.raises(InputError, match='reaches all 12 poses of the task at none'):
@@ -124,8 +126,7 @@ def test_a_task_out_of_reach_is_refused():
         place(arm, TASK, 'least')
 
 
-def test_a_task_from_a_box_of_joint_values_is_reached_where_it_came_from():
-    arm = calibrated()
+def test_a_task_from_a_box_of_joint_values_is_reached_where_it_came_from(arm):
     middle = np.array([0.2, -1.4, 1.6, -0.5, 1.0, 0.2])
     q = middle + np.random.default_rng(0).uniform(-0.2, 0.2, (10, 6))
     poses = workspace.in_base(arm.chain, q)
@@ -136,10 +137,10 @@ def test_a_task_from_a_box_of_joint_values_is_reached_where_it_came_from():
     np.testing.assert_allclose(arm.chain.forward(found.joints[0]), arm.chain.forward(q), atol=1e-8)
 
 
-def test_a_box_of_joint_values_is_a_task():
+def test_a_box_of_joint_values_is_a_task(arm):
     box = (0, -1.6, 1.4, -0.6, 0.9, 0, 0.3, -1.3, 1.6, -0.4, 1.1, 0.4)
     options = Namespace(task=None, joint_box=box, model='corrected')
-    task = _task(options, calibrated(), np.random.default_rng(0))
+    task = _task(options, arm, np.random.default_rng(0))
     assert task.shape == (30, 4, 4)
     np.testing.assert_allclose(task[:, :3, 3].max(axis=0), -task[:, :3, 3].min(axis=0))
 

@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surveyed import TASK, UR, calibrated, identified
+from test_placement import TASK
+from verified import UR
 
 from calib_ros.apply import workspace
 from calib_ros.apply.workspace import SIDES, regions, survey
 from calib_ros.cli.workspace import PLACEMENT_FILES, WORKSPACE_FILES
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.programs import csv_of, read_joints, read_poses
 from calib_ros.identification.calibration import Calibration, load_calibration
 from calib_ros.kinematics.chain import Frame
@@ -20,9 +21,8 @@ from calib_ros.kinematics.se3 import to_quat
 # What is removed and what remains
 
 
-def test_what_is_removed_is_what_the_nominal_arm_misses():
-    true, result = identified()
-    arm = calibrated()
+def test_what_is_removed_is_what_the_nominal_arm_misses(cell, arm):
+    true, result, _ = cell
     found = survey(arm, 2000, np.random.default_rng(1))
     missed = (result.before.forward(found.joints) - true.forward(found.joints))[:, :3, 3]
     missed = np.linalg.norm(missed, axis=1)
@@ -33,9 +33,8 @@ def test_what_is_removed_is_what_the_nominal_arm_misses():
     assert 5e-4 < turn.mean() < 5e-3
 
 
-def test_expected_errors_add_up():
-    _, result = identified()
-    arm = calibrated()
+def test_expected_errors_add_up(cell, arm):
+    result = cell[1]
     q = UR.random_joints(50, np.random.default_rng(1))
     covariance = result.pose_covariance(q)[:, :3, :3]
     variance = np.trace(covariance, axis1=1, axis2=2)
@@ -48,9 +47,8 @@ def test_expected_errors_add_up():
         arm.expected(q, 'best')
 
 
-def test_positions_are_in_the_base_frame():
-    _, result = identified()
-    arm = calibrated()
+def test_positions_are_in_the_base_frame(cell, arm):
+    result = cell[1]
     found = survey(arm, 500, np.random.default_rng(1))
     flange = replace(result.chain, base=None, tool=None).forward(found.joints)[:, :3, 3]
     reach = np.linalg.norm(result.chain.tool.matrix[:3, 3])
@@ -62,8 +60,8 @@ def test_positions_are_in_the_base_frame():
     np.testing.assert_array_equal(found.cloud[:, 4], found.sigma)
 
 
-def test_a_chain_alone_has_no_sigma(tmp_path):
-    _, result = identified()
+def test_a_chain_alone_has_no_sigma(cell, tmp_path):
+    result = cell[1]
     (tmp_path / 'chain.yaml').write_text(dump_chain(result.chain, {'source': 'a test'}))
     arm = load_calibration(tmp_path / 'chain.yaml', UR)
     found = survey(arm, 100, np.random.default_rng(1))
@@ -75,8 +73,8 @@ def test_a_chain_alone_has_no_sigma(tmp_path):
         arm.expected(found.joints, 'corrected')
 
 
-def test_frames_that_are_fixed_stay(tmp_path):
-    _, result = identified()
+def test_frames_that_are_fixed_stay(cell, tmp_path):
+    result = cell[1]
     fixed = result.chain.with_frame('base', Frame(result.chain.base.matrix, fixed=True))
     (tmp_path / 'chain.yaml').write_text(dump_chain(fixed, {'source': 'a test'}))
     arm = load_calibration(tmp_path / 'chain.yaml', UR)
@@ -89,8 +87,8 @@ def write_result(folder, result):
     (folder / 'calibration.yaml').write_text(Calibration.of(result).dump())
 
 
-def test_a_calibration_knows_its_nominal_chain(tmp_path):
-    _, result = identified()
+def test_a_calibration_knows_its_nominal_chain(cell, tmp_path):
+    result = cell[1]
     write_result(tmp_path, result)
     load_calibration(tmp_path, UR)
     other = UR.with_offsets({'elbow_joint.d': 1e-6})
@@ -144,8 +142,8 @@ def test_a_map_holds_the_rms_of_each_cell(rng):
 
 
 @pytest.fixture
-def folder(tmp_path):
-    write_result(tmp_path / 'result', identified()[1])
+def folder(cell, tmp_path):
+    write_result(tmp_path / 'result', cell[1])
     return 'result'
 
 
@@ -173,6 +171,9 @@ def test_workspace_places_a_task(run, folder, tmp_path):
     values = np.column_stack([task[:, :3, 3], to_quat(task[:, :3, :3])])
     (tmp_path / 'task.csv').write_text(csv_of(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values))
     np.testing.assert_allclose(read_poses(tmp_path / 'task.csv'), task, atol=1e-8)
+    (tmp_path / 'long.csv').write_text('x,y,z,qx,qy,qz,qw\n1,2,3,1,0,0,1\n')
+    with pytest.raises(InputError, match='line 2: quaternion'):
+        read_poses(tmp_path / 'long.csv')
     status, out, err = run(
         'workspace',
         *(folder, '--chain', 'ur10e', '--out', 'map', '--poses', 500, '--task', 'task.csv'),

@@ -21,20 +21,14 @@ def bad_inputs():
         (*csv_of, 'jugs.csv'),
         'cannot read jugs.csv: No such file or directory\n',
     )
-    yield 'a folder as table', (*csv_of, 'folder'), 'folder'
     yield 'empty table', (*csv_of, 'empty'), 'empty has no rows'
-    yield 'bad number', (*csv_of, 'number.csv'), 'number.csv, line 4: q2 must be a finite number'
     yield 'a column twice', (*csv_of, 'twice.csv'), 'are called x: rename all but one'
     yield 'too few rows', (*csv_of, 'few.csv'), 'too few different poses: 3 measured'
     yield 'only test rows', (*csv_of, 'judging.csv'), 'judging.csv has no rows to fit'
-    yield 'no such session', (*good, '--session', 'A'), 'no column "session"'
     yield 'no such bag', (*bag_of, 'missing'), 'no bag at missing'
     yield 'an empty bag folder', (*bag_of, 'folder'), 'no .mcap or .db3 file is in it'
-    yield 'an empty bag file', (*bag_of, 'empty.mcap'), 'empty.mcap is not a readable rosbag2'
     yield 'a chain as table', (*bag_of, 'broken.yaml'), 'but identify takes a table or a bag'
-    yield 'no such chain', (*chain_of, 'missing.yaml'), 'missing.yaml'
     yield 'no such robot', (*chain_of, 'ur10x'), 'did you mean "ur10'
-    yield 'not YAML', (*chain_of, 'broken.yaml'), 'broken.yaml is not valid YAML'
     yield 'no chain', (*chain_of, 'good.csv'), 'good.csv'
     yield 'another number of joints', (*chain_of, 'franka_panda'), 'q7'
     yield 'unknown parameter', (*good, '--fixed', 'elbow.a'), 'did you mean "elbow_joint.a"'
@@ -45,7 +39,6 @@ def bad_inputs():
         ': every parameter is fixed: nothing is left to identify\n',
     )
     yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
-    yield 'NaN', (*good, '--sigma-orientation', 'nan'), 'sigma_orientation must be'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
     yield (
         'useless option',
@@ -57,15 +50,11 @@ def bad_inputs():
     yield 'joint names', (*bag_of, 'folder', *names), 'wrist_3_joint; not a, a, b, c, d, e, f'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'
     yield 'out is the root', (*good, '--out', '/'), '/ is the root folder: choose'
-    yield 'out is in a file', (*good, '--out', 'empty/out'), 'empty'
     yield 'csv2bag, bad table', ('csv2bag', 'number.csv', 'b', '--chain', 'ur5e'), 'line 4: q2'
     yield 'csv2bag, bag exists', ('csv2bag', 'good.csv', 'folder', '--chain', 'ur5e'), 'exists al'
-    yield 'csv2bag, into a file', ('csv2bag', 'good.csv', 'empty/b', '--chain', 'ur5e'), 'empty'
     yield 'simulate, bag exists', ('simulate', 'folder', '--chain', 'ur5e'), 'exists already'
     yield 'simulate, in place', ('simulate', '.', '--chain', 'ur5e'), '. exists already'
-    yield 'simulate, no name', ('simulate', '', '--chain', 'ur5e'), '. exists already'
     yield 'plan, no name', ('plan', '--chain', 'ur5e', '--out', ''), '. is not a file'
-    yield 'simulate, into a file', ('simulate', 'empty/b', '--chain', 'ur5e'), 'empty'
     yield 'simulate, no poses', ('simulate', 'b', '--chain', 'ur5e', '--poses', '-1'), 'poses'
     yield 'simulate, seed', ('simulate', 'b', '--chain', 'ur5e', '--seed', '-1'), 'seed'
     yield (
@@ -104,7 +93,6 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     write_csv(tmp_path / 'number.csv', rows)
     (tmp_path / 'twice.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z,x\n0,0,0,0,0,0,1,2,3,4\n')
     (tmp_path / 'empty').write_text('')
-    (tmp_path / 'empty.mcap').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
     for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.jpg')):

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.misread import _angles
 from calib_ros.decision.mistakes import explained
-from calib_ros.decision.suspects import QUARTERS, dead
+from calib_ros.decision.suspects import dead
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 
@@ -85,7 +86,10 @@ SPOILT = {
         lambda e: replace(e, rotations=np.swapaxes(e.rotations, 1, 2)),
         '--columns qx=-qx,qy=-qy,qz=-qz',
     ),
-    'Euler order': (rewritten('XYZ', 'ZYX'), '--euler ZYX, '),
+    'Euler order': (
+        rewritten('XYZ', 'ZYX'),
+        'ZYX (xyz about fixed axes), not XYZ (zyx about fixed axes): --euler ZYX, ',
+    ),
     'Euler columns': (
         lambda e: replace(e, rotations=_in_turn(e.rotations)),
         '--euler ZYX with r1, r2, r3 (now rx, ry, rz)',
@@ -314,10 +318,12 @@ def test_mistakes_are_named_where_some_orientations_are_missing():
     assert '--length mm' in str(explained(Problem(UR, partly)))
 
 
-def test_quarters_are_what_their_names_say():
-    assert {float(name): np.degrees(angle) for name, angle in QUARTERS.items()} == pytest.approx(
-        {90.0: 90.0, -90.0: -90.0, 180.0: 180.0}
-    )
+@pytest.mark.parametrize('order', ['XYZ', 'ZXY'])
+def test_an_orientation_has_two_triples_of_angles(order, rng):
+    turns = Rotation.from_matrix(se3.exp_rotation(rng.normal(size=(20, 3))))
+    for angles in _angles(turns.as_matrix(), order):
+        again = Rotation.from_euler(order, angles[:, ['XYZ'.index(axis) for axis in order]])
+        np.testing.assert_allclose((again * turns.inv()).magnitude(), 0.0, atol=1e-7)
 
 
 def test_good_results_are_not_searched(monkeypatch):

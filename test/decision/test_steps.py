@@ -103,6 +103,7 @@ def test_a_step_is_named_and_refused(design, what, size, unmodelled):
     assert step.what == (UR10E.joint_names[2] if what == 'joint' else what)
     assert step.size == pytest.approx(size, rel=0.4)
     assert step.unit == ('rad' if what == 'joint' else 'm')
+    assert (step.thing == 'the joint') == (what == 'joint')
 
 
 def test_a_bumped_target_is_no_gain_of_a_healthy_arm():

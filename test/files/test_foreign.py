@@ -3,6 +3,7 @@
 """Tables that others have written."""
 
 import re
+import sys
 import zipfile
 
 import numpy as np
@@ -10,12 +11,11 @@ import pytest
 from robots import DATA, needs_data
 from scipy.spatial.transform import Rotation
 
-from calib_ros import Chain, Settings, load_chain, read_table
-from calib_ros.errors import ConfigError, InputError
-from calib_ros.files import loading
+from calib_ros import load_chain, read_table
+from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
+from calib_ros.files import sheets
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, load_layout
-from calib_ros.kinematics.chain import Joint
 
 JOINTS = np.array([[0.1, -0.2], [0.3, 0.4], [-1.5, 2.0]])
 PLACES = np.array([[1.0, 2.0, 3.0], [-0.5, 0.25, 0.125], [0.0, -1.0, 1e-3]])
@@ -39,6 +39,7 @@ def text_of(*columns, names, separator=','):
 
 
 NAMES = ['q1', 'q2', 'x', 'y', 'z']
+DEGREES = 'q1,q2,x,y,z,rx,ry,rz\n1,2,3,4,5,90,0,0\n'
 PLAIN = text_of(JOINTS, PLACES, names=NAMES)
 
 
@@ -92,14 +93,6 @@ def test_euler_angles_of_any_order(read, letters):
         assert_same(read(text_of(JOINTS, PLACES, np.radians(angles), names=names), euler=letters))
 
 
-@pytest.mark.parametrize('layout', [{'euler': 'XYZ'}, {'rotation_vector': True}])
-def test_angles_of_many_turns_are_taken_for_degrees(read, layout):
-    text = text_of(JOINTS, PLACES, 60.0 * TURNED.as_rotvec(), names=[*NAMES, 'rx', 'ry', 'rz'])
-    with pytest.raises(InputError, match=r'line [0-9]+: rx, ry, rz .* in degrees, .*--angle deg'):
-        read(text, **layout)
-    read(text, angle='deg', **layout)
-
-
 @pytest.mark.parametrize('letters', ['XYZ', 'zyx', 'ZYZ', 'zxy'])
 def test_standard_deviations_of_euler_angles(read, letters):
     sigmas = np.array([1e-4, 2e-4, 3e-4])
@@ -135,6 +128,7 @@ def test_separators_and_decimal_commas_are_guessed_and_said(read, separator, dec
     text = text_of(JOINTS, PLACES, names=NAMES, separator=separator)
     table = read(text.replace('.', decimal))
     assert_same(table, None)
+    assert_same(read(text.replace('0.25', '"0.25"').replace('.', decimal)), None)
     said = ' '.join(table.warnings)
     assert '--separator' in said
     assert ('--decimal' in said) == (decimal == ',')
@@ -277,7 +271,8 @@ def test_joint_values_that_stand_a_row_below(read):
         ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
         ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),
-        ('q1,q2,x,y,z,rx,ry,rz\n1,2,3,4,5,6,7,8\n', {}, 'say which, --euler'),
+        (PLAIN, {'columns': {'x': '#9'}}, 'has no column #9 for x'),
+        (DEGREES.replace('90', '1'), {}, 'say which, --euler'),
         ('q1,q2,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,0,0,0,2\n', {}, 'line 2: quaternion'),
         ('q1,q2,x,y,z\n', {}, 'no rows'),
         ('', {}, 'no rows'),
@@ -287,8 +282,19 @@ def test_joint_values_that_stand_a_row_below(read):
         (PLAIN, {'euler': 'XYZ', 'rotation_vector': True}, 'only one form of rotation'),
         (PLAIN, {'separator': ',', 'decimal': ','}, 'cannot separate both cells and decimals'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n', {'length': 'um', 'columns': {'sx': '1'}}, 'sx, sy and sz'),
+        (PLAIN, {'columns': {f's{each}': '1' for each in ('x', 'y', 'z', 'rx')}}, 'srx, sry, srz'),
+        (PLAIN, {'columns': {'time': 'y*1e10'}}, 'line 2: time .s. must be a number of at most'),
+        (PLAIN, {'euler': 'XYZ'}, 'euler is given, but no columns'),
+        (PLAIN, {'columns': {'rx': 'x', 'ry': 'y'}}, r"r1, r2, r3, all three; missing \['rz'\]"),
+        (DEGREES.replace('90', '1'), {'euler': 'ZXZ'}, 'an axis comes twice: give r1, r2, r3'),
+        (PLAIN, {'columns': {'qx': 'x', 'qy': 'y'}}, 'four columns, missing qz, qw'),
+        (DEGREES.replace('90', ''), {'euler': 'XYZ'}, 'line 2: rx.*, not blank'),
+        *((DEGREES, each, r'line 2: rx, ry, rz .* in degrees, .*--angle deg') for each in
+          ({'euler': 'XYZ'}, {'rotation_vector': True})),
+        (b'\xff\xfe\0\xd8', {}, 'cannot read .*: unexpected end of data'),
+        (b'PK\xff\0', {}, 'it is not text, and not a workbook by its name'),
     ],
-)
+)  # fmt: skip
 def test_faults_are_named(read, text, layout, said):
     with pytest.raises((InputError, ConfigError), match=said):
         read(text, **layout)
@@ -307,45 +313,7 @@ def test_axes_called_like_accelerations_are_none(run, tmp_path):
     assert (tmp_path / 'out.csv').read_text().splitlines()[0] == 'q1,q2,x,y,z'
 
 
-@pytest.mark.parametrize(
-    ('names', 'proposed'),
-    [
-        (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*_rad"'),
-        (
-            ['Joint 1 [rad]', 'Joint 2 [rad]', 'X [m]', 'y', 'z'],
-            '--columns "q*={Joint * [rad]},x={X [m]}"',
-        ),
-        (
-            ['x', 'y', 'z', 'a', 'b'],
-            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
-        ),
-        (
-            ['q1', 'c11', 'c12', 'y', 'z'],
-            'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
-        ),
-        (
-            ['J1 [°]', 'J2 [°]', 'x [mm]', 'y [mm]', 'z [mm]'],
-            '--columns "q*={J* [°]},x={x [mm]},y={y [mm]},z={z [mm]}" --length mm --angle deg',
-        ),
-        (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
-        (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),
-        (
-            ['a', 'a', 'x', 'y', 'z'],
-            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
-        ),
-        (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
-    ],
-)
-def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
-    path = tmp_path / 'cell.csv'
-    path.write_text(text_of(JOINTS, PLACES, names=names))
-    joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
-    with pytest.raises(InputError) as told:
-        loading.table(path, Chain('arm', 'standard', joints), Settings())
-    assert str(told.value).endswith(proposed)
-
-
-def test_workbooks(tmp_path):
+def test_workbooks(tmp_path, monkeypatch):
     openpyxl = pytest.importorskip('openpyxl')
     book = openpyxl.Workbook()
     book.active.title = 'first'
@@ -368,6 +336,7 @@ def test_workbooks(tmp_path):
     book.save(path)
     found = read_table(path, 2, foreign=Foreign(Layout()))
     assert_same(found, None)
+    assert 'there are no numbers in line 3: left out' in str(found.warnings)
     assert 'sheet "measured" is read, the first of 2 (--sheet)' in str(found.warnings)
     smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
     with zipfile.ZipFile(path) as whole, smaller:
@@ -377,6 +346,24 @@ def test_workbooks(tmp_path):
     assert_same(read_table(tmp_path / 'smaller.xlsx', 2, foreign=Foreign(Layout())), None)
     path.write_bytes(b'no workbook')
     with pytest.raises(InputError, match='cannot read'):
+        read_table(path, 2, foreign=Foreign(Layout()))
+    columns = {'eye_in_hand': 'e'} | {f'q{k}': f'q{k}' for k in (1, 2)}
+    for rows, said in (
+        ([], 'has no rows'),
+        ([['q'] * (MOST_ENTRIES + 1)], f'has {MOST_ENTRIES + 1} columns, more than'),
+        ([[*NAMES, 'e'], [1, 2, 3, 4, 5, True]], 'of a camera on the flange need an orientation'),
+    ):
+        book = openpyxl.Workbook()
+        for row in rows:
+            book.active.append(row)
+        book.save(path)
+        with pytest.raises(InputError, match=said):
+            read_table(path, 2, foreign=Foreign(Layout(columns=columns)))
+    monkeypatch.setattr(sheets, 'LARGEST_SHEET', 100)
+    with pytest.raises(InputError, match='MB when unpacked'):
+        read_table(path, 2, foreign=Foreign(Layout()))
+    monkeypatch.setitem(sys.modules, 'openpyxl', None)
+    with pytest.raises(InputError, match=r'needs openpyxl: pip install "calib_ros\[xlsx\]"'):
         read_table(path, 2, foreign=Foreign(Layout()))
 
 

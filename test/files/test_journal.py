@@ -101,7 +101,9 @@ def plain(number, **more):
 
 def test_the_samples_of_a_bag_are_a_table_with_any_names(tmp_path):
     many = [plain(1, device='a,b'), plain(2, device='say "b"'), plain(3, target='=1')]
-    (tmp_path / 'cell.csv').write_text(table_text(many, JOINTS))
+    text = table_text(many, JOINTS)
+    assert text.startswith('stamp_ns,q1,q2,q3,x,y,z,device,target,delay,')
+    (tmp_path / 'cell.csv').write_text(text)
     assert_equal(read_journal(tmp_path / 'cell.csv', JOINTS)[0], many)
 
 

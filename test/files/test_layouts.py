@@ -2,10 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Presets and expressions of columns."""
 
+import numpy as np
 import pytest
+from test_foreign import JOINTS, PLACES, text_of
 
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros import Chain, Settings
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.files import loading
 from calib_ros.files.layouts import Expression, layout_of, load_layout, presets
+from calib_ros.kinematics.chain import Joint
 
 
 def test_later_columns_may_use_our_names_of_earlier_ones():
@@ -16,6 +21,18 @@ def test_later_columns_may_use_our_names_of_earlier_ones():
     assert columns['target'] == 'q1'
     coupled = layout_of('fanuc', ['q3=q3-q2'], {}).columns['q3']
     assert coupled == '(J3 + J2)-(J2)'
+    with pytest.raises(ConfigError, match=r'OURS=THEIRS,.*, not "x="'):
+        layout_of('', ['y=Y,x='], {})
+
+
+def test_an_expression_has_its_signs_and_its_order():
+    columns = {'a b': np.array([1.0, 2.0]), 'A': np.array([5.0, 9.0])}
+    assert Expression.parse('-{a b}*2 + (A - 3)/4').of(columns).tolist() == [-1.5, -2.5]
+
+
+def test_another_way_to_turn_replaces_that_of_a_preset():
+    layout = layout_of('kuka_abc', [], {'rotation_vector': True, 'euler': ''})
+    assert (layout.euler, layout.rotation_vector) == ('', True)
 
 
 def test_every_preset_says_where_its_format_is_documented():
@@ -54,3 +71,41 @@ def test_presets_of_users_and_their_faults(tmp_path):
 def test_what_is_no_expression(text):
     with pytest.raises(ConfigError, match='not an expression'):
         Expression.parse(text)
+
+
+@pytest.mark.parametrize(
+    ('names', 'proposed'),
+    [
+        (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*_rad"'),
+        (
+            ['Joint 1 [rad]', 'Joint 2 [rad]', 'X [m]', 'y', 'z'],
+            '--columns "q*={Joint * [rad]},x={X [m]}"',
+        ),
+        (
+            ['x', 'y', 'z', 'a', 'b'],
+            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+        ),
+        (
+            ['q1', 'c11', 'c12', 'y', 'z'],
+            'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
+        ),
+        (
+            ['J1 [°]', 'J2 [°]', 'x [mm]', 'y [mm]', 'z [mm]'],
+            '--columns "q*={J* [°]},x={x [mm]},y={y [mm]},z={z [mm]}" --length mm --angle deg',
+        ),
+        (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
+        (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),
+        (
+            ['a', 'a', 'x', 'y', 'z'],
+            '--columns "q*=NAME*"; joint values in another file: --joints FILE',
+        ),
+        (['0.1', '-2', '3', '4e-5', '5'], '--columns "q1=#1,q2=#2,x=#3,y=#4,z=#5", in its order'),
+    ],
+)
+def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, names, proposed):
+    path = tmp_path / 'cell.csv'
+    path.write_text(text_of(JOINTS, PLACES, names=names))
+    joints = tuple(Joint(name, a=0.3) for name in ('shoulder', 'elbow'))
+    with pytest.raises(InputError) as told:
+        loading.table(path, Chain('arm', 'standard', joints), Settings())
+    assert str(told.value).endswith(proposed)

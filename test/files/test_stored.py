@@ -47,17 +47,20 @@ def test_messages_are_those_of_the_library_in_its_order(tmp_path, storage, mode,
     assert {data: stream for stream, data in found} == streams
 
 
+@pytest.mark.parametrize('summary', [True, False])
 @pytest.mark.parametrize('log_times', LOG_TIMES)
-def test_messages_without_chunks_come_as_they_stand_in_the_file(tmp_path, log_times):
+def test_messages_without_chunks_come_as_they_stand_in_the_file(tmp_path, log_times, summary):
     """As of rosbag2 with the preset fastwrite; its log times need not be in order."""
     path = record_in_chunks(tmp_path / 'bag', 'mcap', log_time=LOG_TIMES[log_times])
     (file,) = path.glob('*.mcap')
-    flat = MAGIC
-    for kind, content in records(file.read_bytes(), len(MAGIC)):
-        flat += struct.pack('<BQ', kind, len(content)) + content
-        if kind == Kind.DATA_END:
-            break
-    file.write_bytes(flat + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + MAGIC)
+    stream = records(file.read_bytes()[: -len(MAGIC)], len(MAGIC))
+    found = [(kind, struct.pack('<BQ', kind, len(each)) + each) for kind, each in stream]
+    end = 1 + [kind for kind, _ in found].index(Kind.DATA_END)
+    flat = MAGIC + b''.join(each for _, each in found[:end])
+    kept = (Kind.SCHEMA, Kind.CHANNEL, Kind.STATISTICS) if summary else ()
+    behind = b''.join(each for kind, each in found[end:] if kind in kept)
+    footer = struct.pack('<BQQQI', 2, 20, len(flat) if summary else 0, 0, 0)
+    file.write_bytes(flat + behind + footer + MAGIC)
     session, warnings = session_of(file)
     account = session.account()
     assert (account.joint_states, account.poses) == (180, 100)

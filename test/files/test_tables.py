@@ -7,6 +7,7 @@ import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files import loading
+from calib_ros.files.columns import distinct
 from calib_ros.files.csv_columns import read_columns
 from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.tables import read_table
@@ -155,8 +156,11 @@ FAULTS = [
         r'different frames: world \(lines 2, 6\), map \(line 5\); only one is allowed',
     ),
     (f'q1,q2,x,y,z,frame_id\n{NAMED}', r'map \(lines 3, 4, 5, 6, 7, and 3 more\)'),
-    *((POINTS.replace('5.5', f'"{each}"'), f"line 3: y must be a finite number, not '{each}'")
-      for each in ('nan', 'inf', '-inf', '', ' ', 'twelve', '1;2', '0,5')),
+    *((POINTS.replace('5.5', f'"{each}"'), f"y must be a finite number, not '{each}': correct")
+      for each in ('nan', 'inf', '-inf', '', ' ', 'twelve', '1;2')),
+    (POINTS.replace('5.5', '"0,5"'), "line 3: y must be .*, not '0,5': write a point"),
+    ('q1,q2,x,y,z,distance\n0,0,1,2,3,\n0,0,1,2,3,4\n', 'line 3 has both .* and distance: give'),
+    ('q1,q2,location,socket\n0,0,A,1\n0,0,B,1_2\n', 'line 3: socket must be LOCATION/SOCKET'),
     *((POINTS.replace('5.5', each), r'cell\.csv, line 3: y must be') for each in
       ('1e160', '-1e7', '²')),
     (POINTS.replace('-0.3', '1e300'), 'line 3: q1 must be'),
@@ -301,3 +305,10 @@ def test_one_column_has_a_line_for_each_row(tmp_path, header):
     found = read_columns(path, ['q1'])
     assert found.lines.tolist() == [2, 3]
     assert found.select(slice(1, None)).lines.tolist() == [3]
+
+
+@pytest.mark.parametrize('far', [3, 2**40])
+def test_rows_alike_have_one_number(far):
+    """Also where their codes do not fit into one integer."""
+    different, number = distinct(np.array([[far, far], [0, 1], [far, far]]))
+    assert (different.tolist(), number.tolist()) == ([[far, far], [0, 1]], [0, 1, 0])

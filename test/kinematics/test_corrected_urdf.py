@@ -18,6 +18,7 @@ from urdfs import (
     SEEDS,
     UR10E,
     UR_JOINTS,
+    by_kinpy,
     ends,
     poses_of,
     random_arm,
@@ -60,21 +61,8 @@ def test_a_public_library_reads_it_back(text, rng):
     corrected = corrected_urdf(text, chain, tip_link=tip)
     q = chain.random_joints(10, rng)
     base, end = ends(text)
-    found = by_yourdfpy(corrected, chain.joint_names, q, base, tip or end)
+    found = by_kinpy(corrected, chain.joint_names, q, base, tip or end)
     np.testing.assert_allclose(found, chain.forward(q), rtol=0.0, atol=EXACT)
-
-
-def by_yourdfpy(text, names, q, base, tip):
-    import io
-
-    import yourdfpy
-
-    robot = yourdfpy.URDF.load(io.StringIO(text), load_meshes=False)
-    poses = []
-    for row in q:
-        robot.update_cfg(dict(zip(names, row, strict=True)))
-        poses.append(robot.get_transform(tip, base))
-    return np.array(poses)
 
 
 HAND_WRITTEN = """<?xml version='1.0' encoding='utf-8'?>\r

@@ -83,36 +83,20 @@ def with_a_hole(recording):
     return replace(recording, joint_stamps_ns=stamps[kept], joints=recording.joints[kept])
 
 
-def with_noise(recording):
-    """Return a recording with joint values that never stay within `still`."""
-    noise = np.random.default_rng(8).normal(scale=3e-4, size=recording.joints.shape)
-    return replace(recording, joints=recording.joints + noise)
-
-
-@pytest.mark.parametrize(
-    ('spoilt', 'accepted', 'said', 'status'),
-    [
-        (with_a_hole, True, 'max_gap (0.1 s): 20 Hz or more are needed', '20 Hz or more'),
-        (with_noise, False, 'hardly ever rest within still (0.0005)', 'set still to 0.00'),
-    ],
-)
-def test_what_looks_wrong_is_told_live_and_of_a_bag(
-    tmp_path, capfd, recording, spoilt, accepted, said, status
-):
-    recording = spoilt(recording)
+def test_what_looks_wrong_is_told_live_and_of_a_bag(tmp_path, capfd, recording):
+    recording, status = with_a_hole(recording), '20 Hz or more'
+    said = f'max_gap (0.1 s): {status} are needed'
     write_bag(tmp_path / 'bag', recording, 'mcap')
     arguments = ['identify', str(tmp_path / 'bag'), '--chain', 'ur10e', '--json']
     arguments += ['--largest-loss', '1']
-    assert (main(arguments) == 0) == accepted
+    assert main(arguments) == 0
     heard = capfd.readouterr()
     assert said in heard.err
-    if accepted:
-        assert said in ''.join(json.loads(heard.out)['warnings'])
+    assert said in ''.join(json.loads(heard.out)['warnings'])
     with Cell(chain='ur10e', data_dir=str(tmp_path)) as cell:
         words = cell.listen(String, 'calibration_node/status')
         cell.play(topics(recording))
-        answer = cell.call('identify')
-        assert answer.success == accepted
+        answer = cell.done('identify')
         assert len(answer.message) <= 200
         assert status in answer.message
         assert said in cell.in_full(answer)

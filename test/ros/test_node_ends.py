@@ -107,20 +107,6 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
         np.testing.assert_array_equal(kept.position, sample.position)
 
 
-SLOW_SAVE = """
-import os, time
-sync = os.fsync
-saved = []
-def slow(file):
-    sync(file)
-    name = os.readlink(f'/proc/self/fd/{file}')
-    if '.yaml' in name and name.endswith('.partial'):
-        saved.append(name)
-        if len(saved) > 2:  # the settings and the calibration of the first time
-            print('in the middle of saving', flush=True)
-            time.sleep(600.0)
-os.fsync = slow
-"""
 SLOW_IDENTIFICATION = """
 import time
 from calib_ros.ros import identifying, node
@@ -139,23 +125,6 @@ import sys
 from calib_ros.ros.node import main
 sys.exit(main())
 """
-
-
-def test_killed_while_it_saves(journal):
-    command = ('-c', SLOW_SAVE + RUN)
-    with cell_and_child(data_dir=journal, resume='true', command=command) as (cell, child):
-        cell.done('identify')
-        cell.done('save')
-        saved = sorted(journal.glob('*Z*.yaml'))
-        contents = [path.read_text() for path in saved]
-        cell.start_call('save')
-        child.wait_for('in the middle of saving')
-        child.kill()
-    assert sorted(journal.glob('*Z*.yaml')) == saved
-    assert [path.read_text() for path in saved] == contents
-    with Cell(chain='ur10e', data_dir=str(journal)) as cell:
-        loaded = cell.done('load')
-        assert str(next(journal.glob('*Z.yaml'))) in loaded.message
 
 
 def test_ended_while_an_identification_runs(journal):

@@ -128,28 +128,22 @@ def test_an_identification_is_cancelled_between_stages(tmp_path, recording, stag
         cell.done('identify')
 
 
-def test_a_result_that_was_cancelled_at_last_is_not_published(cell, recording, held):
-    release, problems = held
-    cell.play(topics(recording))
-    answer = cell.start_call('identify')
-    cell.spin_until(lambda: problems)
-    cell.done('cancel')
-    release.set()
-    cell.spin_until(answer.done)
-    assert not answer.result().success
-    assert 'cancelled' in answer.result().message
-    assert cell.node.session.calibration is None
-
-
-def test_clear_while_an_identification_runs(cell, recording, held):
+@pytest.mark.parametrize('call', ['cancel', 'clear'])
+def test_what_is_called_at_last_holds(cell, recording, held, call):
+    """A cancelled result is not published; one whose poses were cleared is, and judges others."""
     release, problems = held
     cell.play(topics(recording))
     running = cell.start_call('identify')
     cell.spin_until(lambda: problems)
-    cell.done('clear')
+    cell.done(call)
     release.set()
     cell.spin_until(running.done)
-    assert running.result().success, running.result().message
+    answer = running.result()
+    assert answer.success == (call == 'clear'), answer.message
+    assert (cell.node.session.calibration is None) == (call == 'cancel')
+    if call == 'cancel':
+        assert 'cancelled' in answer.message
+        return
     cell.play(topics(recording))
     judged = cell.call('validate')
     assert f'{STOPS} poses measured since' in judged.message

@@ -6,12 +6,13 @@ import sys
 import threading
 from array import array
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from recorded import TYPES, serialised, write
 from ros_cell import PATIENCE, START, Cell, header, joint_messages, stamp_ns
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
 
 from calib_ros.apply.simulation import (
     Camera,
@@ -252,6 +253,8 @@ def test_memory_for_images_is_bounded(monkeypatch):
     [
         ({'k': [0.0] * 9}, 'not calibrated'),
         ({'binning_x': 2}, 'without roi and binning'),
+        ({'binning_y': 2}, 'without roi and binning'),
+        ({'roi': RegionOfInterest(y_offset=8)}, 'without roi and binning'),
         ({'distortion_model': 'equidistant'}, 'must be plumb_bob'),
         ({'d': [0.0] * 5 + [0.1] * 3}, 'only k1 k2 p1 p2 k3'),
     ],
@@ -267,10 +270,13 @@ def test_a_camera_info_that_cannot_be_used(change, said):
         lens_in(info)
 
 
-def test_an_image_of_another_size_than_its_camera_info_is_refused(shift, board):
+def test_an_image_that_does_not_fit_its_camera_info_is_refused(shift, board):
     (camera,) = cameras_of(sources(board, Image)).values()
     come = messages(shift, Image, 1)
     info, image = (next(e for _, e in come if isinstance(e, k)) for k in (CameraInfo, Image))
+    assert camera.look(image).reason == 'no CameraInfo of it has come'
+    camera.learn(CameraInfo())
+    assert 'not calibrated' in camera.look(image).reason
     camera.learn(info)
     assert not isinstance(camera.look(image), Refusal)
     info.width, info.height = 640, 480
@@ -279,6 +285,15 @@ def test_an_image_of_another_size_than_its_camera_info_is_refused(shift, board):
     info.width, info.height = 1280, 960
     camera.learn(info)
     assert camera.look(image).reason.startswith('it and its CameraInfo are of 640 x 480 and 1280')
+    given = {
+        each: getattr(image, each) for each in ('width', 'height', 'step', 'encoding', 'data')
+    }
+    for change, said in (
+        ({'encoding': 'yuv422'}, 'unknown encoding of images "yuv422"'),
+        ({'data': image.data[:-1]}, 'an image of 640 x 480 px holds 307199 bytes only'),
+        ({'step': 639}, 'an image of 640 x 480 px'),
+    ):
+        assert said in camera.look(SimpleNamespace(**given | change)).reason
 
 
 @pytest.mark.parametrize(
@@ -306,11 +321,17 @@ def test_what_images_need_is_told(monkeypatch, board):
         cameras_of(sources(board, Image))
 
 
-def test_bayer_patterns_become_grey():
+def test_bayer_patterns_and_colours_become_grey():
     rng = np.random.default_rng(0)
     colours = rng.integers(0, 255, 3)
     for encoding, places in (('bayer_rggb8', 'rggb'), ('bayer_gbrg8', 'gbrg')):
         tile = np.array([colours['rgb'.index(each)] for each in places], np.uint8).reshape(2, 2)
         image = np.tile(tile, (8, 8))
         found = grey(image.ravel(), 16, 16, 16, encoding)[4:-4, 4:-4]
+        assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0
+    for encoding in ('rgb8', 'bgr8', '8UC3', 'rgba8', 'bgra8'):
+        order = encoding.replace('8UC3', 'bgr').strip('8')
+        pixel = [0 if each == 'a' else colours['rgb'.index(each)] for each in order]
+        image = np.tile(np.array(pixel, np.uint8), (4, 6))
+        found = grey(image.ravel(), 4, 6, image.shape[1], encoding)
         assert np.abs(found - colours @ (0.299, 0.587, 0.114)).max() < 2.0

@@ -14,19 +14,13 @@ if 'CI' not in os.environ:
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
-from rclpy.serialization import serialize_message
-from recorded import write
-from ros_cell import LATCHED, Cell, assert_same, direct, header, joint_messages, stamp_ns
+from ros_cell import LATCHED, Cell, direct, header, joint_messages
 from tf2_msgs.msg import TFMessage
 
-from calib_ros import CalibrationSession, Settings, load_chain, replay
 from calib_ros.errors import ConfigError
 from calib_ros.kinematics import se3
-from calib_ros.ros.inputs import Hearing, deserialised
-from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, parse_sources
+from calib_ros.ros.inputs import Hearing
 
-TYPES = {'/tf': TRANSFORMS, '/tf_static': TRANSFORMS, '/joint_states': JOINT_STATE}
 SOURCE = '/tf parent=tracker child=tool'
 TRACKER = se3.transform(se3.exp_rotation(np.array([0.3, -0.2, 1.0])), np.array([2.0, 1.0, 0.5]))
 
@@ -66,40 +60,17 @@ def moving(recording):
     return found
 
 
-def serialised(recording):
-    """Return topics, stamps and bytes of a recording, the frames that stand still first."""
-    found = [('/tf_static', recording.joint_stamps_ns[0], still())]
-    found += [('/tf', stamp_ns(each), each) for each in moving(recording)]
-    found += [('/joint_states', stamp_ns(each), each) for each in joint_messages(recording)]
-    found.sort(key=lambda each: each[1])
-    return [(topic, int(stamp), serialize_message(message)) for topic, stamp, message in found]
-
-
-def test_direct_bag_and_live_give_equal_observations(tmp_path, recording):
-    """As of poses: one by one without ROS, through a bag, and through a running node."""
-    settings = Settings(sources=(SOURCE,))
-    content = serialised(recording)
-    alone = CalibrationSession(load_chain('ur10e'), settings)
-    streams = {each.topic: each for each in measured(parse_sources([SOURCE]), {})}
-    streams['/joint_states'] = Stream('/joint_states', JOINT_STATE)
-    for topic, _, data in content:
-        assert feed(alone, [(streams[topic], data)], deserialised) == []
-    replayed = CalibrationSession(load_chain('ur10e'), settings)
-    assert replay(write(tmp_path / 'bag', TYPES, content), replayed).warnings == ()
-    parameters = {'chain': 'ur10e', 'sources': [SOURCE], 'data_dir': str(tmp_path)}
-    with Cell(**parameters) as cell:
+def test_a_link_is_measured_as_a_pose_would_be(tmp_path, recording):
+    with Cell(chain='ur10e', sources=[SOURCE], data_dir=str(tmp_path)) as cell:
         latched = cell.peer.create_publisher(TFMessage, '/tf_static', LATCHED)
         latched.publish(still())
         cell.play({'/tf': moving(recording), 'joint_states': joint_messages(recording)})
         live = cell.node.session
-        expected = alone.problem().observations
-        assert_same(expected, replayed.problem().observations)
-        assert_same(expected, live.problem().observations)
-        assert live.account() == alone.account() == replayed.account()
-    of_poses = direct(recording).problem().observations
-    np.testing.assert_array_equal(expected.stamps_ns, of_poses.stamps_ns)
-    np.testing.assert_allclose(expected.positions, of_poses.positions, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(expected.rotations, of_poses.rotations, rtol=0, atol=1e-12)
+        found, expected = (each.problem().observations for each in (live, direct(recording)))
+        assert live.account().dropped == {}
+    np.testing.assert_array_equal(found.stamps_ns, expected.stamps_ns)
+    np.testing.assert_allclose(found.positions, expected.positions, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.rotations, expected.rotations, rtol=0, atol=1e-12)
 
 
 def test_the_diagnostics_tell_which_frames_are_there(tmp_path, recording):

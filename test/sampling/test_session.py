@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sessions import TRUE, UR5E, drive, samples, session, tracker
-from streams import POSE, RANGE, TRACKER, TRANSFORM, distance, pose, take, transform
+from streams import POSE, TRACKER, pose, take
 
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError
@@ -171,32 +171,6 @@ def test_clear_forgets_samples_and_counts_but_not_the_calibration():
 
 
 # Sources
-
-
-def test_devices_and_targets_have_frames_of_their_own():
-    """Two markers of one tracker by their child frames, and a wire with an origin of its own."""
-    rng = np.random.default_rng(7)
-    ball = replace(TRUE, tool=random_frame(rng, 0.2))
-
-    def marker(stamp, row):
-        where = ball.forward(row[np.newaxis])[0]
-        return transform(stamp, where[:3, 3], 'ball', where[:3, :3])
-
-    def wire(stamp, row):
-        return distance(stamp, np.linalg.norm(TRUE.forward(row[np.newaxis])[0, :3, 3]))
-
-    made = session()
-    others = (Source('marker'), TRANSFORM, marker), (Source('wire', device='wire'), RANGE, wire)
-    drive(made, 5, [tracker(), *others])
-    made.finish()
-    sets = made.problem().sets
-    # streams of one stop come in the order of their names
-    assert {(each.base, each.tool, each.distances is not None) for each in sets} == {
-        ('base', 'tool', False),
-        ('base', 'tool_ball', False),
-        ('base_wire', 'tool', True),
-    }
-    assert [len(each) for each in sets] == [5, 5, 5]
 
 
 def test_the_world_is_the_frame_of_the_base():
