@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -17,7 +17,12 @@ def packed(square: FloatArray) -> list[str]:
     scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
     scaled = square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
     root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
-    return [' '.join(f'{x:.9e}' for x in row[: k + 1]) for k, row in enumerate(root)]
+    return rows_of([row[: k + 1] for k, row in enumerate(root)])
+
+
+def rows_of(matrix: Iterable[FloatArray]) -> list[str]:
+    """Return the rows of a matrix (P, K) as text, for `parse_rows`."""
+    return [' '.join(f'{x:.9e}' for x in row) for row in matrix]
 
 
 def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:

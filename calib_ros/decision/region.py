@@ -22,7 +22,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.drift import inverse_root
-from calib_ros.decision.packing import damaged, packed, parse_rows, unpacked
+from calib_ros.decision.packing import damaged, packed, parse_rows, rows_of, unpacked
 from calib_ros.errors import UnknownNameError
 from calib_ros.estimation.evidence import Mixed, Posterior, with_unmodelled
 from calib_ros.estimation.levels import KNOWN, UNUSUAL
@@ -107,7 +107,7 @@ class Region(Shown):
             'tool': self.tool,
             'names': list(self.names),
             'root': packed(self.square),
-            'device': [' '.join(f'{x:.9e}' for x in row) for row in self.device],
+            'device': rows_of(self.device),
             'unmodelled': list(self.unmodelled),
         }
 
