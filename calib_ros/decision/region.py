@@ -14,7 +14,7 @@ for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -106,7 +106,7 @@ class Region(Shown):
             'tool': self.tool,
             'names': list(self.names),
             'root': packed(self.square),
-            'device': [' '.join(f'{x:.9e}' for x in row) for row in self.device],
+            'device': rows_of(self.device),
             'unmodelled': list(self.unmodelled),
         }
 
@@ -137,7 +137,12 @@ def packed(square: FloatArray) -> list[str]:
     scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
     scaled = square / np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
     root = scale[:, np.newaxis] * np.linalg.cholesky(scaled)
-    return [' '.join(f'{x:.9e}' for x in row[: k + 1]) for k, row in enumerate(root)]
+    return rows_of([row[: k + 1] for k, row in enumerate(root)])
+
+
+def rows_of(matrix: Iterable[FloatArray]) -> list[str]:
+    """Return the rows of a matrix (P, K) as text, for `parse_rows`."""
+    return [' '.join(f'{x:.9e}' for x in row) for row in matrix]
 
 
 def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> FloatArray:

@@ -15,6 +15,7 @@ import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,6 +45,57 @@ def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) ->
     return tuple(name for name in every if name not in names)
 
 
+class Tilts(NamedTuple):
+    """Size [rad] of the waves of wobbling axes, and how P parameters follow each (P, T)."""
+
+    size: float
+    followed: FloatArray
+
+    @property
+    def square(self) -> FloatArray:
+        """Return the covariance (P, P) of the parameters."""
+        return np.asarray(self.size**2 * self.followed @ self.followed.T)
+
+    def among(self, names: Sequence[str], own: Sequence[str]) -> Tilts:
+        """Return how other parameters follow, of which only the `own` (P,) do."""
+        rows = dict(zip(own, self.followed, strict=True))
+        none = np.zeros(self.followed.shape[1])
+        return Tilts(self.size, np.array([rows.get(name, none) for name in names]))
+
+    def of(self, chain: Chain) -> bool:
+        """Tell whether they may be those of a chain."""
+        return 0.0 <= self.size < np.inf and self.followed.shape[1] == 8 * len(chain.joints)
+
+
+def tilting(chain: Chain) -> list[Parameter]:
+    """Return the parameters that tilt the axes of joints: those of rows, and turns of bases."""
+    bases = [frame for frame in chain.frame_names if frame.startswith('base')]
+    turns = [name for frame in bases for name in parameters_of(frame)[3:]]
+    return [*turns, *(Parameter(n, kind) for n in chain.joint_names for kind in ('alpha', 'beta'))]
+
+
+def tilted(chain: Chain, names: Sequence[str], joints: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return the columns (T, c, N) of wobbling axes at joint values (N, n).
+
+    Each of the n axes tilts in two directions by sine and cosine of the first and second harmonic
+    of its own joint, T = 8 n. `rows` (P, c, N) are those of the names, with all that are
+    `tilting`. In the standard convention the row before a joint tilts its axis, or the base does.
+    """
+    own = dict(zip(names, rows, strict=False))
+    pairs = [[own[f'{n}.{kind}'] for kind in ('alpha', 'beta')] for n in chain.joint_names]
+    if chain.convention == 'standard':
+        bases = [frame for frame in chain.frame_names if frame.startswith('base')]
+        turned = [
+            np.tensordot(chain.frame(frame).matrix[:3, :2], [own[n] for n in turns], (0, 0))
+            for frame, turns in ((frame, parameters_of(frame)[3:]) for frame in bases)
+        ]
+        pairs = [list(np.sum(turned, axis=0)), *pairs[:-1]]
+    angles = np.multiply.outer((1.0, 2.0), joints.T)  # (2, n, N)
+    waves = np.concatenate([np.cos(angles), np.sin(angles)])
+    every = ((tilt, waves[:, k]) for k, pair in enumerate(pairs) for tilt in pair)
+    return np.array([wave * tilt for tilt, own in every for wave in own])
+
+
 def products_with_doubts(
     chain: Chain,
     names: Sequence[str],
@@ -54,6 +106,7 @@ def products_with_doubts(
     by_device: bool,
     known: Normal | None,
     most: int = 10 * SOME_POSES,
+    tilts: Tilts | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return products of columns and residual, and their products with doubtful columns.
 
@@ -61,16 +114,16 @@ def products_with_doubts(
     and of the residual. A^T N (P + 1, K) and N^T N + 1 (K, K) follow, with N scaled by its
     standard deviations. All are in units of `noise` [sigma given], without priors. `doubts` are
     standard deviations of parameters that something else moves too; `by_device` includes smooth
-    device errors. Larger systems are thinned to `most` samples; `known` holds the products of all
-    samples for the names alone.
+    device errors, `tilts` what the names do not follow already. Larger systems are thinned to
+    `most` samples; `known` holds the products of all samples for the names alone.
     """
-    columns = list(dict.fromkeys([*names, *lengths]))
+    columns = list(dict.fromkeys([*names, *lengths, *(tilting(chain) if tilts else ())]))
     share = -(-system.count // most)
     if known is not None and share == 1 and not lengths and not by_device:
         products = known.products.sum(axis=0)
     else:
         few = replace(system.spread(most), prior=None)
-        products = share * _products(chain, columns, few, by_device)
+        products = share * _products(chain, columns, few, by_device, tilts is not None)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own = [*range(len(columns)), -1]
     products[np.ix_(own, own)] += share * (extra.T @ extra)
@@ -80,6 +133,10 @@ def products_with_doubts(
     grown = grown.sum(axis=1)[:, np.newaxis][:, : len(lengths)]  # none without lengths
     doubted = every[:, [row[str(name)] for name in doubts]] * [*doubts.values()]
     fields = every[:, len(columns) : -1]
+    if tilts is not None:
+        waves = fields[:, -tilts.followed.shape[1] :]
+        waves[: len(names)] -= tilts.followed
+        waves *= tilts.size
     kept = np.column_stack([every[:, : len(names)], grown, every[:, -1]])
     mixing = np.column_stack([kept, doubted, fields])
     mixed = mixing.T @ (products / noise**2) @ mixing
@@ -105,22 +162,23 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 
-def _products(chain: Chain, columns: Sequence[str], system: System, by_device: bool) -> FloatArray:
+def _products(
+    chain: Chain, columns: Sequence[str], system: System, by_device: bool, wobbling: bool
+) -> FloatArray:
     fields = bends(system.sets) if by_device else []
-    if not any(map(len, fields)):
+    if not (any(map(len, fields)) or wobbling):
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
-    size = len(columns)
-    found = np.zeros((size + len(fields[0]) + 1,) * 2)
-    own = [*range(size), -1]
+    waves = 8 * len(chain.joints) * wobbling
+    found = np.zeros((len(columns) + len(fields[0]) + waves + 1,) * 2)
     for samples, field in zip(system.sets, fields, strict=True):
         first = 0
-        for placed, *turned in samples.parts(chain, columns):
-            last = first + placed.shape[2]
-            wide = np.concatenate([placed[:-1], field[:, :, first:last], placed[-1:]])
-            found += gram(wide)
-            for rows in turned:  # distortion does not turn
-                found[np.ix_(own, own)] += gram(rows)
-            first = last
+        for parts in samples.parts(chain, columns):
+            block = slice(first, first := first + parts[0].shape[2])
+            joints = samples.observations.joints[block]
+            for number, rows in enumerate(parts):
+                bent = field[:, :, block] * (number == 0)  # distortion does not turn
+                more = [tilted(chain, columns, joints, rows)] if wobbling else []
+                found += gram(np.concatenate([rows[:-1], bent, *more, rows[-1:]]))
     return found
 
 

@@ -35,7 +35,7 @@ from calib_ros.estimation.leastsquares import Fit, System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -264,11 +264,13 @@ def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> t
     return _gather(chain, names, system, share, most // 20), share
 
 
-def joints_of_places(chain: Chain) -> Index:
-    """Return the joint (D,) of each column of the places of stops, -1 for that of their set."""
+def joints_at(chain: Chain, place: FloatArray) -> FloatArray:
+    """Return the joint values (n, J), angles within a turn, at the places (n, D) of stops."""
     circular = np.array([joint.type == 'revolute' for joint in chain.joints])
-    one, other = np.flatnonzero(circular), np.flatnonzero(~circular)
-    return np.concatenate([one, one, other, [-1]])
+    cos, sin, straight = np.split(place[:, :-1], np.arange(1, 3) * circular.sum(), axis=1)
+    found = np.empty((len(place), len(circular)))
+    found[:, circular], found[:, ~circular] = np.arctan2(sin, cos), straight
+    return found
 
 
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> Stops:

@@ -13,10 +13,11 @@ K holds the products, stop by stop, of the columns of turns of all joints about 
 tilts. If a test finds r^T K r larger than white noise allows, sizes v >= 0 equate these forms with
 their expected values (MINQUE, Rao 1971).
 
-They move the fitted parameters too. Turns, as of gears, average out like noise. Tilts, as of
-bearings, change slowly with the value of their joint, as exp(-distance) on the unit circle [m if
-prismatic], and add H^-1 (J^T v_3 K J) H^-1. Considered effects (`evidence.py`) of columns A and
-expected squares S add H^-1 (J^T A S A^T J) H^-1.
+They move the fitted parameters too. Turns, as of gears, average out like noise. Considered effects
+(`evidence.py`) of columns A and expected squares S add H^-1 (J^T A S A^T J) H^-1. So do tilts that
+change slowly with the value of their joint, as of bearings: waves (`considered.tilted`) of one
+size, the most probable one. In a small region parameters absorb them without a trace in the
+residuals, and the typical size counts.
 """
 
 from __future__ import annotations
@@ -25,79 +26,87 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy import special
-from scipy.spatial.distance import cdist
 
+from calib_ros.estimation.considered import Tilts, tilted, tilting
 from calib_ros.estimation.evidence import Posterior, turns_and_tilts
 from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.shared_errors import Stops, gathered, joints_of_places, nonnegative
-from calib_ros.estimation.sizes import solved
-from calib_ros.kinematics.chain import Chain
+from calib_ros.estimation.shared_errors import gathered, joints_at, nonnegative
+from calib_ros.estimation.sizes import LEAST_SIZE, SPREAD, TYPICAL, Evidence, solved
 from calib_ros.kinematics.se3 import FloatArray
 
 
 def unmodelled_errors(
     posterior: Posterior, factor: FloatArray, system: System
-) -> tuple[tuple[float, float], FloatArray]:
+) -> tuple[tuple[float, float], FloatArray, Tilts]:
     """Return the sizes [rad] of random turns and tilts of the joints, zero without evidence.
 
     Those of a prismatic joint along its axis [m] count as turns. Then follow the expected squares
-    (F, F) that unmodelled errors add to the F parameters of the fit with that `factor` (F, F), the
-    first of the posterior's names. Parameters held at nominal have no prior: the fit includes them
-    already.
+    (F, F) that considered effects add to the F parameters of the fit with that `factor` (F, F),
+    the first of the posterior's names, and the tilts, which add to them too. Parameters held at
+    nominal have no prior: the fit includes them already.
     """
     chain, names = posterior.chain, posterior.names
     groups, fitted = turns_and_tilts(chain), np.s_[: len(factor)]
-    every = tuple(dict.fromkeys((*names, *groups[0], *groups[1])))
+    every = tuple(dict.fromkeys((*names, *groups[0], *tilting(chain))))
     units, share = gathered(chain, every, system, SOME_POSES)
-    sizes = (0.0, 0.0)
-    if len(units) >= TELLING:
-        columns = [[every.index(name) for name in group] for group in groups]
-        sizes = _found(posterior, [part for part in units.parts if part.any()], columns)
     rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= len(factor)]
-    each = (np.einsum('pcn,qcn->pq', part[fitted], part[rest]) for part in units.parts)
-    along = share * sum(each, np.zeros((len(factor), len(rest))))
-    middle = along @ posterior.square[np.ix_(rest, rest)] @ along.T
-    if sizes[1]:
-        middle += sizes[1] ** 2 * _tilted(chain, every, len(factor), units, share)
-    return sizes, covariance(factor, middle)
+    columns = [[every.index(name) for name in group] for group in groups]
+    parts, along = [], np.zeros((len(factor), len(rest) + 4 * len(columns[1])))  # 4 waves each
+    for part in units.parts:
+        waves = tilted(chain, every, joints_at(chain, units.place), part)
+        others = np.concatenate([part[rest], waves])
+        along += share * np.einsum('pcn,qcn->pq', part[fitted], others)
+        parts += [np.concatenate([part[:-1], waves, part[-1:]])] * bool(part.any())
+    found = ((0.0, 0.0), TYPICAL['drive'])
+    if len(units) >= TELLING:
+        found = _found(posterior, parts, columns, len(every))
+    own, pushed = np.split(along, [len(rest)], axis=1)
+    tilts = Tilts(found[1], covariance(factor) @ pushed)
+    moved = covariance(factor, own @ posterior.square[np.ix_(rest, rest)] @ own.T)
+    return found[0], moved, tilts
 
 
 def _found(
-    posterior: Posterior, parts: Sequence[FloatArray], groups: Sequence[Sequence[int]]
-) -> tuple[float, float]:
-    """Return the sizes of turns and tilts, whose columns are the `groups`, by weighted rows."""
+    posterior: Posterior, parts: Sequence[FloatArray], groups: Sequence[Sequence[int]], first: int
+) -> tuple[tuple[float, float], float]:
+    """Return the sizes of turns and tilts, whose columns are the `groups`, and of waves.
+
+    By weighted rows, those of waves from the `first` on.
+    """
     count = len(posterior.names)
     found = _explained(posterior, [part[[*range(count), -1]] for part in parts])
     if found is None:
-        return 0.0, 0.0
+        return (0.0, 0.0), TYPICAL['drive']
     step, root, scales = found
     parts = [part / scale for part, scale in zip(parts, scales, strict=True)]
-    rows = np.concatenate(parts, axis=1).transpose(2, 1, 0)  # (n, c, P)
+    wide = np.concatenate(parts, axis=1)
+    rows = wide.transpose(2, 1, 0)  # (n, c, P)
     residual = rows[..., -1] + rows[..., :count] @ step
     part_of = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
     whites = rows.any(axis=2) & (part_of == np.arange(len(parts))[:, np.newaxis, np.newaxis])
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [rows[..., group] @ np.swapaxes(rows[..., group], 1, 2) for group in groups]
     turn, tilt = _sizes(np.array(kernels), rows[..., :count] @ root, residual).tolist()
-    return turn, tilt
+    return (turn, tilt), _size_of_waves(posterior, wide[[*range(count), *range(first, len(wide))]])
 
 
-def _tilted(
-    chain: Chain, names: Sequence[str], count: int, units: Stops, share: int
-) -> FloatArray:
-    """Return J^T K J (P, P) of tilts of all joints, for the first `count` of the names."""
-    middle = np.zeros((count, count))
-    for tilt in turns_and_tilts(chain)[1]:
-        place = units.place[:, joints_of_places(chain) == chain.joint_names.index(tilt.owner)]
-        kernel = share**2 * np.exp(-cdist(place, place))
-        np.fill_diagonal(kernel, share)
-        own = names.index(tilt)
-        rows = sum(np.einsum('cn,pcn->np', part[own], part[:count]) for part in units.parts)
-        middle += rows.T @ kernel @ rows
-    return middle
+def _size_of_waves(posterior: Posterior, rows: FloatArray) -> float:
+    """Return the size [rad] of waves, whose rows (P + T + 1, c, n) follow the posterior's.
+
+    At least the typical one, unless the data rule that out and show none.
+    """
+    products, count, group = gram(rows), len(posterior.names), 'tilt'
+    none = np.zeros(len(products) - 1 - count)
+    given = [1.0 / posterior.priors.get(name, np.inf) ** 2 for name in posterior.names]
+    matrix, typical = products[:-1, :-1], TYPICAL['drive']
+    vector = matrix @ np.append(posterior.offsets, none) + products[:-1, -1]
+    groups = [None] * count + [group] * len(none)
+    sought = Evidence(matrix, vector, np.append(given, none), groups, {group: typical})
+    size = float(np.exp(sought.most_probable({group})[0][0]))
+    return max(size, typical) if size > SPREAD * LEAST_SIZE * typical else 0.0
 
 
 def _explained(

@@ -26,9 +26,10 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.decision.region import Region, packed, region_of_record, sigma_of
+from calib_ros.decision.region import Region, packed, region_of_record, rows_of, sigma_of
 from calib_ros.decision.result import Identification
 from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.estimation.considered import Tilts
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
@@ -61,6 +62,8 @@ class Calibration(Shown):
     """Fitted parameters, (P,)."""
     covariance: FloatArray | None = None
     """Of the fitted parameters, (P, P)."""
+    tilts: Tilts | None = None
+    """The share of unmodelled wobble in it."""
     freedom: float = np.inf
     """Degrees of freedom of the covariance estimate."""
     residual: float | None = None
@@ -109,6 +112,7 @@ class Calibration(Shown):
             before=result.before,
             names=result.names,
             covariance=result.covariance,
+            tilts=result.posterior.tilts,
             freedom=result.uncertainty.overall,
             residual=1e-3 * rms_mm,
             noise=noise,
@@ -128,6 +132,9 @@ class Calibration(Shown):
                 'freedom': None if np.isinf(self.freedom) else self.freedom,
                 'root': packed(self.covariance),
             }
+            if self.tilts is not None:
+                size, followed = self.tilts
+                record['covariance'] |= {'tilt': size, 'tilts': rows_of(followed)}
         if self.rows is not None:
             record['rows'] = self.rows.document()
         return HEAD + dump_chain(self.chain, record)
@@ -273,13 +280,14 @@ def parse_calibration(
     nominal = nominal or record.nominal(chain)
     record.check(chain, nominal, settings)
     content = record.content
-    names, covariance, freedom = record.covariance(chain)
+    names, covariance, freedom, tilts = record.covariance(chain)
     residual = content.get('rms_mm_after')
     return Calibration(
         chain=chain,
         before=record.before(nominal, chain),
         names=names,
         covariance=covariance,
+        tilts=tilts,
         freedom=freedom,
         residual=None if residual is None else 1e-3 * residual,
         noise=record.noise(),

@@ -8,6 +8,10 @@ The parameter difference d is tested by d^T C^-1 d with C = C_1 + C_2; then the 
 are searched for (`changes.py`). The difference of predicted positions, in the best frames, is a
 quadratic form of d; its limit is the quantile for d ~ N(d, C).
 
+Wobble of the axes that the models lack moves the parameters of each, in a small region without a
+trace in the residuals (`unmodelled.py`). It is the same in both, so C has the covariance of the
+difference of its effects: nothing for the same poses, the whole for other regions.
+
 Smooth errors of a moved device (`considered.py`) give differences if other poses were measured.
 Only expected squares of errors include them (`region.py`): a difference that is significant
 without them is reported as such. If a calibration held DH parameters at nominal, its fitted ones
@@ -127,13 +131,18 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     if not names:
         raise InputError('neither calibration fitted a parameter of the arm')
     square, lacking = np.zeros((2, len(names), len(names)))
+    size, apart = 0.0, np.zeros((len(names), 1))
     for number, each in enumerate((first, second), 1):
         if each.covariance is None:
             raise InputError(
                 f'calibration {number} has no parameter covariance: identify it again with this '
                 'version'
             )
-        own = whole = _in_names(each.chain, names, each.names, each.covariance)
+        alone = each.covariance
+        if each.tilts is not None:
+            alone, size = alone - each.tilts.square, max(size, each.tilts.size)
+            apart = _change(each.chain, names, each.names) @ each.tilts.followed - apart
+        own = whole = _in_names(each.chain, names, each.names, alone)
         region = each.region
         if region is not None:
             arm, device = region.square, region.device @ region.device.T
@@ -142,6 +151,8 @@ def difference(first: Calibration, second: Calibration) -> Difference:
             whole = own + _in_names(region.chain, names, region.names, device)
         square += own
         lacking += whole
+    wobble = size**2 * apart @ apart.T
+    square, lacking = square + wobble, lacking + wobble
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
     left_over = _information(names, change, square)
@@ -196,6 +207,15 @@ def _in_names(
     chain: Chain, names: Sequence[Parameter], own: Sequence[str], square: FloatArray
 ) -> FloatArray:
     """Return the covariance of the names; parameters that were not fitted have typical sizes."""
+    change = _change(chain, names, own)
+    whole = change @ square @ change.T
+    unknown = np.abs(change).max(axis=1) < HALF_THE_DIGITS
+    sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]
+    return np.asarray(whole + np.diag(unknown * np.square(sizes)))
+
+
+def _change(chain: Chain, names: Sequence[Parameter], own: Sequence[str]) -> FloatArray:
+    """Return how the names (P,) change with a unit of each of a calibration's own (P, K)."""
     chain = chain.with_effects([n for n in names if not (n.of_dh or chain.owns_frame(n))])
     parameters = [Parameter(name) for name in own]
     change = np.array([[float(name == other) for other in parameters] for name in names])
@@ -204,10 +224,7 @@ def _in_names(
         change[:, others] = changes.gauged(
             chain, names, [parameters[k] for k in others], free=True
         )[0]
-    whole = change @ square @ change.T
-    unknown = np.abs(change).max(axis=1) < HALF_THE_DIGITS
-    sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]
-    return np.asarray(whole + np.diag(unknown * np.square(sizes)))
+    return change
 
 
 def _information(

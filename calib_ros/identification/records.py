@@ -17,8 +17,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.region import damaged, unpacked
+from calib_ros.decision.region import damaged, parse_rows, unpacked
 from calib_ros.errors import ConfigError
+from calib_ros.estimation.considered import Tilts
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.start import fit_to_arm, movable
@@ -201,21 +202,26 @@ class Record:
         names = movable(start, ('base', 'tool'))
         return fit_to_arm(start, names, chain, joints)[0] if names else start
 
-    def covariance(self, chain: Chain) -> tuple[tuple[str, ...], FloatArray | None, float]:
-        """Return the fitted parameters, their covariance (P, P) and its degrees of freedom."""
-        known = self._part('covariance')
+    def covariance(
+        self, chain: Chain
+    ) -> tuple[tuple[str, ...], FloatArray | None, float, Tilts | None]:
+        """Return the fitted parameters, their covariance (P, P), its freedom, and their tilts."""
+        known, tilts = self._part('covariance'), None
         if not known:
-            return (), None, math.inf
+            return (), None, math.inf, None
         try:
             names = tuple(known['names'])
             square = unpacked(known['root'], len(names))
             freedom = math.inf if known['freedom'] is None else float(known['freedom'])
             ours = set(names) <= set(chain.parameter_names) and len(set(names)) == len(names)
+            if 'tilts' in known:
+                tilts = Tilts(float(known['tilt']), parse_rows(known['tilts'], len(names)))
+                ours = ours and tilts.of(chain)
             if not (ours and (np.diag(square) > 0.0).all() and freedom > 0.0):
                 raise ValueError('no covariance of this chain')
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
             raise damaged('covariance', self.where, err) from err
-        return names, square, freedom
+        return names, square, freedom, tilts
 
     def noise(self) -> Noise | None:
         """Return the noise of the measurements, if recorded."""

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Axes that wobble: parameters absorb it in a small region, differently in another one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E
+
+from calib_ros import Calibration, Problem, difference, identify, load_chain, recalibrate
+from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.errors import ConfigError
+from calib_ros.estimation.considered import tilted, tilting
+from calib_ros.identification.calibration import parse_calibration
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.jacobian import ErrorModel
+
+WIDTH = 0.6  # rad, either way
+
+
+class Wobbling:
+    """An arm whose axes wobble by up to 0.3 mrad, measured in regions around postures."""
+
+    def __init__(self, seed):
+        self.rng = np.random.default_rng(seed)
+        self.true = faulty(UR10E, Cell(), self.rng)
+        self.sizes, self.phases = self.rng.uniform(0.0, (3e-4, 6.28), (2, 6, 2)).transpose(2, 0, 1)
+
+    def tilts(self, q):
+        """Return the tilts of the axes of all joints but the first at joint values (6,)."""
+        waves = self.sizes * np.sin(2.0 * q + self.phases)
+        names = UR10E.joint_names
+        pairs = zip(('alpha', 'beta'), waves[:, 1:], strict=True)
+        return {f'{names[k]}.{kind}': x for kind, own in pairs for k, x in enumerate(own)}
+
+    def measured(self, middle, count):
+        q = middle + self.rng.uniform(-WIDTH, WIDTH, (count, 6))
+        poses = np.array([self.true.with_offsets(self.tilts(x)).forward(x[None])[0] for x in q])
+        seen = measure(self.true, q, self.rng)
+        noise = self.rng.normal(size=(2, count, 3)) * np.reshape(NOISE, (2, 1, 1))
+        turned = se3.exp_rotation(noise[1]) @ poses[:, :3, :3]
+        return Problem(
+            UR10E, replace(seen, positions=poses[:, :3, 3] + noise[0], rotations=turned), **SIGMAS
+        )
+
+    def calibrated(self, middle, count=60):
+        return Calibration.of(identify(self.measured(middle, count)))
+
+    def middle(self):
+        return self.rng.uniform(-2.0, 2.0, 6)
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_two_regions_of_an_arm_that_lacks_nothing_else_are_the_same(seed):
+    arm = Wobbling(seed)
+    first, second = (arm.calibrated(arm.middle()) for _ in range(2))
+    found = difference(first, second)
+    assert found.same, found.in_words()
+    certain = [
+        replace(each, tilts=None, covariance=each.covariance - each.tilts.square)
+        for each in (first, second)
+    ]
+    assert not difference(*certain).same
+
+
+def test_what_changes_in_the_same_region_is_found_in_spite_of_it():
+    """The wobble is the same in both, so it hides nothing."""
+    arm = Wobbling(0)
+    middle = arm.middle()
+    first = arm.calibrated(middle)
+    assert difference(first, arm.calibrated(middle)).same
+    arm.true = arm.true.with_offsets({'elbow_joint.theta': 1e-3})
+    found = difference(first, arm.calibrated(middle))
+    assert 'elbow_joint' in {each.owner for reasons in found.changed for each in reasons}
+    elsewhere = difference(first, arm.calibrated(arm.middle()))
+    assert elsewhere.sigma @ elsewhere.sigma > 2.0 * found.sigma @ found.sigma
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_few_poses_in_another_region_show_no_change(seed):
+    arm = Wobbling(seed)
+    previous = arm.calibrated(arm.middle())
+    found = recalibrate(previous, arm.measured(arm.middle(), 8), 0.0)
+    assert not found.changed
+    again = found.calibration
+    left = again.covariance - again.tilts.square
+    assert np.linalg.eigvalsh(left).min() > 0.0
+    assert again.tilts.size == previous.tilts.size
+
+
+def test_a_loaded_calibration_knows_what_is_lacking():
+    arm = Wobbling(1)
+    first, second = arm.calibrated(arm.middle()), arm.calibrated(arm.middle())
+    read = [parse_calibration(each.dump(), 'here.yaml', UR10E) for each in (first, second)]
+    np.testing.assert_allclose(read[0].tilts.followed, first.tilts.followed, rtol=1e-8)
+    assert difference(*read).limit == pytest.approx(difference(first, second).limit, rel=1e-3)
+    wrong = replace(first, tilts=first.tilts._replace(followed=first.tilts.followed[:, 1:]))
+    with pytest.raises(ConfigError, match='covariance is damaged'):
+        parse_calibration(wrong.dump(), 'here.yaml', UR10E)
+
+
+@pytest.mark.parametrize('name', ['ur10e', 'franka_panda'])
+def test_columns_are_those_of_axes_that_tilt(name):
+    """By turns of what follows an axis about its foot, in either convention."""
+    chain = load_chain(name)
+    rng = np.random.default_rng(0)
+    chain = faulty(chain, Cell(), rng)
+    q = chain.random_joints(5, rng)
+    names = list(dict.fromkeys([*chain.parameter_names, *tilting(chain)]))
+    rows = np.moveaxis(ErrorModel(chain, names).jacobian(q), 2, 0).transpose(0, 2, 1)
+    found = tilted(chain, names, q, rows).reshape(len(chain.joints), 2, 4, 6, len(q))
+    waves = [np.cos(q.T), np.cos(2.0 * q.T), np.sin(q.T), np.sin(2.0 * q.T)]
+    axes = [ErrorModel(chain, [joint.driven]).jacobian(q)[:, 3:, 0] for joint in chain.joints]
+    for joint, (own, axis) in enumerate(zip(found, axes, strict=True)):
+        first = own[0, 0] / waves[0][joint]
+        for wave, columns in zip(waves, own[0], strict=True):
+            np.testing.assert_allclose(columns, first * wave[joint], atol=1e-12)
+        turns = [tilt[0, 3:] / waves[0][joint] for tilt in own]
+        np.testing.assert_allclose([np.linalg.norm(t, axis=0) for t in turns], 1.0, atol=1e-6)
+        across = [np.einsum('cn,nc->n', turn, axis) for turn in turns]
+        np.testing.assert_allclose(across, 0.0, atol=5e-3)  # rows are off by milliradians
