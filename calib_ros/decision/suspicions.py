@@ -54,7 +54,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.parameter import IN_A_FRAME, LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
-from calib_ros.settings import EXACT, EXCEPTION
+from calib_ros.settings import EXACT, EXCEPTION, Settings
 
 LEAST_SCALE = 0.5 * SCALE
 """Scale of a device that is remarked: half the scatter of good ones."""
@@ -252,10 +252,12 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
         given = float(np.sqrt(np.median(each.mean(axis=1))))
         own = not np.isclose(given, sigmas[k])
+        stated = own or sigmas[k] != getattr(Settings, f'sigma_{what}')
         name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
         name = f'{name} {given:.2g} {unit}'
         left = f'{1e3 * size * given:.2g} m{unit} are left'
-        if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
+        implausible = size < LEAST_NOISE or given > most
+        if stated and SIMULATED < size * given < given and implausible:
             found.append(f'{name}, and only {left}: was m{unit} meant?')
         elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
             found.append(

@@ -22,9 +22,9 @@ GRAVITY = {
 }
 
 
-def seen_of(true, seed=0, count=60, oriented=True):
+def seen_of(true, seed=0, count=60, oriented=True, noise=5e-5):
     rng = np.random.default_rng(seed)
-    return measure(true, true.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+    return measure(true, true.random_joints(count, rng), rng, noise, 4.0 * noise, oriented)
 
 
 def scaled(observations, ppm):
@@ -133,6 +133,12 @@ def test_sigmas_in_millimetres_are_named(sigma, oriented):
         result = identify(Problem(UR, seen, **sigmas))
         assert result.accepted
         assert not any('sigma' in each for each in result.remarks)
+
+
+def test_a_default_sigma_is_no_mistake_of_its_user():
+    seen = seen_of(arm(3), count=40, noise=2e-6)
+    assert identify(Problem(UR, seen)).remarks == ()
+    assert 'meant?' in identify(Problem(UR, seen, sigma_position=2e-4)).remarks[0]
 
 
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
