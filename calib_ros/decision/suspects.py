@@ -48,7 +48,7 @@ class Suspect:
     rank: int = 1
     chain: Chain | None = None
     rows: int = 0
-    published: str = 'correct it where it is published'
+    published: str = 'correct the publisher and measure again (after ~/clear)'
     part: str = ''
 
     def undone(self, sets: Sets) -> Sets:
@@ -200,7 +200,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             rank = 2 if more else 1
             found = Suspect(what + more, remedy + option, (*back, *others, *changes), rank)
             if published:
-                rest = ', and correct the rest where it is published' if more else ''
+                rest = ', correct the rest in the publisher' if more else ''
                 found = replace(found, published=published + rest)
             yield found
 

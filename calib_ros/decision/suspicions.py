@@ -221,17 +221,18 @@ def _motion(problem: Problem, result: Identification) -> str:
 
 
 def _order(problem: Problem) -> str:
-    """Return that one joint turned steadily in the order of the poses."""
+    """Return that joints turned steadily in the order of the poses."""
     for each in problem.sets:
         first = np.sort(np.unique(each.configurations, return_index=True)[1])
         q, time = each.joints[first], np.arange(len(first)) - 0.5 * (len(first) - 1)
         q = q - q.mean(axis=0)
         alike = np.abs(time @ q) / np.maximum(np.linalg.norm(time) * norms(q.T), 1e-300)
-        if len(first) >= TELLING and alike.max() > 1.0 - EXCEPTION:
-            name = problem.chain.joint_names[int(alike.argmax())]
+        steady = np.flatnonzero(alike > 1.0 - EXCEPTION)
+        if len(first) >= TELLING and len(steady):
+            names = ', '.join(problem.chain.joint_names[k] for k in steady)
             return (
-                f'{name} moves in one direction from the first pose to the last, so drift of the '
-                'device looks like an error of this joint: next time mix the order of the poses'
+                f'drift of the device looks like an error of {names}, moved in one direction from '
+                'the first pose to the last: next time mix the order of the poses'
             )
     return ''
 

@@ -100,7 +100,7 @@ class Filer:
 ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
 KEEP = '; to keep it call ~/save'
-TELLING = {Rule.MISTAKE, Rule.ENCODER}
+TELLING = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
 

@@ -68,12 +68,17 @@ def test_growth_that_arms_have_is_said_and_not_refused():
 def test_a_joint_that_only_goes_one_way_is_named():
     seen = seen_of(arm(), count=40)
     steady = seen.select(np.argsort(seen.joints[:, 2]))
-    said = [
-        [each for each in identify(Problem(UR, s)).remarks if 'mix' in each]
-        for s in (seen, steady)
-    ]
-    assert [len(each) for each in said] == [0, 1]
-    assert said[1][0].startswith('elbow_joint moves in one direction')
+    joints = steady.joints.copy()
+    joints[:, 4] = np.sort(joints[:, 4])
+    several = measure(arm(), joints, np.random.default_rng(0), 5e-5, 2e-4)
+    for one, named in (
+        (seen, ''),
+        (steady, 'elbow_joint'),
+        (several, 'elbow_joint, wrist_2_joint'),
+    ):
+        said = [each for each in identify(Problem(UR, one)).remarks if 'mix' in each]
+        assert len(said) == bool(named)
+        assert all(f'an error of {named}, moved in one direction' in each for each in said)
 
 
 def test_offsets_that_scatter_hide_a_scale():

@@ -92,7 +92,7 @@ def with_noise(recording):
 @pytest.mark.parametrize(
     ('spoilt', 'accepted', 'said', 'status'),
     [
-        (with_a_hole, True, 'max_gap (0.1 s): 20 Hz or more are needed', '20 Hz or more'),
+        (with_a_hole, True, 'max_gap (0.1 s): 20 Hz or more of every joint', '20 Hz or more'),
         (with_noise, False, 'hardly ever rest within still (0.0005)', 'set still to 0.00'),
     ],
 )

@@ -96,7 +96,7 @@ def test_a_short_answer_names_the_mistake(cell, recording):
     answer = cell.refused('identify')
     assert answer.message.startswith(
         'NOT accepted, nothing is published: the joint values are in degrees, not radians: '
-        'correct it where it is published ... full text: '
+        'correct the publisher and measure again (after ~/clear) ... full text: '
     )
     assert 'To do first: Check at the robot' in cell.in_full(answer)
 

@@ -215,7 +215,11 @@ def test_heavy_losses_are_refused_as_in_a_bag_unless_they_are_allowed(cell, reco
     for message in given['measured_pose'][::4]:
         message.header.stamp = Time()
     cell.play(given)
-    words = '25 % of the measurements were dropped (stamps or full buffers): accept the rest with'
-    assert words in cell.in_full(cell.refused('identify'))
+    answer = cell.refused('identify')
+    words = 'zero stamp (fill header.stamp where it is published), or accept the rest with'
+    assert f'25 % of the measurements were dropped (stamps or full buffers): {words}' in (
+        cell.in_full(answer)
+    )
+    assert f' ... {words} largest_loss ... full text: ' in answer.message
     assert cell.set_parameters({'largest_loss': 0.26})[0].successful
     cell.done('identify')
