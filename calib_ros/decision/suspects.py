@@ -240,12 +240,12 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         order[[i, j]] = j, i
         what = f'{names[i]} and {names[j]} are swapped'
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
-        published = 'swap them in joint_names'
+        published = 'swap them in joint_names, start without resume'
         yield Suspect(what, remedy, (_joints(same[order]),), 2, published=published)
     if len(names) > 3:
         columns = ','.join(f'q{k}=q{len(names) + 1 - k}' for k in range(1, len(names) + 1))
         what = 'the joints are in the order from tool to base'
-        published = 'reverse joint_names'
+        published = 'reverse joint_names, start without resume'
         yield Suspect(what, f'--columns {columns}', (_joints(same[::-1]),), 2, published=published)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':

@@ -118,7 +118,7 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
         f'{between} of {measurements} measurements lie between joint states further apart than '
         f'max_gap ({max_gap:g} s): {rate} are needed'
     )
-    return [Hint(f'joint states are too rare: {rate} are needed', words)]
+    return [Hint(f'joint states were missing or too rare: {rate} are needed', words)]
 
 
 def apart(ahead: float) -> Hint:
@@ -270,7 +270,7 @@ def progress(
 
     `fitted` holds the joint values (n,) of each.
     """
-    counted = f'{len(fitted)} poses'
+    counted = f'{len(fitted)} pose{"s" * (len(fitted) != 1)}'
     if estimate is not None:
         counted += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()
@@ -279,8 +279,7 @@ def progress(
 
 def _forecast(estimate: Estimate, settings: Settings) -> str:
     wanted = settings.wanted_accuracy
-    more = estimate.more_for(wanted)
-    if not more:
+    if estimate.enough(wanted):
         return 'enough for the accuracy wanted'
     if estimate.excess is None:
         return 'too few to predict how many are needed'
@@ -289,6 +288,7 @@ def _forecast(estimate: Estimate, settings: Settings) -> str:
         if settings.model == 'geometric':
             advice = 'set model to auto, more'
         return f'{advice} will not help: what is left is {estimate.excess:.0f} x noise'
+    more = estimate.more_for(wanted)
     if more > settings.pose_buffer:
         return f'{1e3 * wanted:g} mm is out of reach: are units, sigmas and wanted_accuracy right?'
     return f'{more} more expected for {1e3 * wanted:g} mm'

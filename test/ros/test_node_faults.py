@@ -91,10 +91,12 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     def wait_for(said, wanted=True):
         cell.spin_until(lambda: heard and (said in heard[-1].status[0].message) == wanted)
 
+    status = cell.listen(String, 'calibration_node/status')
     silent = 'no more messages on /measured_pose'
     cell.spin_until(lambda: heard and 'rate of /measured_pose [Hz]' in values_of(heard[-1]))
     alive.remove(tracker)
     wait_for(silent)
+    cell.spin_until(lambda: f'; {silent}; ' in status[-1].data)  # the operator reads no other
     assert heard[-1].status[0].level == DiagnosticStatus.WARN
     assert '/joint_states' not in heard[-1].status[0].message
     alive.append(tracker)
