@@ -48,7 +48,7 @@ from calib_ros.apply.simulation import Cell as SimulatedCell, drive, faulty, mea
 from calib_ros.files.bags import Recording
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.ros import advisor as advisor_module, node as node_module
+from calib_ros.ros import advisor as advisor_module, inputs as inputs_module, node as node_module
 from calib_ros.ros.node import CalibrationNode
 from calib_ros.sampling.intake import Stream, feed
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD
@@ -58,6 +58,7 @@ from calib_ros.settings import Settings
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
+inputs_module.SILENCE = 1e6  # a busy machine may be silent for long
 node_module.TAKING_PERIOD = 0.02  # a wake-up costs more than what it takes
 node_module.DIAGNOSTICS_PERIOD = 0.1  # who waits for a report does not wait long
 node_module.JOIN_TIMEOUT = 120.0  # what was begun ends, however busy the machine is

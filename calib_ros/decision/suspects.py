@@ -48,7 +48,7 @@ class Suspect:
     rank: int = 1
     chain: Chain | None = None
     rows: int = 0
-    published: str = 'correct it where it is published'
+    published: str = 'correct the publisher and measure again (after ~/clear)'
     part: str = ''
 
     def undone(self, sets: Sets) -> Sets:
@@ -200,7 +200,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             rank = 2 if more else 1
             found = Suspect(what + more, remedy + option, (*back, *others, *changes), rank)
             if published:
-                rest = ', and correct the rest where it is published' if more else ''
+                rest = ', correct the rest in the publisher' if more else ''
                 found = replace(found, published=published + rest)
             yield found
 
@@ -240,12 +240,12 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         order[[i, j]] = j, i
         what = f'{names[i]} and {names[j]} are swapped'
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
-        published = 'swap them in joint_names'
+        published = 'swap them in joint_names, start without resume'
         yield Suspect(what, remedy, (_joints(same[order]),), 2, published=published)
     if len(names) > 3:
         columns = ','.join(f'q{k}=q{len(names) + 1 - k}' for k in range(1, len(names) + 1))
         what = 'the joints are in the order from tool to base'
-        published = 'reverse joint_names'
+        published = 'reverse joint_names, start without resume'
         yield Suspect(what, f'--columns {columns}', (_joints(same[::-1]),), 2, published=published)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':

@@ -63,7 +63,7 @@ from calib_ros.kinematics.parameter import (
     parameters_of,
 )
 from calib_ros.kinematics.se3 import FloatArray, norms
-from calib_ros.settings import EXACT, EXCEPTION
+from calib_ros.settings import EXACT, EXCEPTION, Settings
 
 LEAST_SCALE = 0.5 * SCALE
 """Scale of a device that is remarked: half the scatter of good ones."""
@@ -236,17 +236,18 @@ def _motion(problem: Problem, result: Identification) -> str:
 
 
 def _order(problem: Problem) -> str:
-    """Return that one joint turned steadily in the order of the poses."""
+    """Return that joints turned steadily in the order of the poses."""
     for each in problem.sets:
         first = np.sort(np.unique(each.configurations, return_index=True)[1])
         q, time = each.joints[first], np.arange(len(first)) - 0.5 * (len(first) - 1)
         q = q - q.mean(axis=0)
         alike = np.abs(time @ q) / np.maximum(np.linalg.norm(time) * norms(q.T), 1e-300)
-        if len(first) >= TELLING and alike.max() > 1.0 - EXCEPTION:
-            name = problem.chain.joint_names[int(alike.argmax())]
+        steady = np.flatnonzero(alike > 1.0 - EXCEPTION)
+        if len(first) >= TELLING and len(steady):
+            names = ', '.join(problem.chain.joint_names[k] for k in steady)
             return (
-                f'{name} moves in one direction from the first pose to the last, so drift of the '
-                'device looks like an error of this joint: next time mix the order of the poses'
+                f'drift of the device looks like an error of {names}, moved in one direction from '
+                'the first pose to the last: next time mix the order of the poses'
             )
     return ''
 
@@ -300,10 +301,12 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         each = np.concatenate([part[:, 3 * k : 3 * k + 3] for part in variances])
         given = float(np.sqrt(np.median(each.mean(axis=1))))
         own = not np.isclose(given, sigmas[k])
+        stated = own or sigmas[k] != getattr(Settings, f'sigma_{what}')
         name = f'sigma_{what} is' if not own else f'by the covariances the {what} is known to'
         name = f'{name} {given:.2g} {unit}'
         left = f'{1e3 * size * given:.2g} m{unit} are left'
-        if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
+        implausible = size < LEAST_NOISE or given > most
+        if stated and SIMULATED < size * given < given and implausible:
             found.append(f'{name}, and only {left}: was m{unit} meant?')
         elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
             found.append(

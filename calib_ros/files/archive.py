@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import errno
 import fcntl
 import io
 import os
@@ -24,7 +25,7 @@ from tempfile import TemporaryFile, mkdtemp
 from urllib.parse import quote
 
 from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
-from calib_ros.errors import InputError
+from calib_ros.errors import InputError, trouble
 from calib_ros.files.tables import cells, columns, is_whole, read_journal
 from calib_ros.sampling.sample import Sample
 
@@ -114,7 +115,7 @@ class Journal:
         written = os.write(self._file, data)
         if written < len(data):  # the disk is full: no half row may stay
             os.ftruncate(self._file, begin)
-            raise OSError(f'{self.path}: the disk is full, the pose was not written')
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 class Archive:
@@ -185,7 +186,7 @@ class Archive:
                 self._journal.add(*self._waiting[0])
                 del self._waiting[0]
         except OSError as err:
-            self.error = str(err)
+            self.error = trouble(OSError(err.errno, err.strerror))  # without the path: known
         else:
             self.error = ''
 

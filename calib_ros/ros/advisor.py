@@ -103,7 +103,7 @@ class Guide:
         estimate = self._session.estimate
         wanted = self._session.settings.wanted_accuracy
         known = {} if estimate is None else {'expected [mm]': f'{1e3 * estimate.sigma:.4f}'}
-        enough = estimate is not None and estimate.sigma <= wanted
+        enough = estimate is not None and estimate.enough(wanted)
         return known | {'enough samples': enough, 'last trajectory': self._last_trajectory}
 
     def advise(self) -> None:

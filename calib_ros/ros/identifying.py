@@ -99,7 +99,8 @@ class Filer:
 
 ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
-TELLING = {Rule.MISTAKE, Rule.ENCODER}
+KEEP = '; to keep it call ~/save'
+TELLING = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
 
@@ -205,7 +206,7 @@ class Identifying:
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples
             )
-            self.last += '; to keep it call ~/save'
+            self.last += KEEP
         else:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
@@ -232,18 +233,21 @@ class Identifying:
             path = self._archive.note(f'{text}\n')
             path = self._report or path
             more = f' ... full text: {path.name if path else "in the log"}'
-            before, advice, _ = text.partition(self._advice or text)
-            text = _without_middle(before + advice, ANSWER_LENGTH - len(more)) + more
+            before, advice, rest = text.partition(self._advice or text)
+            more = (KEEP if KEEP in rest else '') + more
+            text = _without_middle(before, advice, ANSWER_LENGTH - len(more)) + more
         return success, text
 
 
-def _without_middle(text: str, longest: int) -> str:
-    """Return a text without its middle; the last clause, the advice, stays whole."""
-    end = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
-    room = longest - len(text) + end - 1
-    if len(text) <= longest or not longest // 4 < room < end:
-        return shortened(text, longest)
-    return f'{textwrap.shorten(text[:end], room, placeholder=" ...")} {text[end:]}'
+def _without_middle(before: str, advice: str, longest: int) -> str:
+    """Return a text without its middle: the advice at its end stays whole, or its last clause."""
+    text = before + advice
+    last = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
+    for end in (len(before), last):
+        room = longest - len(text) + end - 1
+        if longest // 4 < room < end:
+            return f'{textwrap.shorten(text[:end], room, placeholder=" ...")} {text[end:]}'
+    return shortened(text, longest)
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:

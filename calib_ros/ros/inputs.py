@@ -138,14 +138,15 @@ class Inputs:
         for hearing in self._topics.values():
             hearing.look(now, span)
 
+    @property
+    def silent(self) -> list[str]:
+        """Return which topics have become silent, as text."""
+        silent = [topic for topic, hearing in self._topics.items() if hearing.silent]
+        return [f'no more messages on {topic}' for topic in silent]
+
     def troubles(self) -> list[str]:
         """Return problems of topics as text."""
-        wrong = [
-            f'no more messages on {topic}'
-            for topic, hearing in self._topics.items()
-            if hearing.silent
-        ]
-        wrong += [
+        wrong = self.silent + [
             f'{topic} is published {hearing.deaf} is asked for'
             for topic, hearing in self._topics.items()
             if hearing.deaf and not hearing.count

@@ -334,7 +334,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Return the status; publish its first words when they change."""
         words = self.session.status(str(self._identifying.progress))
         trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
-        text = textwrap.shorten(f'{trouble} {words}', STATUS_LENGTH, placeholder=' ...')
+        state, _, rest = words.partition('; ')
+        text = '; '.join((f'{trouble} {state}', *self._inputs.silent, rest))
+        text = textwrap.shorten(text, STATUS_LENGTH, placeholder=' ...')
         if text != self._status_text:
             self._status_text = text
             self._status.publish(String(data=text))

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.messages import Readings, Source
+from calib_ros.sampling.messages import NO_STAMP, Readings, Source
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
 from calib_ros.settings import EXCEPTION
@@ -159,16 +159,16 @@ class Entry:
             values = numbers[:, index]
             for k, end in self._names.held.items():
                 values[:, columns.index(k)] = end
-            size = np.abs(values).max(axis=1)
-            good = size <= LARGEST
+            size, good = np.abs(values).max(axis=1), np.ones(len(stamps), dtype=bool)
+            for wrong, cause in (
+                (stamps <= 0, NO_STAMP),
+                (~np.isfinite(size), 'NaN or infinite joint value'),
+                (size > LARGEST, 'joint value beyond 1e6'),
+            ):
+                if count := int((good & wrong).sum()):
+                    self.miss(JOINTS, count, cause)
+                    good &= ~wrong
             if not good.all():
-                infinite = int((~np.isfinite(size)).sum())
-                for count, cause in (
-                    (infinite, 'NaN or infinite joint value'),
-                    (int((~good).sum()) - infinite, 'joint value beyond 1e6'),
-                ):
-                    if count:
-                        self.miss(JOINTS, count, cause)
                 places, stamps, values = places[good], stamps[good], values[good]
             if not len(stamps):
                 continue

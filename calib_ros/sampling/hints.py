@@ -113,22 +113,22 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
     """Report measurements `between` joint states too far apart, if many."""
     if between < NO_ACCIDENT or between <= EXCEPTION * measurements:
         return []
-    rate = f'{2.0 / max_gap:g} Hz or more'
+    rate = f'{2.0 / max_gap:g} Hz or more of every joint'
     words = (
         f'{between} of {measurements} measurements lie between joint states further apart than '
         f'max_gap ({max_gap:g} s): {rate} are needed'
     )
-    return [Hint(f'joint states are too rare: {rate} are needed', words)]
+    return [Hint(f'joint states were missing or too rare: {rate} are needed', words)]
 
 
 def apart(ahead: float) -> Hint:
     """Report clocks too far apart: measurements are `ahead` of the joint states [s]."""
-    when, other = ('after', 'check that joint states still arrive')
+    when, other = ('after', 'do joint states still arrive?')
     if ahead < 0.0:
-        when, other = ('before', 'raise lateness if the device sends late')
+        when, other = ('before', 'if the device sends late, raise lateness')
     words = (
-        f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state: synchronise '
-        f'the clocks (NTP, PTP), or {other}; then repeat the poses of that time'
+        f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state ({other}): '
+        'synchronise the clocks (NTP, PTP) and repeat the poses of that time'
     )
     return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks', words)
 
@@ -163,10 +163,13 @@ def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]
 def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     """Return why a result must not be accepted: more than `largest_loss` of a kind was lost."""
     counts = ((JOINTS, account.joint_states), (POSES, account.poses))
-    shares = {name: lost(name, count, account.dropped)[0] for name, count in counts}
+    found = [(name, *lost(name, count, account.dropped)) for name, count in counts]
     return [
-        Reason(Rule.DROPPED, f'{100.0 * share:.0f} % of the {name} {LOST}: {allowing(share)}')
-        for name, share in shares.items()
+        Reason(
+            Rule.DROPPED,
+            f'{100.0 * share:.0f} % of the {name} {LOST}: {cause}, or {allowing(share)}',
+        )
+        for name, share, cause in found
         if share > largest_loss
     ]
 
@@ -267,7 +270,7 @@ def progress(
 
     `fitted` holds the joint values (n,) of each.
     """
-    counted = f'{len(fitted)} poses'
+    counted = f'{len(fitted)} pose{"s" * (len(fitted) != 1)}'
     if estimate is not None:
         counted += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()
@@ -276,8 +279,7 @@ def progress(
 
 def _forecast(estimate: Estimate, settings: Settings) -> str:
     wanted = settings.wanted_accuracy
-    more = estimate.more_for(wanted)
-    if not more:
+    if estimate.enough(wanted):
         return 'enough for the accuracy wanted'
     if estimate.excess is None:
         return 'too few to predict how many are needed'
@@ -286,4 +288,7 @@ def _forecast(estimate: Estimate, settings: Settings) -> str:
         if settings.model == 'geometric':
             advice = 'set model to auto, more'
         return f'{advice} will not help: what is left is {estimate.excess:.0f} x noise'
+    more = estimate.more_for(wanted)
+    if more > settings.pose_buffer:
+        return f'{1e3 * wanted:g} mm is out of reach: are units, sigmas and wanted_accuracy right?'
     return f'{more} more expected for {1e3 * wanted:g} mm'

@@ -79,6 +79,10 @@ class Estimate:
     noise: float  # of the residuals, used for sigma [sigma given]
     excess: float | None
 
+    def enough(self, wanted: float) -> bool:
+        """Tell whether a wanted sigma [m] is reached, and not by the priors."""
+        return self.excess is not None and self.sigma <= wanted
+
     def more_for(self, wanted: float) -> int:
         """Return how many more samples are expected for a wanted sigma [m]."""
         return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))

@@ -107,7 +107,7 @@ def head_of(message: Any) -> tuple[int, str]:
 def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
     """Return which readings (N,) can be used, and the causes of the others.
 
-    Joint values are not checked: some may be those of another robot.
+    Joint states are not checked: some may be those of another robot.
     """
     numbers, causes = found.numbers, Counter[str]()
     good = np.ones(len(numbers), dtype=bool)
@@ -118,8 +118,10 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
             causes[cause] += count
             good[wrong] = False
 
+    if kind == JOINT_STATE:
+        return good, causes
     refuse(found.stamps_ns <= 0, NO_STAMP)
-    if kind in (JOINT_STATE, *PICTURES):
+    if kind in PICTURES:
         return good, causes
     width = numbers.shape[1]
     if width == 1:
@@ -149,7 +151,8 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
 
 @functools.lru_cache(maxsize=16)  # most devices repeat one
 def _fault(covariance: bytes) -> str:
-    return str(covariance_faults(np.frombuffer(covariance).reshape(1, 6, 6))[0])
+    fault = str(covariance_faults(np.frombuffer(covariance).reshape(1, 6, 6))[0])
+    return fault and f'{fault} (leave it zero if it is not known)'
 
 
 def transforms_in(message: Any, kind: str) -> Sequence[Any]:

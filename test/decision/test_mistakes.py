@@ -126,7 +126,7 @@ TWO = ('shoulder_lift_joint', 'wrist_2_joint')
 TWO_SIGNS, TWO_UNITS = (np.array([1.0, each, 1.0, 1.0, each, 1.0]) for each in (-1, 180.0 / np.pi))
 PUBLISHED = {
     'orientations': 'check the orientations where they are published',
-    'both': 'correct it where it is published',
+    'both': 'correct the publisher and measure again',
     'inverse': 'set eye_in_hand=true in sources',
     'sign': 'sign: -1 in the chain file',
     'zero': 'theta -90 degrees in the chain file',

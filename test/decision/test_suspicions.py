@@ -22,9 +22,9 @@ GRAVITY = {
 }
 
 
-def seen_of(true, seed=0, count=60, oriented=True):
+def seen_of(true, seed=0, count=60, oriented=True, noise=5e-5):
     rng = np.random.default_rng(seed)
-    return measure(true, true.random_joints(count, rng), rng, 5e-5, 2e-4, oriented)
+    return measure(true, true.random_joints(count, rng), rng, noise, 4.0 * noise, oriented)
 
 
 def scaled(observations, ppm):
@@ -68,12 +68,17 @@ def test_growth_that_arms_have_is_said_and_not_refused():
 def test_a_joint_that_only_goes_one_way_is_named():
     seen = seen_of(arm(), count=40)
     steady = seen.select(np.argsort(seen.joints[:, 2]))
-    said = [
-        [each for each in identify(Problem(UR, s)).remarks if 'mix' in each]
-        for s in (seen, steady)
-    ]
-    assert [len(each) for each in said] == [0, 1]
-    assert said[1][0].startswith('elbow_joint moves in one direction')
+    joints = steady.joints.copy()
+    joints[:, 4] = np.sort(joints[:, 4])
+    several = measure(arm(), joints, np.random.default_rng(0), 5e-5, 2e-4)
+    for one, named in (
+        (seen, ''),
+        (steady, 'elbow_joint'),
+        (several, 'elbow_joint, wrist_2_joint'),
+    ):
+        said = [each for each in identify(Problem(UR, one)).remarks if 'mix' in each]
+        assert len(said) == bool(named)
+        assert all(f'an error of {named}, moved in one direction' in each for each in said)
 
 
 def test_offsets_that_scatter_hide_a_scale():
@@ -133,6 +138,12 @@ def test_sigmas_in_millimetres_are_named(sigma, oriented):
         result = identify(Problem(UR, seen, **sigmas))
         assert result.accepted
         assert not any('sigma' in each for each in result.remarks)
+
+
+def test_a_default_sigma_is_no_mistake_of_its_user():
+    seen = seen_of(arm(3), count=40, noise=2e-6)
+    assert identify(Problem(UR, seen)).remarks == ()
+    assert 'meant?' in identify(Problem(UR, seen, sigma_position=2e-4)).remarks[0]
 
 
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():

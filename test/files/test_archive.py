@@ -180,6 +180,7 @@ def test_a_full_disk_loses_nothing(tmp_path):
             archive.add(each)
         assert archive.error
         assert stamps(tmp_path) == [1, 2]
+        assert archive.trouble.startswith('poses are in memory only: the disk is full: make room')
         archive.remove(samples[1])
         archive.remove(samples[3])
     archive.write()

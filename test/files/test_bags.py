@@ -227,6 +227,7 @@ SKEW[0, 1] = 0.5
 ZERO = np.diag([1, 1, 1, 1, 1, 0])
 ZERO_STAMP = 'measurements: zero stamp (fill header.stamp where it is published)'
 NOT_FINITE = 'measurements: NaN or infinite position'
+COVARIANCE = 'measurements: covariance {} (leave it zero if it is not known)'
 NOT_UNIT = 'measurements: quaternion not of length 1 (normalise it where it is published)'
 BAD_POSES = [
     (pose_stamped(0), ZERO_STAMP),
@@ -242,10 +243,10 @@ BAD_POSES = [
         'measurements: child frame whose name cannot be printed',
     ),
     (transform_stamped(175 * MS, quat=(1, 1, 1, 1)), NOT_UNIT),
-    (pose_with_covariance(185 * MS, NAN), 'measurements: covariance with NaN or infinite values'),
-    (pose_with_covariance(195 * MS, SKEW), 'measurements: covariance not symmetric'),
-    (pose_with_covariance(205 * MS, -GOOD), 'measurements: covariance not positive definite'),
-    (pose_with_covariance(215 * MS, ZERO), 'measurements: covariance not positive definite'),
+    (pose_with_covariance(185 * MS, NAN), COVARIANCE.format('with NaN or infinite values')),
+    (pose_with_covariance(195 * MS, SKEW), COVARIANCE.format('not symmetric')),
+    (pose_with_covariance(205 * MS, -GOOD), COVARIANCE.format('not positive definite')),
+    (pose_with_covariance(215 * MS, ZERO), COVARIANCE.format('not positive definite')),
     (pose_stamped(5 * MS), 'measurements: no joint state before'),
     (pose_stamped(1005 * MS), 'measurements: no joint state after'),
 ]

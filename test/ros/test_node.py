@@ -85,7 +85,7 @@ def with_a_hole(recording):
 
 def test_what_looks_wrong_is_told_live_and_of_a_bag(tmp_path, capfd, recording):
     recording, status = with_a_hole(recording), '20 Hz or more'
-    said = f'max_gap (0.1 s): {status} are needed'
+    said = f'max_gap (0.1 s): {status} of every joint'
     write_bag(tmp_path / 'bag', recording, 'mcap')
     arguments = ['identify', str(tmp_path / 'bag'), '--chain', 'ur10e', '--json']
     arguments += ['--largest-loss', '1']

@@ -21,7 +21,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
-from calib_ros.ros.identifying import Snapshot, _page, _without_middle
+from calib_ros.ros.identifying import KEEP, Snapshot, _page, _without_middle
 from calib_ros.settings import Settings
 
 
@@ -52,11 +52,23 @@ def test_errors_are_answers(cell, recording):
     ],
 )
 def test_an_answer_is_cut_between_verdict_and_advice(verdict, middle, advice):
-    found = _without_middle(verdict + middle + advice, 120)
+    found = _without_middle('', verdict + middle + advice, 120)
     assert len(found) <= 120
     assert found.startswith(verdict[:25])
     assert found.endswith(advice[2:])
     assert ' ... ' in found
+
+
+def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_path):
+    identifying = cell.node._identifying
+    cell.node._archive._path = tmp_path / 'ur10e_20260102T030405000006Z.csv'
+    verdict, hint = 'accepted: 40 poses, RMS 1.911 -> 0.0053 mm', 'J moves one way: mix the order'
+    identifying._advice = hint
+    rest = f'valid; {"not identifiable, " * 20}note: {hint}{KEEP}; not filed'
+    _, found = identifying.shortened((True, f'{verdict} (95 %: 0.0045 to 0.006 mm); {rest}'))
+    assert len(found) <= 200
+    assert found.startswith(verdict)
+    assert f'... {hint}{KEEP} ... full text: ' in found
 
 
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])
@@ -84,7 +96,7 @@ def test_a_short_answer_names_the_mistake(cell, recording):
     answer = cell.refused('identify')
     assert answer.message.startswith(
         'NOT accepted, nothing is published: the joint values are in degrees, not radians: '
-        'correct it where it is published ... full text: '
+        'correct the publisher and measure again (after ~/clear) ... full text: '
     )
     assert 'To do first: Check at the robot' in cell.in_full(answer)
 

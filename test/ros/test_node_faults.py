@@ -91,11 +91,13 @@ def test_a_source_that_dies_and_comes_back(monkeypatch, cell, recording):
     def wait_for(said, wanted=True):
         cell.spin_until(lambda: heard and (said in heard[-1].status[0].message) == wanted)
 
+    status = cell.listen(String, 'calibration_node/status')
     silent = 'no more messages on /measured_pose'
     rate = 'rate of /measured_pose [Hz]'
     cell.spin_until(lambda: heard and 1 < float(values_of(heard[-1]).get(rate, 0)) < 1000)
     alive.remove(tracker)
     wait_for(silent)
+    cell.spin_until(lambda: f'; {silent}; ' in status[-1].data)  # the operator reads no other
     assert heard[-1].status[0].level == DiagnosticStatus.WARN
     assert '/joint_states' not in heard[-1].status[0].message
     alive.append(tracker)
@@ -217,7 +219,11 @@ def test_heavy_losses_are_refused_as_in_a_bag_unless_they_are_allowed(cell, reco
     for message in given['measured_pose'][::4]:
         message.header.stamp = Time()
     cell.play(given)
-    words = '25 % of the measurements were dropped (stamps or full buffers): accept the rest with'
-    assert words in cell.in_full(cell.refused('identify'))
+    answer = cell.refused('identify')
+    words = 'zero stamp (fill header.stamp where it is published), or accept the rest with'
+    assert f'25 % of the measurements were dropped (stamps or full buffers): {words}' in (
+        cell.in_full(answer)
+    )
+    assert f' ... {words} largest_loss ... full text: ' in answer.message
     assert cell.set_parameters({'largest_loss': 0.26})[0].successful
     cell.done('identify')

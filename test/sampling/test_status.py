@@ -32,12 +32,18 @@ def test_the_status_tells_how_far_it_is():
     assert made.status().startswith('waiting for joint states; 6 poses, ')
     assert 'too few to predict how many are needed' in made.status()
     assert 'more' not in made.status()
+    made.change(replace(made.settings, wanted_accuracy=1.0))  # that is what priors say
+    assert 'too few to predict how many are needed' in made.status()
     made.restore(samples(60, start=100))
     assert 'mm expected' in made.status()
     made.change(replace(made.settings, wanted_accuracy=1e-2))
     assert 'enough for the accuracy wanted' in made.status()
-    made.change(replace(made.settings, wanted_accuracy=1e-6))
-    assert 'more expected for 0.001 mm' in made.status()
+    made.change(replace(made.settings, wanted_accuracy=2e-6))
+    assert 'more expected for 0.002 mm' in made.status()
+    made.change(replace(made.settings, wanted_accuracy=1e-8))  # or positions in mm
+    assert made.status().endswith(
+        'expected, 1e-05 mm is out of reach: are units, sigmas and wanted_accuracy right?'
+    )
 
 
 @pytest.mark.parametrize(
