@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.cli import common, given
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.reasons import Reason, Rule
@@ -179,7 +180,7 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
 def _source(options: argparse.Namespace) -> str:
     """Return 'bag' or 'table', with the table in `options.csv`, or the bag in `measured`."""
     if options.measured is not None and options.csv is None:
-        bag = given.refuse_others(options.measured, 'identify', 'table', 'bag') == 'bag'
+        bag = refuse_others(options.measured, 'identify', 'table', 'bag') == 'bag'
         if not bag:
             options.csv, options.measured = options.measured, None
     source = 'table' if options.csv or options.detections else 'bag'

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, given
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
@@ -109,7 +110,7 @@ def _sets(
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
     """Return the sets between the calibration's frames of their devices and targets."""
     settings = common.settings_of(options)
-    if given.refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
+    if refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)
     else:
         session, read = given.replayed(options.measured, nominal, settings, screen)
