@@ -30,7 +30,7 @@ from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
-from calib_ros.report import words
+from calib_ros.report import documents, words
 from calib_ros.report.advice import FAR, GOOD_ARM, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
@@ -102,7 +102,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
             found = recalibrate(previous, problem, years, growth, new)
-        figures = words.figures_document(found.comparison)
+        figures = documents.figures_document(found.comparison)
         text = dump_json(found.document() | figures) + '\n'
         contents['result.json'] = text
         if found.accepted:
@@ -153,7 +153,7 @@ def _interval(judged: Comparison | None) -> tuple[tuple[str, str], ...]:
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     loaded, settings = _loaded(options, screen)
-    configuration = words.configuration_yaml(options.chain, settings)
+    configuration = documents.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
     origin = given.origin_of(options, read, configuration)
     with screen.work('identifying') as work:
@@ -333,7 +333,7 @@ def _with_outliers(judged: Comparison) -> tuple[tuple[str, str], ...]:
 
 
 def _document(found: Identified) -> str:
-    content = words.as_document(found.result, found.loaded.samples)
+    content = documents.as_document(found.result, found.loaded.samples)
     content |= {'warnings': list(found.loaded.warnings), 'tolerance_mm': found.tolerance}
     return dump_json(content | {'origin': found.origin.document()})
 

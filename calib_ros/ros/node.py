@@ -35,7 +35,7 @@ from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate, years_since
-from calib_ros.report import words
+from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
 from calib_ros.ros.diagnostics import Diagnostics
@@ -160,7 +160,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         given = self._given
         more = {**given.links, 'serial': given.serial}
         more = {name: value for name, value in more.items() if value}
-        return words.configuration_yaml(given.chain, self.session.settings, **more)
+        return documents.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
         """Refuse settings that no identification could use, and forbidden files."""

@@ -21,12 +21,13 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import workspace_report
+from calib_ros.report.documents import as_document
 from calib_ros.report.page import Input, Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
 from calib_ros.report.verdicts import verification_report
-from calib_ros.report.words import as_document, limits_mm, summary
+from calib_ros.report.words import limits_mm, summary
 
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
 
