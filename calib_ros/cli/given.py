@@ -30,7 +30,7 @@ from calib_ros.files.layouts import Layout, layout_of
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
-from calib_ros.sampling.sample import Gathered
+from calib_ros.sampling.gathered import Gathered
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 

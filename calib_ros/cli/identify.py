@@ -43,7 +43,7 @@ from calib_ros.report.reports import (
     somewhere,
     within_tolerance,
 )
-from calib_ros.sampling.sample import with_lenses
+from calib_ros.sampling.gathered import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json

@@ -29,7 +29,7 @@ from calib_ros.report.verdicts import (
     standing,
     verification_report,
 )
-from calib_ros.sampling.sample import gathered
+from calib_ros.sampling.gathered import gathered
 from calib_ros.shown import rounded
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')

@@ -44,9 +44,10 @@ from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.to_ros import LATCHED
+from calib_ros.sampling.gathered import check_settings
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.sample import Sample, check_settings
+from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
