@@ -152,7 +152,7 @@ class LiveEstimate:
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
         try:
             self._names = structurally_independent(model, problem.free, problem.kinds)
-            chain = start_frames(model, problem.sets, *self._sigmas, problem.loss)
+            chain = start_frames(problem)
         except (CalibrationError, np.linalg.LinAlgError):
             return False
         wide: dict[str, float] = {

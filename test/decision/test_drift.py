@@ -85,8 +85,8 @@ def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
         kind = ('fading', 'none')[seed % 2]
         seen = session(seed, 0.0, kind, count=60, width=None)
         known = frames if seen.oriented.all() else frames[:9]
-        system = Problem(UR10E, seen, **SIGMAS).system([seen])
-        start = start_frames(UR10E, [seen], *NOISE, 'none')
+        problem = Problem(UR10E, seen, loss='none', **SIGMAS)
+        system, start = problem.system([seen]), start_frames(problem)
         before = minimise(start, known, system).chain
         found.append(chance_of_gain(before, known, arm, system))
     chances = np.array(found)

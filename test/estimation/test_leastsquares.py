@@ -59,7 +59,7 @@ def still_joint(name, seed):
     q[:, 1] = 1.0 + rng.uniform(-3e-4, 3e-4, 60)
     seen = measure(faulty(nominal, Cell(), rng), q, rng, 5e-4, oriented=False)
     problem = Problem(nominal, seen)
-    start = start_frames(problem.model, problem.sets, 1e-4, 1e-4, 'none')
+    start = start_frames(replace(problem, loss='none'))
     names = structurally_independent(problem.model, problem.free, problem.kinds)
     return start, names, problem.system(problem.sets)
 
