@@ -18,15 +18,9 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files import loading
 from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.history import (
-    Filing,
-    History,
-    content_hash,
-    measured_at,
-    samples_hash,
-    settings_hash,
-)
+from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.rows import Filing, content_hash, measured_at, samples_hash, settings_hash
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page

@@ -22,8 +22,8 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards
-from calib_ros.files.history import identified as row_of
 from calib_ros.files.loading import Loaded, of_bag, of_table
+from calib_ros.files.rows import identified as row_of
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate, years_since

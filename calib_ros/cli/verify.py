@@ -14,8 +14,8 @@ from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.history import verified
 from calib_ros.files.programs import read_joints
+from calib_ros.files.rows import verified
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash

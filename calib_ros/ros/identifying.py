@@ -27,9 +27,9 @@ from calib_ros.errors import (
 )
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
-from calib_ros.files.history import (
+from calib_ros.files.history import History
+from calib_ros.files.rows import (
     Filing,
-    History,
     Row,
     identified,
     judged,
