@@ -17,8 +17,8 @@ import numpy as np
 import calib_ros
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.verification import Verification
+from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import LONGEST_NAME, ConfigError
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics.chain import Chain

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 import calib_ros
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import Comparison
 from calib_ros.estimation.fitting import ParameterRow
 from calib_ros.report import words
 from calib_ros.settings import Settings

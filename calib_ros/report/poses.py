@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import Comparison
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import SOME_POSES, Observations

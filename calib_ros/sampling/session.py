@@ -10,8 +10,8 @@ from functools import partial
 
 import numpy as np
 
+from calib_ros.decision.comparison import ErrorFigures, compare
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import ErrorFigures, compare
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import Observations

@@ -10,7 +10,7 @@ from verified import in_words
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
-from calib_ros.decision.validation import Comparison, Residuals
+from calib_ros.decision.comparison import Comparison, Residuals
 from calib_ros.files.rows import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
