@@ -15,8 +15,8 @@ from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import common, given
 from calib_ros.cli.identify import RESULT_FILES, Identified, result_files, show
 from calib_ros.cli.screen import Screen
-from calib_ros.files.bags import Recording, write_bag
 from calib_ros.files.loading import of_bag
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain, read_text
 from calib_ros.report import documents, words
