@@ -30,8 +30,9 @@ from calib_ros.report.advice import (
     Situation,
     advice,
 )
+from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
-from calib_ros.report.poses import Poses, explorer
+from calib_ros.report.poses import Poses
 from calib_ros.shown import some
 
 NOT_YET = 'The robot itself is unchanged so far'
