@@ -103,7 +103,6 @@ def _unread(found: Columns, joints: int) -> Iterator[str]:
 
 
 def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
-    """Return the measurements of some sessions."""
     if not len(found.lines):
         measurements(found, joints)  # names missing columns first
         raise InputError(f'{found.path} has no rows')
