@@ -28,8 +28,8 @@ from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.cli.main import main as calib_ros
 from calib_ros.estimation.leastsquares import minimise
-from calib_ros.files.bags import Recording, write_bag
 from calib_ros.files.programs import csv_of
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.se3 import to_quat
 
 CHAIN = load_chain('ur10')

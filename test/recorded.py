@@ -8,7 +8,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import Stores, get_typestore
 
 from calib_ros.apply import simulation
-from calib_ros.files.bags import Recording, replay
+from calib_ros.files.bags import replay
+from calib_ros.files.recording import Recording
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.intake import Stream
 from calib_ros.sampling.messages import JOINT_STATE

@@ -45,7 +45,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 
 from calib_ros.apply.simulation import Cell as SimulatedCell, drive, faulty, measure
-from calib_ros.files.bags import Recording
+from calib_ros.files.recording import Recording
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import advisor as advisor_module, inputs as inputs_module, node as node_module

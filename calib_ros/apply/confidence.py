@@ -31,7 +31,7 @@ from functools import cache
 import numpy as np
 from scipy import optimize, special
 
-from calib_ros.decision.validation import Comparison
+from calib_ros.decision.comparison import Comparison
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.se3 import FloatArray, Index

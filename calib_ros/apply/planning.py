@@ -90,7 +90,6 @@ class _Pick:
         self.chosen: list[int] = []
 
     def best(self, worth: _Worth) -> int:
-        """Return the best candidate not chosen yet."""
         free = np.flatnonzero(self._blocked == 0)
         if not free.size:
             raise InputError(
@@ -106,7 +105,6 @@ class _Pick:
         return int(promising[worth.of(self.information, self._rows[promising]).argmax()])
 
     def add(self, index: int, place: int | None = None) -> None:
-        """Choose a candidate."""
         near = np.abs(self._joints - self._joints[index]).max(axis=1) <= self._apart
         place = len(self.chosen) if place is None else place
         self.chosen.insert(place, index)

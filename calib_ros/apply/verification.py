@@ -31,7 +31,7 @@ from scipy.spatial import cKDTree
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
-from calib_ros.decision.validation import Comparison, compare
+from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.identifiability import excited

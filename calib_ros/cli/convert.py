@@ -10,18 +10,19 @@ import numpy as np
 
 from calib_ros.atomic import write_file
 from calib_ros.cli import common, given
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.bags import Recording, write_bag
 from calib_ros.files.foreign import Foreign, as_csv
 from calib_ros.files.layouts import Layout
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.tables import check_table, read_table, table_text
 from calib_ros.kinematics.chain_file import load_chain
 
 
 def _convert(options: argparse.Namespace, screen: Screen) -> int:
-    given.refuse_others(options.table, 'import', 'table')
+    refuse_others(options.table, 'import', 'table')
     common.refuse_existing(options, options.out)
     chain = None if options.chain is None else load_chain(options.chain)
     foreign = given.foreign_of(options, chain) or Foreign(Layout(), chain)
@@ -38,7 +39,7 @@ def _convert(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
-    given.refuse_others(options.csv, 'csv2bag', 'table')
+    refuse_others(options.csv, 'csv2bag', 'table')
     chain = load_chain(options.chain)
     table = read_table(options.csv, len(chain.joints), common.sessions_of(options))
     if len(table.fitted) != 1 or table.fitted[0].distances is not None or table.pairs:
@@ -58,7 +59,7 @@ def _csv2bag(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
-    given.refuse_others(options.bag, 'bag2csv', 'bag')
+    refuse_others(options.bag, 'bag2csv', 'bag')
     common.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
     session, read = given.replayed(options.bag, chain, common.settings_of(options), screen)

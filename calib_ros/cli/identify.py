@@ -12,24 +12,25 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.cli import common, given
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.decision.changes import reason_in_words
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import Comparison
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards
-from calib_ros.files.history import identified as row_of
 from calib_ros.files.loading import Loaded, of_bag, of_table
+from calib_ros.files.rows import identified as row_of
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
-from calib_ros.report import words
+from calib_ros.report import documents, words
 from calib_ros.report.advice import FAR, GOOD_ARM, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
@@ -42,7 +43,7 @@ from calib_ros.report.reports import (
     somewhere,
     within_tolerance,
 )
-from calib_ros.sampling.sample import with_lenses
+from calib_ros.sampling.gathered import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json
@@ -101,7 +102,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
         problem = loaded.between(previous.frames_of(loaded.owners))
         with screen.work('looking for what has changed'):
             found = recalibrate(previous, problem, years, growth, new)
-        figures = words.figures_document(found.comparison)
+        figures = documents.figures_document(found.comparison)
         text = dump_json(found.document() | figures) + '\n'
         contents['result.json'] = text
         if found.accepted:
@@ -152,7 +153,7 @@ def _interval(judged: Comparison | None) -> tuple[tuple[str, str], ...]:
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     loaded, settings = _loaded(options, screen)
-    configuration = words.configuration_yaml(options.chain, settings)
+    configuration = documents.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
     origin = given.origin_of(options, read, configuration)
     with screen.work('identifying') as work:
@@ -179,7 +180,7 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
 def _source(options: argparse.Namespace) -> str:
     """Return 'bag' or 'table', with the table in `options.csv`, or the bag in `measured`."""
     if options.measured is not None and options.csv is None:
-        bag = given.refuse_others(options.measured, 'identify', 'table', 'bag') == 'bag'
+        bag = refuse_others(options.measured, 'identify', 'table', 'bag') == 'bag'
         if not bag:
             options.csv, options.measured = options.measured, None
     source = 'table' if options.csv or options.detections else 'bag'
@@ -332,7 +333,7 @@ def _with_outliers(judged: Comparison) -> tuple[tuple[str, str], ...]:
 
 
 def _document(found: Identified) -> str:
-    content = words.as_document(found.result, found.loaded.samples)
+    content = documents.as_document(found.result, found.loaded.samples)
     content |= {'warnings': list(found.loaded.warnings), 'tolerance_mm': found.tolerance}
     return dump_json(content | {'origin': found.origin.document()})
 

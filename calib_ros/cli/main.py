@@ -124,7 +124,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
     if name not in TEXTS:
         from pathlib import Path  # slow to load, not needed by the overview
 
-        from calib_ros.cli.given import proposal
+        from calib_ros.cli.kinds import proposal
 
         words = proposal(Path(name))
         if words is None:

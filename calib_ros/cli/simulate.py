@@ -15,11 +15,11 @@ from calib_ros.atomic import whole_folder, write_files
 from calib_ros.cli import common, given
 from calib_ros.cli.identify import RESULT_FILES, Identified, result_files, show
 from calib_ros.cli.screen import Screen
-from calib_ros.files.bags import Recording, write_bag
 from calib_ros.files.loading import of_bag
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain, read_text
-from calib_ros.report import words
+from calib_ros.report import documents, words
 from calib_ros.settings import Settings
 
 
@@ -40,7 +40,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say('2. reading the recording as if from a real cell')
         loaded = of_bag(*given.replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors')
-        configuration = words.configuration_yaml(options.chain, settings)
+        configuration = documents.configuration_yaml(options.chain, settings)
         origin = given.origin_of(options, [bag], configuration)
         with screen.work('identifying') as work:
             found = Identified(loaded, loaded.identified(settings.model, work), origin)

@@ -10,11 +10,12 @@ from dataclasses import replace
 
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, given
+from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.history import verified
 from calib_ros.files.programs import read_joints
+from calib_ros.files.rows import verified
 from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
@@ -28,7 +29,7 @@ from calib_ros.report.verdicts import (
     standing,
     verification_report,
 )
-from calib_ros.sampling.sample import gathered
+from calib_ros.sampling.gathered import gathered
 from calib_ros.shown import rounded
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
@@ -109,7 +110,7 @@ def _sets(
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
     """Return the sets between the calibration's frames of their devices and targets."""
     settings = common.settings_of(options)
-    if given.refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
+    if refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)
     else:
         session, read = given.replayed(options.measured, nominal, settings, screen)

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.comparison import COUNTS, Comparison, log_gain, mean_squares
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step
-from calib_ros.decision.validation import COUNTS, Comparison, log_gain, mean_squares
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem

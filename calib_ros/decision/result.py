@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
 from calib_ros.decision.steps import Step
-from calib_ros.decision.validation import Comparison
 from calib_ros.errors import ConfigError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Posterior

@@ -1,164 +1,26 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Judging a result on held-out poses."""
+"""Judging a result on poses that were not fitted: held out, in folds, or place by place."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-from scipy import special
 
+from calib_ros.decision.comparison import Comparison, Residuals, compare, joined, residuals
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import Fitted
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import System, minimise, without_each
-from calib_ros.estimation.levels import CONFIDENT, TELLING
+from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, distances_of
-from calib_ros.estimation.samples import residual_arrays, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import parameters_of
-from calib_ros.kinematics.se3 import Flags, FloatArray, Index, norms
-from calib_ros.shown import Shown, as_frame, of_them
-
-COUNTS = 0.005
-"""Relative change of an RMS error that counts; less is chance (benchmarks/real_robots.py)."""
-
-
-@dataclass(frozen=True)
-class ErrorFigures:
-    """Figures of position errors over a set of poses."""
-
-    count: int
-    rms_mm: float
-    mean_mm: float
-    max_mm: float
-    mean_plus_3_sigma_mm: float
-    rms_mrad: float | None
-    rms_px: float | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Residuals:
-    """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].
-
-    Both in the world; the rotation is NaN where not measured. `configurations` (N,) are the
-    configuration numbers. For board points the position is the shortest shift that explains the
-    residual in `pixels` (N, 2), which are NaN otherwise.
-    """
-
-    position: FloatArray
-    orientation: FloatArray
-    configurations: Index
-    pixels: FloatArray
-
-    def figures(self, which: Flags) -> ErrorFigures:
-        """Return RMS, mean and maximum over the pairs of a mask (N,)."""
-        parts = self.position, self.orientation, self.pixels
-        distance, angle, away = (norms(part[which]) for part in parts)
-        distance, angle = 1e3 * distance, 1e3 * angle[~np.isnan(angle)]
-        away = away[~np.isnan(away)]
-        return ErrorFigures(
-            len(distance),
-            float(np.sqrt(np.mean(distance**2))),
-            float(distance.mean()),
-            float(distance.max()),
-            float(distance.mean() + 3.0 * distance.std(ddof=int(len(distance) > 1))),
-            float(np.sqrt(np.mean(angle**2))) if angle.size else None,
-            float(np.sqrt(np.mean(away**2))) if away.size else None,
-        )
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Comparison(Shown):
-    """Residuals of the same poses before and after.
-
-    Before is the nominal chain with fitted base and tool frames, so that the gain is the arm's.
-    `judged` (N,) is False for outliers; `repeated` (N,) is True for held-out pairs at fitted
-    configurations, which count nowhere.
-    """
-
-    before: Residuals
-    after: Residuals
-    judged: Flags
-    repeated: Flags | None = None
-
-    @property
-    def counting(self) -> Flags:
-        """Return which pairs (N,) count, with outliers."""
-        return np.ones_like(self.judged) if self.repeated is None else ~self.repeated
-
-    @property
-    def deciding(self) -> Flags:
-        """Return which pairs (N,) are in the figures."""
-        return self.counting & self.judged
-
-    @property
-    def outliers(self) -> int:
-        """Return the number of outliers, which are left out of the figures."""
-        return int((self.counting & ~self.judged).sum())
-
-    @property
-    def share_of_outliers(self) -> float:
-        """Return their share of the pairs that count."""
-        return self.outliers / int(self.counting.sum())
-
-    @property
-    def omitted(self) -> str:
-        """Return in words which pairs are not in the figures."""
-        return f', {of_them(self.outliers, "outlier")} not in the figures' if self.outliers else ''
-
-    @cached_property
-    def figures(self) -> tuple[ErrorFigures, ErrorFigures]:
-        """Return the figures before and after, without outliers."""
-        return self.before.figures(self.deciding), self.after.figures(self.deciding)
-
-    def to_frame(self) -> Any:
-        """Return the position residuals [m] before and after as a pandas.DataFrame."""
-        columns = {
-            f'{when}_{axis}': residuals.position[:, k]
-            for when, residuals in (('before', self.before), ('after', self.after))
-            for k, axis in enumerate('xyz')
-        }
-        groups = {'configuration': self.after.configurations, 'judged': self.deciding}
-        return as_frame(columns | groups)
-
-    @cached_property
-    def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
-        """Return the figures before and after with outliers."""
-        if not self.outliers:
-            return self.figures
-        return self.before.figures(self.counting), self.after.figures(self.counting)
-
-
-def residuals(chain: Chain, observations: Observations) -> Residuals:
-    """Return measured minus predicted for every pair."""
-    pixels = np.full((len(observations), 2), np.nan)
-    if observations.pixels is not None:
-        pixels, position = seen_residuals(chain, observations)
-        orientation = np.full((len(observations), 3), np.nan)
-    else:
-        position, orientation = residual_arrays(chain, observations)
-    if position.shape[1] == 1:  # a distance
-        position = np.pad(position, ((0, 0), (0, 2)))
-    return Residuals(position, orientation, observations.configurations, pixels)
-
-
-def compare(
-    before: Chain, after: Chain, sets: Sequence[Observations], judged: Flags | None = None
-) -> Comparison:
-    """Return the residuals of all sets by both chains; `judged` (N,) is False for outliers."""
-    numbers = np.concatenate(numbered(sets))
-    last, first = (  # `after` first: cached after a fit
-        _joined([residuals(chain, each) for each in sets], numbers) for chain in (after, before)
-    )
-    every = np.ones(len(numbers), dtype=bool)
-    return Comparison(first, last, every if judged is None else judged)
+from calib_ros.kinematics.se3 import Flags, Index
 
 
 def validate(
@@ -250,7 +112,7 @@ def left_out(
             for side, chain in zip(pieces, pair, strict=True):
                 side.append(residuals(chain, out))
     index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
-    before, after = (_joined(side, np.concatenate(groups), index) for side in pieces)
+    before, after = (joined(side, np.concatenate(groups), index) for side in pieces)
     return before, after
 
 
@@ -278,17 +140,6 @@ def _folds(problem: Problem, names: Sequence[str], count: int, rows: int) -> int
     if len(unknown) == len(names) or rows * (folds - 1) // folds < len(unknown) + TELLING:
         return 0
     return folds
-
-
-def _joined(
-    pieces: Sequence[Residuals], configurations: Index, index: Index | slice = slice(None)
-) -> Residuals:
-    return Residuals(
-        np.concatenate([piece.position for piece in pieces])[index],
-        np.concatenate([piece.orientation for piece in pieces])[index],
-        configurations,
-        np.concatenate([piece.pixels for piece in pieces])[index],
-    )
 
 
 def _places(problem: Problem) -> list[set[str]]:
@@ -338,33 +189,7 @@ def _leave_one_place_out(
         for each in problem.sets
     ]
     groups = np.concatenate([np.full(len(each), number[each.base]) for each in problem.sets])
-    first = _joined([part.before for part in parts], groups)
-    second = _joined([part.after for part in parts], groups)
+    first = joined([part.before for part in parts], groups)
+    second = joined([part.after for part in parts], groups)
     judged = Comparison(first, second, ~fitted.robust.outliers)
     return judged, f'leaving out one of {len(places)} places at a time{judged.omitted}'
-
-
-def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:
-    """Return the mean squared errors (2, K) of K configurations, for errors (N, 3) of pairs."""
-    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
-    known = ~np.isnan(squares).any(axis=0)
-    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
-    return np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
-
-
-def log_gain(
-    before: FloatArray, after: FloatArray, configurations: Index, confidence: float = CONFIDENT
-) -> tuple[float, float]:
-    """Return the log of RMS before / RMS after, and its size that chance could cause.
-
-    Errors are (N, 3). The standard error is that of the difference of the two logarithms by the
-    delta method, from the spread over configurations, because pairs of one are not independent.
-    """
-    means = mean_squares(before, after, configurations)
-    count = means.shape[1]
-    if count < 2:
-        return 0.0, np.inf
-    totals = np.maximum(means.mean(axis=1, keepdims=True), 1e-300)
-    deviation = np.diff(means / totals, axis=0).std(ddof=1)
-    limit = special.stdtrit(count - 1, confidence) * deviation / np.sqrt(count)
-    return 0.5 * float(np.log(totals[0, 0] / totals[1, 0])), 0.5 * float(limit)

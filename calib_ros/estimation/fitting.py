@@ -132,8 +132,7 @@ def fit(problem: Problem, simpler: Simpler | None = None) -> tuple[tuple[str, ..
         model, problem.free, problem.kinds, separations
     )
     _require_enough(problem, [name for name in structural if name not in problem.prior_sigmas])
-    sigmas = (problem.sigma_position, problem.sigma_orientation)
-    start = start_frames(model, problem.sets, *sigmas, problem.loss)
+    start = start_frames(problem)
     names, factor = _excited_names(problem, structural, start)
     fitted = _fit_all(problem, names, start, factor, simpler)
     held = tuple(name for name in held if name not in names)  # unless a prior tells them

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from calib_ros.estimation.identifiability import DEGENERATE, excited, structurally_independent
 from calib_ros.estimation.leastsquares import System, factor_of, minimise, normal_equations
 from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.robust import robust_fit, thorough_fit
 from calib_ros.estimation.samples import Samples, residual_arrays
@@ -31,19 +32,14 @@ from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
 
 
-def start_frames(
-    chain: Chain,
-    sets: Sequence[Observations],
-    sigma_position: float,
-    sigma_orientation: float,
-    loss: str,
-) -> Chain:
-    """Return the chain with base and tool frames that bring it close to the measurements.
+def start_frames(problem: Problem) -> Chain:
+    """Return the model with base and tool frames that bring it close to the measurements.
 
     Sets are processed in order; frames found by earlier sets are kept.
     """
+    chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()
-    for observations in sets:
+    for observations in problem.sets:
         placed = {name: replace(chain.frame(name), fixed=True) for name in found}
         known = {**chain.all_frames, **placed}
         base, tool = observations.base, observations.tool
@@ -53,7 +49,7 @@ def start_frames(
             lens = require_lens(view.frame(alone.camera).lens, alone.camera)
             share = -(-(int(alone.images[-1]) + 1) // SOME_POSES)
             alone = board_poses(alone.select(alone.images % share == 0), lens)
-        view = _start_one(view, alone, (sigma_position, sigma_orientation), loss)
+        view = _start_one(view, alone, sigmas, problem.loss)
         for key, name in (('base', base), ('tool', tool)):
             frame = replace(view.frame(key), fixed=chain.frame(name).fixed)
             chain = chain.with_frame(name, frame)

@@ -34,7 +34,7 @@ IRREGULAR = (b'"', b'\r', b'\0')  # characters that need the csv module
 
 
 @dataclass(frozen=True, eq=False)
-class TextColumns(Columns):
+class _TextColumns(Columns):
     """The columns of a regular text: cells are what is between separators."""
 
     _separator: str
@@ -43,18 +43,15 @@ class TextColumns(Columns):
     """Ends of the cells (N, C) in the text; each starts after the end of the one before."""
 
     def blank(self, name: str) -> Flags:
-        """Return (N,) which cells of a column are empty."""
         begins, ends = self._places(name)
         return np.asarray(begins == ends)
 
     def texts(self, name: str) -> list[str]:
-        """Return the cells of a column."""
         begins, ends = self._places(name)
         data, places = self._data, zip(begins.tolist(), ends.tolist(), strict=True)
         return [data[begin:end].decode() for begin, end in places]
 
-    def select(self, rows: NDArray[np.generic] | slice) -> TextColumns:
-        """Return some rows, by a mask (N,), indices (K,) or a slice."""
+    def select(self, rows: NDArray[np.generic] | slice) -> Columns:
         index, width = np.arange(len(self.lines))[rows], len(self.header)
         begins, ends = self._ends[:-1:width][index] + 1, self._ends[width::width][index]
         places = zip(begins.tolist(), ends.tolist(), strict=True)
@@ -64,7 +61,6 @@ class TextColumns(Columns):
         return replace(found, lines=self.lines[index])
 
     def codes(self, name: str) -> Codes:
-        """Return the code (N,) of each row's text, and the texts."""
         starts, ends = self._places(name)
         longest = int((ends - starts).max(initial=0))
         if longest == 0:
@@ -141,7 +137,7 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
 
 def regular(
     path: Path, data: bytes, separator: str = ',', header: Sequence[str] = (), above: int = 0
-) -> TextColumns | None:
+) -> Columns | None:
     """Return the columns of a text, None if irregular.
 
     Its first line is the header unless one is given; `above` lines of the file precede it.
@@ -168,7 +164,7 @@ def regular(
     if ends is None:
         return None
     lines = above + 1 + int(begin > 0) + np.arange((len(ends) - 1) // width)
-    return TextColumns(path, names, lines, separator, data, ends)
+    return _TextColumns(path, names, lines, separator, data, ends)
 
 
 def _ends(data: bytes, begin: int, separator: str, width: int) -> NDArray[np.int32] | None:

@@ -182,11 +182,9 @@ class _Table:
 
     @property
     def header(self) -> tuple[str, ...]:
-        """Return the names of its columns."""
         return tuple(filter(None, self._sheet.header))
 
     def words(self) -> dict[str, list[str]]:
-        """Return the text columns."""
         found = {}
         for ours in WORDS:
             if ours in self._ours:

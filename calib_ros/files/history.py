@@ -10,14 +10,10 @@ any time.
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 import secrets
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
-from datetime import datetime, timezone
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -25,201 +21,13 @@ from urllib.parse import quote, unquote
 
 import numpy as np
 
-import calib_ros
-from calib_ros.apply.confidence import interval_of
-from calib_ros.apply.verification import Verification
 from calib_ros.atomic import write_file
-from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import ErrorFigures
-from calib_ros.errors import LONGEST_NAME, CalibrationError, ConfigError, InputError
-from calib_ros.estimation.observations import Observations
-from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import chain_document, parse_chain
-from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.settings import Settings
-from calib_ros.shown import Shown
-from calib_ros.values import parse_name
+from calib_ros.errors import CalibrationError, ConfigError, InputError
+from calib_ros.files.rows import Row
 
 MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
 AWAY = 'move it away, and its work is repeated'
-
-
-@dataclass(frozen=True)
-class Filing:
-    """Robot, time and source of a filed result."""
-
-    serial: str
-    time: datetime
-    inputs: str  # a hash
-    settings: str  # a hash
-    source: str = ''
-    fingerprint: str = ''  # cheap test that the source is unchanged
-
-    def __post_init__(self) -> None:
-        parse_serial(self.serial, 'the serial number')
-
-
-def parse_serial(value: object, where: str) -> str:
-    """Return a serial number that can name a folder; errors name it `where`."""
-    if not isinstance(value, str) or value in ('', '.', '..'):
-        raise ConfigError(f'{where} must be text ("0042" in quotes), not {value!r}')
-    if len(quote(parse_name(value, where), safe='')) > LONGEST_NAME:
-        raise ConfigError(f'{where} is too long to name a folder: {value}')
-    return value
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Row(Shown):
-    """A filed result; docs/fleet.md describes the columns.
-
-    Figures are in mm and mrad; offsets and covariance (P, P) of the parameters `names` in m and
-    rad.
-    """
-
-    serial: str
-    kind: str
-    time: datetime
-    verdict: str
-    inputs: str
-    settings: str
-    source: str = ''
-    fingerprint: str = ''
-    software: str = calib_ros.__version__
-    filed: datetime = field(default_factory=lambda: datetime.now(timezone.utc))
-    model: str = ''
-    reasons: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    poses: int = 0
-    rms_before_mm: float | None = None
-    rms_mm: float | None = None
-    lower_mm: float | None = None
-    upper_mm: float | None = None
-    mean_mm: float | None = None
-    max_mm: float | None = None
-    rms_mrad: float | None = None
-    rms_freedom: float | None = None
-    freedom: float | None = None
-    names: tuple[str, ...] = ()
-    offsets: FloatArray = field(default_factory=lambda: np.zeros(0))
-    covariance: FloatArray = field(default_factory=lambda: np.zeros(0))
-    chain: str = ''
-
-    @property
-    def key(self) -> str:
-        """Return the name of the result: the same for the same work."""
-        return digest([self.serial, self.kind, self.inputs, self.settings, self.software])
-
-    @property
-    def accepted(self) -> bool:
-        """Tell whether it is an accepted identification."""
-        return self.verdict == 'accepted'
-
-    def corrected(self) -> Chain:
-        """Return the corrected chain with its frames."""
-        return parse_chain(self.chain, f'the chain of {self.serial} in the history')
-
-
-def digest(content: object) -> str:
-    """Return the SHA-256 of plain values."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
-
-
-def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
-    """Return the hash of what a result depends on besides the measurements."""
-    return digest([chain_document(nominal), asdict(settings), *more])
-
-
-def content_hash(files: Sequence[str], session: str = '') -> str:
-    """Return the hash of files, by their own hashes, or of a session in them."""
-    return digest([session, *sorted(files)])
-
-
-def samples_hash(sets: Sequence[Observations]) -> str:
-    """Return the hash of samples without a file, by all that was measured."""
-    found = hashlib.sha256()
-    for each in sets:
-        for part in fields(each):
-            value = getattr(each, part.name)
-            data = value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-            found.update(data)
-    return found.hexdigest()
-
-
-def is_time(stamp_ns: int) -> bool:
-    """Tell whether a stamp is a time (from 1973), not since a start or from lines."""
-    return stamp_ns >= 10**17
-
-
-def measured_at(sets: Sequence[Observations], otherwise: datetime | None = None) -> datetime:
-    """Return the time of the last pose, or `otherwise` if stamps are no times."""
-    last = max((int(each.stamps_ns.max()) for each in sets if len(each)), default=0)
-    if not is_time(last):
-        return otherwise or datetime.now(timezone.utc)
-    return datetime.fromtimestamp(last / 1e9, timezone.utc)
-
-
-def identified(result: Identification, about: Filing, warnings: Sequence[str] = ()) -> Row:
-    """Return the row of an identification; `warnings` are of the measurements."""
-    offsets = {str(each.name): each.offset for each in result.parameters}
-    names = tuple(map(str, result.names))
-    which = result.validation or result.fitted
-    freedom = result.uncertainty.overall
-    return _row(
-        about,
-        'identify',
-        result.chain,
-        'accepted' if result.accepted else 'refused',
-        which.figures,
-        interval_of(which, 1),
-        reasons=tuple(map(str, result.refusals)),
-        remarks=tuple(map(str, (*warnings, *result.remarks))),
-        freedom=freedom if np.isfinite(freedom) else None,
-        names=names,
-        offsets=np.array([offsets[name] for name in names]),
-        covariance=result.covariance,
-    )
-
-
-def judged(
-    chain: Chain, before: ErrorFigures | None, after: ErrorFigures, verdict: str, about: Filing
-) -> Row:
-    """Return the row of a validation: a calibration on later poses."""
-    return _row(about, 'validate', chain, verdict, (before, after))
-
-
-def verified(chain: Chain, found: Verification, about: Filing) -> Row:
-    """Return the row of a verification; without freedom, and so in no chart, of fitted poses."""
-    before, after = found.comparison.figures
-    figures = before, replace(after, rms_mm=1e3 * found.rms)
-    limits = found.lower, found.upper
-    freedom = None if found.reused else found.freedom
-    return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=freedom)
-
-
-def _row(
-    about: Filing,
-    kind: str,
-    chain: Chain,
-    verdict: str,
-    figures: tuple[ErrorFigures | None, ErrorFigures],
-    limits: tuple[float, float] | None = None,
-    **more: Any,
-) -> Row:
-    before, after = figures
-    more |= {name: getattr(after, name) for name in ('rms_mm', 'mean_mm', 'max_mm', 'rms_mrad')}
-    if limits is not None and np.isfinite(limits).all():
-        more |= {'lower_mm': 1e3 * limits[0], 'upper_mm': 1e3 * limits[1]}
-    return Row(
-        **asdict(about),
-        kind=kind,
-        model=chain.name,
-        chain=json.dumps(chain_document(chain)),
-        verdict=verdict,
-        poses=after.count,
-        rms_before_mm=None if before is None else before.rms_mm,
-        **more,
-    )
 
 
 class History:

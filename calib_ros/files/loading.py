@@ -22,7 +22,8 @@ from calib_ros.identification.identification import identify_model
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.sample import Gathered, named
+from calib_ros.sampling.gathered import Gathered
+from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 

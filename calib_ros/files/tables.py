@@ -47,7 +47,8 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.sample import Gathered, Sample, View, gathered
+from calib_ros.sampling.gathered import Gathered, gathered
+from calib_ros.sampling.sample import Sample, View
 from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
@@ -102,7 +103,6 @@ def _unread(found: Columns, joints: int) -> Iterator[str]:
 
 
 def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:
-    """Return the measurements of some sessions."""
     if not len(found.lines):
         measurements(found, joints)  # names missing columns first
         raise InputError(f'{found.path} has no rows')

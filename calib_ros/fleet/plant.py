@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
-from calib_ros.files.history import parse_serial, settings_hash
+from calib_ros.files.rows import parse_serial, settings_hash
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.settings import EXCEPTION, Settings

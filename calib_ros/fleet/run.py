@@ -20,7 +20,8 @@ from urllib.parse import quote
 import calib_ros
 from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, shortened, trouble
-from calib_ros.files.history import History, Row
+from calib_ros.files.history import History
+from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.work import Outcome, Task, sources, work
 from calib_ros.progress import Notify, quiet

@@ -17,7 +17,8 @@ import calib_ros
 from calib_ros.apply.confidence import Drift, drift
 from calib_ros.atomic import write_file
 from calib_ros.errors import MOST_ENTRIES, CalibrationError
-from calib_ros.files.history import History, Row
+from calib_ros.files.history import History
+from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, page_path, results, too_late, verifications
 from calib_ros.fleet.watch import Change, Watched, watch

@@ -41,7 +41,7 @@ from calib_ros.decision.changes import (
     reason_in_words,
 )
 from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
-from calib_ros.files.history import Row
+from calib_ros.files.rows import Row
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import some

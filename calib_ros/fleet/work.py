@@ -14,21 +14,14 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, shortened
-from calib_ros.files.history import (
-    Filing,
-    Row,
-    content_hash,
-    digest,
-    identified,
-    is_local,
-    measured_at,
-)
+from calib_ros.files.history import is_local
 from calib_ros.files.loading import TABLES, of_bag, of_table, replayed, table
+from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
 from calib_ros.fleet.plant import Robot
+from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, inputs_of, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
-from calib_ros.report.words import configuration_yaml
 
 DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
 SUMS = ('ETag', 'etag', 'CRC')  # names of checksums in file systems

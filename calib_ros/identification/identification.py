@@ -19,13 +19,14 @@ import numpy as np
 
 from calib_ros.decision import mistakes, suspicions
 from calib_ros.decision.acceptance import refusals, remarks
+from calib_ros.decision.comparison import compare
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, lacking, outliers_of
 from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded, rounding_errors
 from calib_ros.decision.steps import find_step
-from calib_ros.decision.validation import compare, validate
+from calib_ros.decision.validation import validate
 from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import distinct

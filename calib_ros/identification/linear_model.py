@@ -16,9 +16,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
+from calib_ros.decision.comparison import COUNTS, log_gain
 from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import COUNTS, log_gain
 from calib_ros.estimation.evidence import group_of
 from calib_ros.estimation.leastsquares import Folds, System, gram, owners, products_of, stacked
 from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE

@@ -9,7 +9,7 @@ from typing import Any
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Explanation
-from calib_ros.decision.validation import Comparison, ErrorFigures
+from calib_ros.decision.comparison import Comparison, ErrorFigures
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import reused_in_words

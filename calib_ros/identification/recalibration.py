@@ -23,7 +23,8 @@ import numpy as np
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
-from calib_ros.decision.validation import Comparison, left_out, residuals
+from calib_ros.decision.comparison import Comparison, residuals
+from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import Tilts, products_with_doubts

@@ -266,5 +266,4 @@ class _Task(NamedTuple):
     start: FloatArray
 
     def select(self, index: Index) -> _Task:
-        """Return some of the samples."""
         return _Task._make(None if each is None else each[..., index] for each in self)

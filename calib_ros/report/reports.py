@@ -11,9 +11,9 @@ import numpy as np
 
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.workspace import survey
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import Comparison
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
@@ -30,8 +30,9 @@ from calib_ros.report.advice import (
     Situation,
     advice,
 )
+from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
-from calib_ros.report.poses import Poses, explorer
+from calib_ros.report.poses import Poses
 from calib_ros.shown import some
 
 NOT_YET = 'The robot itself is unchanged so far'

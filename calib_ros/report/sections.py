@@ -12,8 +12,8 @@ from datetime import datetime, timezone
 import numpy as np
 
 import calib_ros
-from calib_ros.decision.validation import Comparison, ErrorFigures
-from calib_ros.files.history import is_time
+from calib_ros.decision.comparison import Comparison, ErrorFigures
+from calib_ros.files.rows import is_time
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, words

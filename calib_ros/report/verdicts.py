@@ -14,8 +14,9 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import sections
 from calib_ros.report.advice import SPREAD_OUT
+from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
-from calib_ros.report.poses import Poses, explorer
+from calib_ros.report.poses import Poses
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
 from calib_ros.shown import rounded

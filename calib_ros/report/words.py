@@ -1,24 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A result as text: a line for the operator, phrases for pages, JSON."""
+"""A result in words: a line for the operator, and phrases for screens and pages."""
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
-import calib_ros
 from calib_ros.apply.confidence import interval_of
 from calib_ros.decision.changes import FALSE, changes_in_words
+from calib_ros.decision.comparison import Comparison, ErrorFigures
 from calib_ros.decision.misfits import Outlier
-from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import Comparison, ErrorFigures
-from calib_ros.estimation.fitting import ParameterRow
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise
 from calib_ros.identification.calibration import Calibration
@@ -30,7 +24,6 @@ from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
 from calib_ros.shown import rounded, some
-from calib_ros.texts import dump_yaml
 
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
@@ -152,14 +145,6 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     )
 
 
-def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
-    """Return settings and `more` as a parameter file that repeats the run in a node."""
-    parameters: dict[str, Any] = {'chain': chain, **more}
-    for name, value in asdict(settings).items():
-        parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
-    return dump_yaml({'/**': {'ros__parameters': parameters}})
-
-
 def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, and why."""
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
@@ -199,78 +184,6 @@ def _lost(calibration: Calibration, text: str) -> str:
         f'the calibration no longer holds: {text}; it had '
         f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, target or robot moved?'
     )
-
-
-def figures_document(which: Comparison, intervals: bool = True) -> dict[str, Any]:
-    """Return the figures before and after, with the intervals of the RMS if wanted."""
-    found = dict(zip(('before', 'after'), map(asdict, which.figures), strict=True))
-    for when, rms in enumerate(found.values() if intervals else ()):
-        rms['rms_lower_mm'], rms['rms_upper_mm'] = limits_mm(which, when) or (None, None)
-    return found
-
-
-def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
-    """Return the result as a JSON document; `samples` is the account of the input."""
-
-    def comparison(which: Comparison) -> dict[str, Any]:
-        found = figures_document(which, which is judged) | {'outliers': which.outliers}
-        return found | {'after_with_outliers': asdict(which.figures_of_all[1])}
-
-    def parameter(p: ParameterRow) -> dict[str, Any]:
-        found = {'value': p.value, 'offset': p.offset, 'std': p.std}
-        found['half_width_95'] = p.half_width()
-        return found | {'unit': p.name.unit, 'status': p.status}
-
-    judged = result.validation
-    by = {'by': result.validated_by}
-    lower = [row[: k + 1] for k, row in enumerate(result.covariance.tolist())]
-    return {
-        'converged': result.converged,
-        'accepted': result.accepted,
-        'refusals': list(result.refusals),
-        'remarks': list(result.remarks),
-        'iterations': result.iterations,
-        'rank': result.rank,
-        'unidentifiable': list(result.unidentifiable),
-        'not_excited': list(result.not_excited),
-        'weakly_determined': list(weakly_determined(result)),
-        'held_near_nominal': list(result.weak),
-        'parameters': {p.name: parameter(p) for p in result.parameters},
-        'fitted': comparison(result.fitted),
-        'validation': None if judged is None else by | comparison(judged),
-        'before_is': BEFORE,
-        'noise_in_sigma': asdict(result.noise),
-        'chance_of_gain': result.chance,
-        'outliers': [asdict(outlier) for outlier in result.outliers],
-        'gauges': result.gauges,
-        'covariance': {
-            'names': list(result.names),
-            'lower': [[float(f'{x:.9e}') for x in row] for row in lower],
-        },
-        'correlated': [list(pair) for pair in result.correlated()],
-        'observability': asdict(result.observability),
-        'predicted_sigma_mm': sigma_over_range(result),
-        'sizes': dict(result.posterior.sizes),
-        'unmodelled': dict(zip(('turns', 'tilts'), result.posterior.unmodelled, strict=True)),
-        'region': None if result.region is None else region_figures(result.region),
-        'priors': result.priors,
-        'effects': dict(result.chain.effects),
-        'verdicts': [asdict(verdict) for verdict in result.verdicts],
-        'step': None if result.step is None else asdict(result.step),
-        'samples': samples,
-        'robot': result.chain.name,
-        'versions': {
-            'calib_ros': calib_ros.__version__,
-            'python': platform.python_version(),
-            'numpy': np.__version__,
-        },
-    }
-
-
-def region_figures(region: Region) -> dict[str, Any]:
-    """Return the region in figures; the limit is None for everywhere."""
-    limit = None if region.whole else 1e3 * region.limit
-    return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
 
 
 BEFORE = 'the nominal chain with its base and tool frames fitted to the same measurements'

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
+from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import ErrorFigures
 from calib_ros.errors import (
     LONGEST,
     CalibrationError,
@@ -27,9 +27,9 @@ from calib_ros.errors import (
 )
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
-from calib_ros.files.history import (
+from calib_ros.files.history import History
+from calib_ros.files.rows import (
     Filing,
-    History,
     Row,
     identified,
     judged,

@@ -35,7 +35,7 @@ from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate, years_since
-from calib_ros.report import words
+from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
 from calib_ros.ros.diagnostics import Diagnostics
@@ -44,9 +44,10 @@ from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.to_ros import LATCHED
+from calib_ros.sampling.gathered import check_settings
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.sample import Sample, check_settings
+from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
@@ -160,7 +161,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         given = self._given
         more = {**given.links, 'serial': given.serial}
         more = {name: value for name, value in more.items() if value}
-        return words.configuration_yaml(given.chain, self.session.settings, **more)
+        return documents.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
         """Refuse settings that no identification could use, and forbidden files."""

@@ -161,13 +161,11 @@ class _Reader:
         self.named: list[slice] = []
 
     def stamp(self) -> int:
-        """Return a stamp [ns]."""
         seconds, nanoseconds = struct.unpack_from(f'{self._order}iI', self._blob, self.at)
         self.at += 8
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def integer(self) -> int:
-        """Return a count."""
         begin = _aligned(self.at, 4)
         self.at = begin + 4
         self.named.append(slice(begin, self.at))

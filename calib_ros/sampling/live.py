@@ -44,7 +44,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
-from calib_ros.sampling.sample import Frames, Sample, collect
+from calib_ros.sampling.gathered import collect
+from calib_ros.sampling.sample import Frames, Sample
 from calib_ros.settings import EXCEPTION, Settings
 
 WIDE = (Settings.largest_length / 5.0, Settings.largest_angle / 5.0)
@@ -155,7 +156,7 @@ class LiveEstimate:
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
         try:
             self._names = structurally_independent(model, problem.free, problem.kinds)
-            chain = start_frames(model, problem.sets, *self._sigmas, problem.loss)
+            chain = start_frames(problem)
         except (CalibrationError, np.linalg.LinAlgError):
             return False
         wide: dict[str, float] = {

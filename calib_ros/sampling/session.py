@@ -10,8 +10,8 @@ from functools import partial
 
 import numpy as np
 
+from calib_ros.decision.comparison import ErrorFigures, compare
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import ErrorFigures, compare
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import Observations
@@ -21,20 +21,18 @@ from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
+from calib_ros.sampling.gathered import (
+    check_joint_names,
+    check_settings,
+    in_frames_of,
+    problem_of,
+    problem_since,
+)
 from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
-from calib_ros.sampling.sample import (
-    Sample,
-    check_joint_names,
-    check_settings,
-    in_frames_of,
-    named,
-    problem_of,
-    problem_since,
-    socket_place,
-)
+from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
 

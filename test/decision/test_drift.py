@@ -19,7 +19,8 @@ from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import start_frames
 from calib_ros.identification.identification import identify, identify_model
-from calib_ros.report.words import as_document, chance_in_words
+from calib_ros.report.documents import as_document
+from calib_ros.report.words import chance_in_words
 
 DRIFTS = ('fading', 'walk', 'swing', 'ramp')
 
@@ -84,8 +85,8 @@ def test_the_chance_is_uniform_where_there_is_nothing_to_gain():
         kind = ('fading', 'none')[seed % 2]
         seen = session(seed, 0.0, kind, count=60, width=None)
         known = frames if seen.oriented.all() else frames[:9]
-        system = Problem(UR10E, seen, **SIGMAS).system([seen])
-        start = start_frames(UR10E, [seen], *NOISE, 'none')
+        problem = Problem(UR10E, seen, loss='none', **SIGMAS)
+        system, start = problem.system([seen]), start_frames(problem)
         before = minimise(start, known, system).chain
         found.append(chance_of_gain(before, known, arm, system))
     chances = np.array(found)

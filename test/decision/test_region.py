@@ -15,7 +15,8 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.report.words import as_document, summary
+from calib_ros.report.documents import as_document
+from calib_ros.report.words import summary
 
 pytestmark = pytest.mark.usefixtures('unsearched')
 HOME = np.array([0.3, -1.2, 1.4, -0.5, 0.9, 0.2])

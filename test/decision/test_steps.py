@@ -18,7 +18,8 @@ from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics import se3
-from calib_ros.report.words import as_document, remarks
+from calib_ros.report.documents import as_document
+from calib_ros.report.words import remarks
 
 COUNT, AT = 60, 26
 DESIGNS = ('random', 'path', 'sweep')

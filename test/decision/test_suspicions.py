@@ -13,7 +13,8 @@ from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, meas
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.suspicions import _common, _motion, scale_of
 from calib_ros.kinematics.chain import Frame, Joint
-from calib_ros.report.words import as_document, summary
+from calib_ros.report.documents import as_document
+from calib_ros.report.words import summary
 
 UR = load_chain('ur10e')
 GRAVITY = {

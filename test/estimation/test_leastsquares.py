@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.validation import residuals
+from calib_ros.decision.comparison import residuals
 from calib_ros.estimation import leastsquares
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import (
@@ -59,7 +59,7 @@ def still_joint(name, seed):
     q[:, 1] = 1.0 + rng.uniform(-3e-4, 3e-4, 60)
     seen = measure(faulty(nominal, Cell(), rng), q, rng, 5e-4, oriented=False)
     problem = Problem(nominal, seen)
-    start = start_frames(problem.model, problem.sets, 1e-4, 1e-4, 'none')
+    start = start_frames(replace(problem, loss='none'))
     names = structurally_independent(problem.model, problem.free, problem.kinds)
     return start, names, problem.system(problem.sets)
 

@@ -14,7 +14,8 @@ from calib_ros.estimation import samples as samples_module, shared_errors
 from calib_ros.estimation.leastsquares import System, minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
-from calib_ros.report.words import as_document, neighbours_in_words
+from calib_ros.report.documents import as_document
+from calib_ros.report.words import neighbours_in_words
 
 
 def fading(count, length, rng):

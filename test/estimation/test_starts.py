@@ -136,7 +136,7 @@ def test_frames_anywhere_need_no_guess_even_of_six_poses(seed, oriented):
     true = faulty(UR10E, Cell(), rng)
     true = replace(true, base=random_frame(rng, 3.0), tool=random_frame(rng, 0.3))
     seen = measure(true, UR10E.random_joints(6, rng), rng, 1e-4, 1e-3, oriented)
-    found = start_frames(UR10E, [seen], 1e-4, 1e-3, 'redescending')
+    found = start_frames(Problem(UR10E, seen, sigma_position=1e-4, sigma_orientation=1e-3))
     left = norms(found.forward(seen.joints)[:, :3, 3] - seen.positions)
     assert np.median(left) < 0.01  # what the errors of the arm leave
 
@@ -231,8 +231,7 @@ def test_distances_start_right_among_gross_errors_that_agree():
     distances = np.linalg.norm(seen.positions, axis=1)
     distances[::3] += 0.3
     wires = replace(seen, distances=distances)
-    problem = Problem(UR10E, wires)
-    found = start_frames(problem.model, problem.sets, 1e-4, 1e-4, problem.loss)
+    found = start_frames(Problem(UR10E, wires))
     left = np.linalg.norm(found.forward(q)[:, :3, 3], axis=1) - distances
     assert np.median(np.abs(left)) < 2e-3
     np.testing.assert_allclose(found.base.matrix[:3, :3], np.eye(3))  # no distance tells a turn
@@ -250,7 +249,7 @@ def test_distances_place_an_arm_that_moves_in_a_plane(height, rng):
     true = replace(nominal, base=Frame(base), tool=Frame(tool))
     seen = measure(true, nominal.random_joints(60, rng), rng)
     wires = replace(seen, distances=np.linalg.norm(seen.positions, axis=1))
-    found = start_frames(nominal, [wires], 1e-4, 1e-4 / 0.3, 'redescending')
+    found = start_frames(Problem(nominal, wires))
     q = nominal.random_joints(50, rng)
     left = [np.linalg.norm(each.forward(q)[:, :3, 3], axis=1) for each in (found, true)]
     np.testing.assert_allclose(*left, rtol=0.0, atol=1e-5)

@@ -28,7 +28,8 @@ from recorded import (
 from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
-from calib_ros.files.bags import replay, write_bag
+from calib_ros.files.bags import replay
+from calib_ros.files.recording import write_bag
 from calib_ros.sampling import intake
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession

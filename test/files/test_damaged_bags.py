@@ -24,7 +24,7 @@ from recorded import (
 from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
-from calib_ros.files.bags import write_bag
+from calib_ros.files.recording import write_bag
 from calib_ros.settings import STORAGES
 
 

@@ -13,15 +13,8 @@ import pytest
 from calib_ros import Problem, Settings, identify, load_chain
 from calib_ros.apply import simulation
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.history import (
-    Filing,
-    History,
-    Row,
-    identified,
-    measured_at,
-    samples_hash,
-    settings_hash,
-)
+from calib_ros.files.history import History
+from calib_ros.files.rows import Filing, Row, identified, measured_at, samples_hash, settings_hash
 
 CHAIN = load_chain('ur10e')
 BEGIN = datetime(2026, 1, 31, 23, 30, 0, 123_456, timezone.utc)

@@ -14,7 +14,8 @@ from killed import every_kill, forked, status_of
 from measured import measured
 
 from calib_ros.cli import identify, main
-from calib_ros.files.bags import Recording, replay, write_bag
+from calib_ros.files.bags import replay
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings

@@ -11,7 +11,8 @@ import pytest
 
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.bags import Recording, Replayed, replay, write_bag
+from calib_ros.files.bags import Replayed, replay
+from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.stored import recorded
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.session import CalibrationSession

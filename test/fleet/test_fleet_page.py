@@ -10,7 +10,7 @@ import plants
 
 from calib_ros.apply.confidence import drift
 from calib_ros.decision.changes import Explanation
-from calib_ros.files.history import Row
+from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Pattern, Robot
 from calib_ros.fleet.run import Run
 from calib_ros.fleet.standing import STATES, Standing, counts, page_of

@@ -10,7 +10,8 @@ import pytest
 from distributed import LocalCluster
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.history import History, Row
+from calib_ros.files.history import History
+from calib_ros.files.rows import Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications

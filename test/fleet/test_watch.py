@@ -12,7 +12,7 @@ import pytest
 
 from calib_ros.apply import simulation
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.history import Filing, identified
+from calib_ros.files.rows import Filing, identified
 from calib_ros.fleet.watch import watch
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import chain_document, load_chain

@@ -22,7 +22,8 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import as_document, summary
+from calib_ros.report.documents import as_document
+from calib_ros.report.words import summary
 
 EXAMPLES = int(os.environ.get('AWKWARD', '15'))
 MOST = 40

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from fits import UR10E, measured_arm
 
+from calib_ros.decision.comparison import log_gain
 from calib_ros.decision.drift import Shifts
-from calib_ros.decision.validation import log_gain
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.identification import linear_model

@@ -17,7 +17,7 @@ from calib_ros.cli.main import main
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report import poses
+from calib_ros.report import explorer
 from calib_ros.report.page import render
 
 pytestmark = pytest.mark.skipif(
@@ -268,7 +268,7 @@ def test_the_first_printed_page_is_the_certificate(wide):
 
 def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
     """They are shown as cells and bands."""
-    monkeypatch.setattr(poses, 'SINGLE', 30)
+    monkeypatch.setattr(explorer, 'SINGLE', 30)
     rows = measured(chain=load_chain('ur5e'), count=40)
     noise = np.random.default_rng(3).normal(0, 1e-3, (40, 3))
     problem = Problem(load_chain('ur5e'), replace(rows, positions=rows.positions + noise))

@@ -12,7 +12,7 @@ from plotly import graph_objects
 
 from calib_ros import Observations, Settings, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
-from calib_ros.decision.validation import compare
+from calib_ros.decision.comparison import compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.effects import Verdict

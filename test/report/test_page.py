@@ -21,12 +21,14 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import workspace_report
+from calib_ros.report.documents import as_document
+from calib_ros.report.explorer import SINGLE, WORST, explorer
 from calib_ros.report.page import Input, Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
-from calib_ros.report.poses import JUDGED, SINGLE, WORST, explorer, poses_of, poses_to_verify
+from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
 from calib_ros.report.verdicts import verification_report
-from calib_ros.report.words import as_document, limits_mm, summary
+from calib_ros.report.words import limits_mm, summary
 
 HOSTILE = '<script>alert(1)</script>"\'&</script><!--'
 
@@ -223,7 +225,7 @@ def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     problem, result = solved
     poses = poses_of(problem, result)
-    monkeypatch.setattr('calib_ros.report.poses.SINGLE', 30)
+    monkeypatch.setattr('calib_ros.report.explorer.SINGLE', 30)
     shown = explorer(result.chain, poses)
     good = ~poses.outlier
     assert sum(shown['cells']['count']) == good.sum()

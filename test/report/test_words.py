@@ -10,8 +10,8 @@ from verified import in_words
 
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
-from calib_ros.decision.validation import Comparison, Residuals
-from calib_ros.files.history import Filing, verified
+from calib_ros.decision.comparison import Comparison, Residuals
+from calib_ros.files.rows import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration

@@ -30,7 +30,8 @@ from std_msgs.msg import Float64MultiArray, String
 
 from calib_ros.apply.simulation import Cell as SimulatedCell, faulty, measure
 from calib_ros.cli.main import main
-from calib_ros.files.bags import replay, write_bag
+from calib_ros.files.bags import replay
+from calib_ros.files.recording import write_bag
 from calib_ros.kinematics.chain_file import calibration_record, load_chain, parse_chain
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.topics import outputs

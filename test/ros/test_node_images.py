@@ -23,8 +23,9 @@ from calib_ros.apply.simulation import (
     photograph,
 )
 from calib_ros.errors import CalibrationError, ConfigError
-from calib_ros.files.bags import Recording, replay
+from calib_ros.files.bags import replay
 from calib_ros.files.cameras import cameras_of, grey, lens_in
+from calib_ros.files.recording import Recording
 from calib_ros.files.tables import read_journal
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain

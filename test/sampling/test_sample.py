@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, strategies as st
 
-from calib_ros.sampling.sample import Frames, Sample, collect
+from calib_ros.sampling.gathered import collect
+from calib_ros.sampling.sample import Frames, Sample
 
 SIGMAS = (1e-4, 3e-4)
 PLAIN = Sample(1, np.zeros(2), position=np.ones(3), rotation=np.eye(3))

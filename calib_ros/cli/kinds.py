@@ -1,0 +1,84 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What kind of file was given, by content and name, and where it belongs if not here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calib_ros.errors import InputError
+from calib_ros.files.loading import TABLES
+
+BEGINNINGS = (
+    *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
+    *((mark, 'image') for mark in (b'\x89PNG', b'\xff\xd8\xff')),
+    *((mark, 'report') for mark in (b'%PDF', b'<!doctype html')),
+    (b'<', 'urdf'),
+)
+SUFFIXES = {
+    **dict.fromkeys(('.mcap', '.db3', '.zstd', '.bag'), 'bag'),
+    **dict.fromkeys(('.urdf', '.xacro', '.xml'), 'urdf'),
+    **dict.fromkeys(('.yaml', '.yml'), 'chain'),
+    **dict.fromkeys(('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp'), 'image'),
+    **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
+    **dict.fromkeys(TABLES, 'table'),
+    **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),
+}
+IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
+WORDS = {
+    'bag': ('a bag', 'use identify or verify, or bag2csv to make a table'),
+    'table': ('a table', 'use identify or verify, or csv2bag to make a bag'),
+    'program': ('a program', 'use compensate'),
+    'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
+    'urdf': ('a URDF', 'give it as --chain'),
+    'result': ('the result of identify', 'use workspace, or give it as --calibration'),
+    'image': ('an image', 'use images on its folder'),
+    'images': ('a folder of images', 'use images'),
+    'workbook': ('a workbook of another kind', 'save it as .xlsx or CSV'),
+    'report': ('a report', 'open it in a browser or PDF reader'),
+}
+
+
+def _by_suffix(name: str) -> str:
+    return SUFFIXES.get(Path(name).suffix.lower(), '')
+
+
+def kind_of(path: Path) -> str:
+    """Return a key of `WORDS`, or empty text if unknown."""
+    if path.is_dir():
+        names = [each.name for each in path.iterdir()]
+        found = [kind for name, kind in IN_FOLDERS if name in names]
+        inside = {'bag': 'bag', 'image': 'images'}
+        found += [inside[kind] for kind in map(_by_suffix, names) if kind in inside]
+        return found[0] if found else ''
+    if path.is_file():
+        with path.open('rb') as file:
+            begin = file.read(16)
+        for mark, kind in BEGINNINGS:
+            if begin.lower().startswith(mark.lower()):
+                return kind
+    kind = _by_suffix(path.name)
+    if kind == 'chain' and path.is_file():
+        with path.open('rb') as file:
+            if b'points:' in file.read(100_000):
+                return 'program'
+    return kind
+
+
+def proposal(path: Path) -> str | None:
+    """Return what to do with a file given instead of a command; None for no file."""
+    kind = kind_of(path)
+    if not kind:
+        return None
+    what, where = WORDS[kind]
+    return f'{path} is {what}, not a command: {where} (calib_ros COMMAND --help)'
+
+
+def refuse_others(path: Path, command: str, *wanted: str) -> str:
+    """Return which of the wanted kinds a path is: the first of an unknown file, else the last."""
+    kind = kind_of(path) or wanted[0 if path.exists() and not path.is_dir() else -1]
+    if kind not in wanted:
+        what, where = WORDS[kind]
+        takes = ' or '.join(WORDS[each][0] for each in wanted)
+        raise InputError(f'{path} is {what}, but {command} takes {takes}: {where}')
+    return kind

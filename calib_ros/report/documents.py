@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A result for programs: the content of result.json, and settings as a parameter file."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+import calib_ros
+from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.region import Region
+from calib_ros.decision.result import Identification
+from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.report import words
+from calib_ros.settings import Settings
+from calib_ros.texts import dump_yaml
+
+
+def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, Any]:
+    """Return the result as a JSON document; `samples` is the account of the input."""
+
+    def comparison(which: Comparison) -> dict[str, Any]:
+        found = figures_document(which, which is judged) | {'outliers': which.outliers}
+        return found | {'after_with_outliers': asdict(which.figures_of_all[1])}
+
+    def parameter(p: ParameterRow) -> dict[str, Any]:
+        found = {'value': p.value, 'offset': p.offset, 'std': p.std}
+        found['half_width_95'] = p.half_width()
+        return found | {'unit': p.name.unit, 'status': p.status}
+
+    judged = result.validation
+    by = {'by': result.validated_by}
+    lower = [row[: k + 1] for k, row in enumerate(result.covariance.tolist())]
+    return {
+        'converged': result.converged,
+        'accepted': result.accepted,
+        'refusals': list(result.refusals),
+        'remarks': list(result.remarks),
+        'iterations': result.iterations,
+        'rank': result.rank,
+        'unidentifiable': list(result.unidentifiable),
+        'not_excited': list(result.not_excited),
+        'weakly_determined': list(words.weakly_determined(result)),
+        'held_near_nominal': list(result.weak),
+        'parameters': {p.name: parameter(p) for p in result.parameters},
+        'fitted': comparison(result.fitted),
+        'validation': None if judged is None else by | comparison(judged),
+        'before_is': words.BEFORE,
+        'noise_in_sigma': asdict(result.noise),
+        'chance_of_gain': result.chance,
+        'outliers': [asdict(outlier) for outlier in result.outliers],
+        'gauges': result.gauges,
+        'covariance': {
+            'names': list(result.names),
+            'lower': [[float(f'{x:.9e}') for x in row] for row in lower],
+        },
+        'correlated': [list(pair) for pair in result.correlated()],
+        'observability': asdict(result.observability),
+        'predicted_sigma_mm': words.sigma_over_range(result),
+        'sizes': dict(result.posterior.sizes),
+        'unmodelled': dict(zip(('turns', 'tilts'), result.posterior.unmodelled, strict=True)),
+        'region': None if result.region is None else region_figures(result.region),
+        'priors': result.priors,
+        'effects': dict(result.chain.effects),
+        'verdicts': [asdict(verdict) for verdict in result.verdicts],
+        'step': None if result.step is None else asdict(result.step),
+        'samples': samples,
+        'robot': result.chain.name,
+        'versions': {
+            'calib_ros': calib_ros.__version__,
+            'python': platform.python_version(),
+            'numpy': np.__version__,
+        },
+    }
+
+
+def figures_document(which: Comparison, intervals: bool = True) -> dict[str, Any]:
+    """Return the figures before and after, with the intervals of the RMS if wanted."""
+    found = dict(zip(('before', 'after'), map(asdict, which.figures), strict=True))
+    for when, rms in enumerate(found.values() if intervals else ()):
+        rms['rms_lower_mm'], rms['rms_upper_mm'] = words.limits_mm(which, when) or (None, None)
+    return found
+
+
+def region_figures(region: Region) -> dict[str, Any]:
+    """Return the region in figures; the limit is None for everywhere."""
+    limit = None if region.whole else 1e3 * region.limit
+    return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
+
+
+def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
+    """Return settings and `more` as a parameter file that repeats the run in a node."""
+    parameters: dict[str, Any] = {'chain': chain, **more}
+    for name, value in asdict(settings).items():
+        parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
+    return dump_yaml({'/**': {'ros__parameters': parameters}})

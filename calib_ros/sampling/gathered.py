@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""From samples to a problem: `collect` groups them into sets of observations with their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.records import Owner
+from calib_ros.kinematics.chain import Chain, Frame
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.messages import parse_sources
+from calib_ros.sampling.sample import Frames, Sample, named, socket_pairs
+from calib_ros.settings import Settings
+from calib_ros.shown import Shown
+
+
+def collect(
+    samples: Sequence[Sample],
+    sigmas: tuple[float, float],
+    frames: Frames | None = None,
+    posed: bool = False,
+    observed: Callable[[Sequence[int]], Observations] | None = None,
+) -> tuple[tuple[Observations, ...], tuple[Observations, ...]]:
+    """Return sets of observations to fit and sets held out, one for each pair of frames.
+
+    `sigmas` (position [m], orientation [rad]) are those of poses seen by a camera on the flange
+    without a covariance of their own. `frames` remembers the names given to earlier samples. With
+    `posed` the poses of boards are taken instead of their corners. If the samples are examples of
+    each kind only, `observed` returns the observations of one set by their indices.
+    """
+    frames = Frames() if frames is None else frames
+    observed = observed or (lambda some: _observations([samples[k] for k in some], posed))
+    groups: dict[tuple[str, str, str, bool, bool], list[int]] = {}
+    for k, sample in enumerate(samples):
+        kind = 'socket' if sample.socket else 'plane' if sample.plane else ''
+        kind = kind or ('distance' if sample.distance is not None else 'pose')
+        kind = 'view' if sample.view is not None and not posed else kind
+        key = (*frames.of(sample), kind, sample.eye_in_hand, sample.validation)
+        groups.setdefault(key, []).append(k)
+    sets: tuple[list[Observations], list[Observations]] = ([], [])
+    for (base, tool, kind, eye_in_hand, validation), members in groups.items():
+        found = replace(observed(members), base=base, tool=tool)
+        if eye_in_hand and kind != 'view':
+            found = found.inverted(sigmas)
+        sets[validation].append(found)
+    return tuple(sets[0]), tuple(sets[1])
+
+
+def lenses(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
+    """Return the lens at each camera frame, which must not change."""
+    found: dict[str, Lens] = {}
+    for sample in samples:
+        if sample.view is not None:
+            camera = frames.of(sample)[sample.eye_in_hand]
+            if found.setdefault(camera, sample.view.lens) != sample.view.lens:
+                raise InputError(
+                    f'the CameraInfo of {sample.device or "the camera"} has changed: take the '
+                    'images of one calibration with one setting of the lens, or call ~/clear'
+                )
+    return found
+
+
+def _seen(posed: Observations, samples: Sequence[Sample]) -> Observations:
+    """Return the corners of images (N), given the poses of their boards."""
+    views = [sample.view for sample in samples if sample.view is not None]
+    rows = posed.select(np.repeat(np.arange(len(views)), [len(each.pixels) for each in views]))
+    return replace(
+        rows,
+        positions=np.zeros((len(rows), 3)),
+        rotations=np.tile(np.eye(3), (len(rows), 1, 1)),
+        oriented=np.zeros(len(rows), dtype=bool),
+        covariance=None,
+        pixels=np.concatenate([each.pixels for each in views]),
+        points=np.concatenate([each.points for each in views]),
+        on_flange=samples[0].eye_in_hand,
+    )
+
+
+def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
+    count = len(samples)
+    oriented = np.array([sample.rotation is not None for sample in samples])
+    rotations = np.tile(np.eye(3), (count, 1, 1))
+    covariance = np.full((count, 6, 6), np.nan)
+    positions = np.zeros((count, 3))
+    for k, sample in enumerate(samples):
+        if sample.position is not None:
+            positions[k] = sample.position
+        if sample.rotation is not None:
+            rotations[k] = sample.rotation
+        if sample.covariance is not None:
+            covariance[k] = sample.covariance
+    distances = None
+    if samples[0].distance is not None:
+        distances = np.array([sample.distance for sample in samples], dtype=np.float64)
+
+    def optional(name: str) -> FloatArray | None:
+        rows = [getattr(sample, name) for sample in samples]
+        if all(row is None for row in rows):
+            return None
+        still = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
+        return np.array([still if row is None else row for row in rows], dtype=np.float64)
+
+    found = Observations(
+        np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
+        np.array([sample.joints for sample in samples], dtype=np.float64),
+        positions,
+        rotations,
+        oriented,
+        None if np.isnan(covariance).all() else covariance,
+        optional('approach'),
+        distances,
+        optional('velocity'),
+        optional('acceleration'),
+        optional('delay'),
+        socket=samples[0].socket,
+        plane=samples[0].plane,
+    )
+    return found if posed or samples[0].view is None else _seen(found, samples)
+
+
+def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
+    """Refuse joint names with a ConfigError unless there is one for each joint."""
+    count = len(chain.joints)
+    if not len(names) == len(set(names)) == count:
+        raise ConfigError(
+            f'joint_names must be {count} different names, one for each of '
+            f'{", ".join(chain.joint_names)}; not {", ".join(names)}'
+        )
+
+
+def check_settings(chain: Chain, settings: Settings) -> None:
+    """Refuse settings with a ConfigError that no identification of a chain could use."""
+    if settings.mode == 'continuous' and any(
+        each.board for each in parse_sources(settings.sources)
+    ):
+        raise ConfigError('images are used only at stops of the arm: mode must not be continuous')
+    nothing = np.zeros((0, len(chain.joints)))
+    empty = replace(Observations.from_arrays(nothing, np.zeros((0, 3))), approach=nothing)
+    Problem(chain, empty, **settings.for_problem())
+
+
+def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
+    """Return a chain with lenses at its frames."""
+    for name, lens in found.items():
+        frame = chain.frame(name) if name in chain.frame_names else Frame()
+        chain = chain.with_frame(name, replace(frame, lens=lens))
+    return chain
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Gathered(Shown):
+    """The sets to fit and held out, each with its own frames."""
+
+    fitted: Sequence[Observations]
+    held_out: Sequence[Observations] = ()
+    pairs: Sequence[tuple[str, str]] = ()  # frames of two sockets at one location
+    world_frame: str = ''  # the first frame of the devices
+    lenses: Mapping[str, Lens] = field(default_factory=dict)  # at the frames of cameras
+    owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is
+    warnings: tuple[str, ...] = ()
+    by_line: bool = False  # stamps are the lines of a table, in seconds
+
+    def problem(self, chain: Chain, settings: Settings, **more: Any) -> Problem:
+        """Return the problem for a chain, with `more` arguments."""
+        apart = settings.socket_distance
+        return Problem(
+            with_lenses(chain, self.lenses),
+            self.fitted[0],
+            self.held_out,
+            more=self.fitted[1:],
+            separations=tuple((*pair, apart) for pair in self.pairs),
+            world_frame=self.world_frame,
+            **settings.for_problem(),
+            **more,
+        )
+
+
+def gathered(
+    samples: Sequence[Sample],
+    sigmas: tuple[float, float],
+    posed: bool = False,
+    observed: Callable[[Sequence[int]], Observations] | None = None,
+) -> Gathered:
+    """Return the sets of samples with their frames; arguments as in `collect`."""
+    frames = Frames()
+    fitted, held_out = collect(samples, sigmas, frames, posed, observed)
+    pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
+    cameras = {} if posed else lenses(samples, frames)
+    return Gathered(fitted, held_out, pairs, world_frame, cameras, frames.owners)
+
+
+def problem_of(
+    chain: Chain, samples: Sequence[Sample], settings: Settings, posed: bool = False
+) -> Problem | None:
+    """Return samples as a problem, or None; with `posed` boards as poses, not corners."""
+    if all(sample.validation for sample in samples):
+        return None
+    found = gathered(samples, (settings.sigma_position, settings.sigma_orientation), posed)
+    return found.problem(chain, settings, of_messages=True)
+
+
+def in_frames_of(
+    calibration: Calibration, since: Sequence[Sample], usable: Sequence[Sample], settings: Settings
+) -> list[Observations]:
+    """Return the poses measured since a calibration, among all usable ones, in its frames.
+
+    Raises InputError if there are none, or if their frames are unknown to it.
+    """
+    sigmas = (settings.sigma_position, settings.sigma_orientation)
+    # without owners, the first device and target have the frames
+    frames = Frames(calibration.owners) if calibration.owners else named(usable)
+    sets = [each for part in collect(since, sigmas, frames) for each in part]
+    if not sets:
+        raise InputError(
+            'no poses since the calibration was identified or loaded: measure some new poses'
+        )
+    known = calibration.chain.frame_names
+    if not all(each.base in known and each.tool in known for each in sets):
+        raise InputError(
+            'the new poses come from a device or target that the calibration does not know'
+        )
+    return sets
+
+
+def problem_since(
+    calibration: Calibration, chain: Chain, sets: Sequence[Observations], settings: Settings
+) -> Problem:
+    """Return sets between the frames of a calibration as a problem of the nominal chain."""
+    cameras = {each.camera for each in sets if each.pixels is not None}
+    known = {name: calibration.chain.frame(name).lens for name in cameras}
+    seen = {name: lens for name, lens in known.items() if lens}
+    return Gathered(sets, lenses=seen).problem(chain, settings)
