@@ -8,6 +8,7 @@ docs/model.md (Judgement) lists and explains them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy import special
@@ -223,4 +224,12 @@ def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) ->
         found.append(
             f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
         )
+    listed, chain = problem.chain.parallel or (), problem.chain
+    ours = replace(chain, parallel=None).parallel or ()
+    for names, others, does, are in ((ours, listed, 'omits', ''), (listed, ours, 'has', 'not ')):
+        if wrong := [name for name in names if name not in others]:
+            found.append(
+                f'"parallel" in the chain file {does} {", ".join(wrong)}, although the axes that '
+                f'this row connects are {are}parallel: leave "parallel" out to derive it'
+            )
     return tuple(found)

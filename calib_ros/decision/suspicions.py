@@ -103,6 +103,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.append(Reason(Rule.SCALE, scale))
     if any(each.rule is Rule.SCALE for each in refusals):
         scale = ''
+    imitated = imitated or bool(lens and refusals)
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))
         lens = ''

@@ -21,12 +21,12 @@ import numpy as np
 
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.leastsquares import Normal, System, gram, normal_equations
-from calib_ros.estimation.levels import PRINTED, SCALE
+from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
 CONSIDERED = ('eccentricity', 'gravity')
@@ -42,7 +42,18 @@ def considered(chain: Chain, names: Sequence[str], fixed: Sequence[str] = ()) ->
     every += effects.couplings([each.name for each in chain.joints if each.type == 'revolute'])
     held = {n for each in fixed for n in fnmatch.filter(chain.parameter_names, each)}
     every += [name for name in chain.parameter_names if name in held and name.of_dh]
+    every += lenses(chain)
     return tuple(name for name in every if name not in names)
+
+
+def lenses(chain: Chain) -> dict[Parameter, float]:
+    """Return the standard deviations [px] of given intrinsics: a calibration has errors too."""
+    return {
+        name: OUT_OF_SCALE * frame.lens.fx
+        for key in chain.frame_names
+        if (frame := chain.frame(key)).lens is not None and frame.lens.fixed
+        for name in parameters_of(key, IN_PIXELS)
+    }
 
 
 class Tilts(NamedTuple):

@@ -166,7 +166,8 @@ def posterior_of(
     deviations of parameters that something else moves too, `at_the_fit` the last normal equations
     if known. Doubts are only evaluated if `judging`.
     """
-    chain = chain.with_effects([name for name in more if not Parameter(name).of_dh])
+    own = [n for n in more if not (Parameter(n).of_dh or chain.owns_frame(n))]
+    chain = chain.with_effects(own)
     every = (*names, *more)
     beside = {name: std for name, std in (doubts or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)

@@ -18,6 +18,7 @@ from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import identifiability
+from calib_ros.estimation.considered import lenses
 from calib_ros.estimation.evidence import Posterior, posterior_of
 from calib_ros.estimation.leastsquares import (
     System,
@@ -116,7 +117,7 @@ class Fitted:
     ) -> Posterior:
         """Return the posterior of the fit with `more` effects considered."""
         problem, names = self.problem, self.names
-        given = dict(problem.given)
+        given: dict[str, float] = {**problem.given} | {**lenses(problem.model)}
         if problem.sigma_scale:
             given['scale'] = problem.sigma_scale
         how = doubts, None if more else self.robust.fit.normal, judging

@@ -150,10 +150,9 @@ class Problem(Shown):
             )
 
     def _check_patterns(self) -> None:
-        names = self.model.parameter_names
         for pattern in (*self.fixed, *self.priors):
-            if not fnmatch.filter(names, pattern):
-                raise UnknownNameError('parameter', pattern, names)
+            if not fnmatch.filter(self.model.all_parameters, pattern):  # b only of some arms
+                raise UnknownNameError('parameter', pattern, self.model.parameter_names)
         for pattern in self.priors:
             if self._places(pattern):
                 raise ConfigError(

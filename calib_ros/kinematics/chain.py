@@ -247,7 +247,7 @@ class Chain(Shown):
         """
         by_owner: dict[str, dict[str, float]] = {}
         for name, offset in offsets.items():
-            if name not in self._all_parameters:
+            if name not in self.all_parameters:
                 raise UnknownNameError('parameter', name, self.parameter_names)
             if not math.isfinite(offset):
                 raise ConfigError(f'the offset of {name} must be a finite number')
@@ -270,7 +270,7 @@ class Chain(Shown):
             'effects': tuple((n, v + float(offsets.get(n, 0.0))) for n, v in self.effects),
         }
         same = all(new is old for new, old in zip(joints, self.joints, strict=True))
-        names = ('joint_names', 'frame_names', '_all_parameters', 'held')
+        names = ('joint_names', 'frame_names', 'all_parameters', 'held')
         kept = (*names, *(('walk', '_joints') if same else ()))
         return _with(self, found, kept)
 
@@ -333,13 +333,13 @@ class Chain(Shown):
         return rng.uniform(lower, upper, (count, len(self.joints)))
 
     def _split(self, name: str) -> tuple[Joint | Frame, str]:
-        if name not in self._all_parameters:
+        if name not in self.all_parameters:
             raise UnknownNameError('parameter', name, self.parameter_names)
         owner, _, kind = name.partition('.')
         return self._joints.get(owner) or self.frame(owner), kind
 
     @cached_property
-    def _all_parameters(self) -> frozenset[str]:
+    def all_parameters(self) -> frozenset[str]:
         """Return all possible parameter names of joints, frames and effects."""
         return _parameters(self.joint_names, self.frame_names, tuple(self._effect_values))
 

@@ -7,7 +7,7 @@ import pytest
 from fits import SIGMAS, UR10E, measured_arm, rms
 
 from calib_ros.apply.simulation import Cell
-from calib_ros.errors import TooFewObservationsError
+from calib_ros.errors import TooFewObservationsError, UnknownNameError
 from calib_ros.estimation.identifiability import (
     structurally_independent,
 )
@@ -81,3 +81,13 @@ def test_priors_are_off_by_default_and_told_when_on(rng):
         f'{name}.a': 1e-5 if name == 'elbow_joint' else 1e-3 for name in UR10E.joint_names
     }
     assert 'priors on 6 parameters' in summary(result)
+
+
+def test_a_pattern_may_hold_what_only_other_arms_have(rng):
+    """No row of this arm has a shift b; a name of no arm at all is a slip of the pen."""
+    *_, seen = measured_arm(rng, 30)
+    held = Problem(UR10E, seen, fixed=('*.b', '*.beta'), priors={'*.b': 1e-3})
+    assert held.free == Problem(UR10E, seen, fixed=('*.beta',)).free
+    for slip in ('*.betta', 'elbow.b'):
+        with pytest.raises(UnknownNameError, match='unknown parameter'):
+            Problem(UR10E, seen, fixed=(slip,))
