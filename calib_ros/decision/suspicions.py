@@ -246,6 +246,9 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         ('position', 'm', noise.position, problem.largest_error),
         ('orientation', 'rad', noise.orientation, problem.largest_angle),
     )
+    judged, asked = result.validation, 'was m{unit} meant?'
+    if judged is not None and judged.figures[0].rms_mm < 1e3 * EXCEPTION * TYPICAL['length']:
+        asked = 'no arm is as good: did its controller compute the poses?'
     for k, (what, unit, size, most) in enumerate(kinds):
         if size is None:
             continue
@@ -256,7 +259,7 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         name = f'{name} {given:.2g} {unit}'
         left = f'{1e3 * size * given:.2g} m{unit} are left'
         if SIMULATED < size * given < given and (size < LEAST_NOISE or given > most):
-            found.append(f'{name}, and only {left}: was m{unit} meant?')
+            found.append(f'{name}, and only {left}: {asked.format(unit=unit)}')
         elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
             found.append(
                 f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '
