@@ -17,6 +17,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step
 from calib_ros.decision.validation import COUNTS, Comparison, log_gain, mean_squares
 from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
@@ -90,10 +91,12 @@ def _unmoved(problem: Problem) -> str:
         return f'{", ".join(still)} stood still (or was not recorded): '
     centred = joints - joints.mean(axis=0)
     axis = np.linalg.svd(centred, full_matrices=False)[2][-1]
-    if len(joints) <= len(names) or np.abs(centred @ axis).max() > STILL:
-        return ''
-    tied = [names[k] for k in np.flatnonzero(np.abs(axis) > EXCEPTION)]
-    return f'{", ".join(tied)} only moved in one fixed relation (is one passive?): '
+    if len(joints) > len(names) and np.abs(centred @ axis).max() <= STILL:
+        tied = [names[k] for k in np.flatnonzero(np.abs(axis) > EXCEPTION)]
+        return f'{", ".join(tied)} only moved in one fixed relation (is one passive?): '
+    turns = problem.chain.forward(joints)[:, :3, :3]
+    least = np.linalg.norm((turns - turns.mean(axis=0)).reshape(-1, 3), -2) / len(turns) ** 0.5
+    return 'the tool points one way in all poses (tilt it): ' if least < DEGENERATE else ''
 
 
 def _gain(
