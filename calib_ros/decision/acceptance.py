@@ -18,6 +18,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step
 from calib_ros.estimation.configurations import STILL
+from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
@@ -96,7 +97,10 @@ def _together(problem: Problem) -> str:
         if len(alike) > 1 and sizes[-1] <= STILL * np.sqrt(len(own)):
             found += f'{", ".join(alike)} only moved together (if the arm couples them, give '
             found += 'their couplings and equal limits in the chain file): '
-    return found
+    turns = problem.chain.forward(joints)[:, :3, :3]
+    least = np.linalg.norm((turns - turns.mean(axis=0)).reshape(-1, 3), -2) / len(turns) ** 0.5
+    level = 'the tool points one way in all poses (tilt it): '
+    return found or (level if least < DEGENERATE else '')
 
 
 def _gain(

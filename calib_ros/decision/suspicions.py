@@ -296,6 +296,8 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         ('position', 'm', noise.position, problem.largest_error),
         ('orientation', 'rad', noise.orientation, problem.largest_angle),
     )
+    best, judged = 1e3 * EXCEPTION * TYPICAL['length'], result.validation
+    computed = judged is not None and judged.figures[0].rms_mm < best
     for k, (what, unit, size, most) in enumerate(kinds):
         if size is None:
             continue
@@ -307,8 +309,11 @@ def _sigmas(problem: Problem, result: Identification) -> str:
         name = f'{name} {given:.2g} {unit}'
         left = f'{1e3 * size * given:.2g} m{unit} are left'
         implausible = size < LEAST_NOISE or given > most
-        if stated and SIMULATED < size * given < given and implausible:
-            found.append(f'{name}, and only {left}: was m{unit} meant?')
+        if (stated or computed) and SIMULATED < size * given < given and implausible:
+            asked = f'was m{unit} meant?'
+            if computed:
+                asked = 'no arm is as good: did its controller compute the poses?'
+            found.append(f'{name}, and only {left}: {asked}')
         elif k and size > CLEARLY * max(noise.position, 1.0) and size * given < most:
             found.append(
                 f'{name}, but {left}: the orientations outweigh the positions and spoil them; set '

@@ -30,6 +30,7 @@ USUAL_TIPS = ('tool0', 'flange')
 ENDS = ('lower', 'upper')
 MOST_LINKS = 10 * MOST_ENTRIES
 
+_AT = ' at'  # no attribute has such a name
 _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
 
 
@@ -162,18 +163,30 @@ def _robot(text: str) -> ET.Element:
         )
     if len(text) > LARGEST_TEXT:
         raise ConfigError(f'the URDF is larger than {LARGEST_TEXT // 1_000_000} MB')
-    builder, parser = ET.TreeBuilder(), expat.ParserCreate()  # ROS declares no prefixes either
-    parser.StartElementHandler, parser.EndElementHandler = builder.start, builder.end
     try:
-        parser.Parse(text, True)
+        root = _parsed(text)
     except (expat.ExpatError, ValueError) as err:  # ValueError: not UTF-8
         raise ConfigError(f'the URDF is not valid XML: {err}') from err
-    root = builder.close()
     if any('xacro:' in element.tag for element in root.iter()):
         raise ConfigError('this is a xacro file, not a URDF: run "xacro FILE > robot.urdf" first')
     if root.tag != 'robot':
         raise ConfigError(f'a URDF has the root element <robot>, not <{root.tag}>')
     return root
+
+
+def _parsed(text: str) -> ET.Element:
+    """Return the elements of a text, each with its first byte as an attribute.
+
+    Prefixes need no declaration, as in ROS.
+    """
+    builder, parser = ET.TreeBuilder(), expat.ParserCreate()
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        builder.start(tag, attributes | {_AT: str(parser.CurrentByteIndex)})
+
+    parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.Parse(text, True)
+    return builder.close()
 
 
 def _outwards(joints: Sequence[DescribedJoint], root: str) -> tuple[DescribedJoint, ...]:
@@ -284,7 +297,7 @@ _TAG = re.compile(r"""<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""
 def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
     """Return a URDF with other joint origins (4, 4), added first in joints without one."""
     data = text.encode()
-    for start, tag, name in sorted(_places(data, origins), reverse=True):
+    for start, tag, name in sorted(_places(text, origins), reverse=True):
         before, rest = data[:start].decode(), data[start:].decode()
         match = _TAG.match(rest)
         assert match is not None  # without entities, expat's index is exact
@@ -297,34 +310,16 @@ def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
     return data.decode()
 
 
-def _places(data: bytes, joints: Mapping[str, object]) -> list[tuple[int, str, str]]:
+def _places(text: str, joints: Mapping[str, object]) -> list[tuple[int, str, str]]:
     """Return the start of each joint's origin, or else of the joint: byte, tag, joint."""
-    places: dict[str, tuple[int, str, str]] = {}
-    above: list[str] = []
-    inside = ''
-    parser = expat.ParserCreate('utf-8')
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal inside
-        if [*above, tag] == ['robot', 'joint']:
-            inside = attributes.get('name', '')
-            places[inside] = (parser.CurrentByteIndex, tag, inside)
-        elif [*above, tag] == ['robot', 'joint', 'origin'] and places[inside][1] == 'joint':
-            places[inside] = (parser.CurrentByteIndex, tag, inside)
-        above.append(tag)
-
-    def end(tag: str) -> None:
-        above.pop()
-
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
-    parser.Parse(data, True)
-    return [place for name, place in places.items() if name in joints]
+    described = [joint for joint in _parsed(text).findall('joint') if joint.get('name') in joints]
+    places = [(joint if (o := joint.find('origin')) is None else o, joint) for joint in described]
+    return [(int(at.get(_AT, '')), at.tag, joint.get('name', '')) for at, joint in places]
 
 
 def _with_origin(tag: str, origin: FloatArray) -> str:
     """Return an origin tag with another value; equal attributes are not touched."""
-    element = ET.fromstring(tag if tag.endswith('/>') else tag[:-1] + '/>')
+    element = _parsed(tag if tag.endswith('/>') else tag[:-1] + '/>')
     written, rpy = _placed(element, 'origin')
     change = np.abs(origin - written)
     if change[:3, :3].max() > ROUNDING:

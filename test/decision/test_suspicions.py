@@ -147,6 +147,15 @@ def test_a_default_sigma_is_no_mistake_of_its_user():
     assert 'meant?' in identify(Problem(UR, seen, sigma_position=2e-4)).remarks[0]
 
 
+def test_poses_computed_by_a_controller_are_named():
+    """Rounded to micrometres they look like those of a device a hundred times better than any."""
+    rng = np.random.default_rng(0)
+    result = identify(Problem(UR, measure(UR, UR.random_joints(25, rng), rng, 2e-6, 5e-6)))
+    said = result.refusals[0]
+    assert said.startswith('sigma_position is 0.0001 m, and only 0.00')
+    assert said.count('no arm is as good: did its controller compute the poses?') == 2
+
+
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
     seen = seen_of(arm(), count=40)
     turned = replace(seen, joints=seen.joints * [1, 1, 1, 1, 1, -1])

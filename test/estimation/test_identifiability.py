@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from fits import NOISE, SIGMAS, UR10E, measured_arm
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.estimation.identifiability import (
@@ -15,8 +16,10 @@ from calib_ros.estimation.identifiability import (
     observability,
     trades,
 )
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
+from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 
 ALIGNED = ('shoulder_lift_joint', 'elbow_joint', 'wrist_1_joint')
@@ -93,6 +96,20 @@ def test_a_joint_that_stands_still_trades_on_the_poses_measured(rng):
     kept = {p.name: p.offset for p in result.parameters}
     assert all(kept[name] == 0.0 for name in result.not_excited)
     assert_trades_hold(result, q)
+
+
+def test_a_tool_that_always_points_down_is_named(rng):
+    """As at a drill: along its own axis it moves whatever the joints do, as if the base did."""
+    places = UR10E.forward(UR10E.random_joints(400, rng))
+    turned = rng.uniform([-3.0, np.pi], [3.0, np.pi], (400, 2))
+    places[:, :3, :3] = Rotation.from_euler('ZX', turned).as_matrix()
+    found = solve(UR10E, places, UR10E.random_joints(400, rng), 'base', 'tool')
+    q = found.joints[found.converged][:60]
+    seen = measure(faulty(UR10E, Cell(), rng), q, rng, *NOISE)
+    seen = Observations.from_arrays(seen.joints, seen.positions)
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    told = 'the tool points one way in all poses (tilt it): the poses do not determine tool (z)'
+    assert told in result.refusals
 
 
 def test_a_fixed_partner_makes_its_trade_identifiable(rng):

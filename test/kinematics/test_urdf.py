@@ -218,6 +218,10 @@ def test_prefixes_need_no_declaration():
     named = edited(UR10E, '<robot ', '<robot xmlns="http://ros.org" ')
     assert chain.joints == chain_from_urdf(named).joints == chain_from_urdf(UR10E).joints
     assert corrected_urdf(limited, chain) == limited
+    noted = edited(UR10E, '<origin ', '<origin drake:note="0" ')
+    longer = chain.with_offsets({'elbow_joint.d': 1e-3})
+    edits = corrected_urdf(noted, longer).replace('drake:note="0" ', '')
+    assert edits == corrected_urdf(UR10E, longer)
 
 
 def elbow(kind, more=''):
