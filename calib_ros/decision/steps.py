@@ -30,7 +30,8 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import weights_of
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, FloatArray, Index
+from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray, Index
+from calib_ros.settings import EXCEPTION
 
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
@@ -45,7 +46,8 @@ class Step:
     the step. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
     ('rad'); of a joint that of its zero. `share` is its share of the squared residuals beyond that
     of as many useless parameters. If all measurements on one side are outliers, `unused` says
-    which: the fit is not affected.
+    which: the fit is not affected. If the arm's places before and after lie `apart`, errors of the
+    arm look like a step.
     """
 
     what: str
@@ -59,6 +61,7 @@ class Step:
     share: float
     unused: str
     image: int | None = None
+    apart: bool = False
 
     @property
     def harmful(self) -> bool:
@@ -85,6 +88,10 @@ class Step:
         text = f'{thing} moved {size}{of} before {where} ({when})'
         if self.unused:
             text += f'; measurements {self.unused} carry no weight'
+        if self.apart:
+            text += (
+                '; errors of the arm may look so, as poses before and after lie apart: mix them'
+            )
         return text
 
 
@@ -279,10 +286,12 @@ class _Scan:
         group, problem = found.group, self._problem
         first: list[tuple[int, int, int]] = []
         moved: list[FloatArray] = []
+        places: list[tuple[FloatArray, Flags]] = []
         weights: tuple[list[FloatArray], list[FloatArray]] = ([], [])
         for number in group.sets:
             each = self._sets[number]
             after = self._numbers[number] >= found.stop
+            places.append((each.joints, after))
             stamps, samples = each.stamps_ns[after].tolist(), self._chosen[number][after].tolist()
             first += [(stamp, number, k) for stamp, k in zip(stamps, samples, strict=True)]
             model = ErrorModel(self._chain, group.names, each.base, each.tool)
@@ -303,7 +312,16 @@ class _Scan:
         image = None if seen.pixels is None else int(seen.images[sample])
         where = (of_set, sample, stamp)
         named = group.what, group.kind, _thing(group.kind, seen)
-        return Step(*named, *where, size, unit, found.share, ''.join(unused), image)
+        apart = _apart(*map(np.concatenate, zip(*places, strict=True)))
+        return Step(*named, *where, size, unit, found.share, ''.join(unused), image, apart)
+
+
+def _apart(joints: FloatArray, after: Flags) -> bool:
+    """Tell whether a plane separates joint values (N, n) by a mask (N,), nearly all of it."""
+    centred, side = joints - joints.mean(axis=0), after - after.mean()
+    left = side - centred @ np.linalg.lstsq(centred, side, rcond=None)[0]
+    freedom = len(joints) - joints.shape[1] - 1
+    return bool(left @ left * (len(joints) - 1) < EXCEPTION * freedom * (side @ side))
 
 
 def _thing(kind: str, seen: Observations) -> str:
