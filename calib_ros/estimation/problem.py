@@ -14,6 +14,7 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation import identifiability
+from calib_ros.estimation.configurations import SCATTER
 from calib_ros.estimation.leastsquares import Prior, System
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.pixels import samples_of
@@ -119,6 +120,7 @@ class Problem(Shown):
                     f'observations have {observations.joints.shape[1:]} joint values, chain '
                     f'"{self.chain.name}" has {joints} joints'
                 )
+            self._check_held(observations)
             if observations.distances is not None:
                 self._check_distances(observations.distances)
             if observations.pixels is not None:
@@ -130,6 +132,17 @@ class Problem(Shown):
                     raise UnknownNameError('socket that is a known distance away', base, sockets)
             if not distance > 0.0:
                 raise ConfigError(f'the distance of sockets must be positive, not {distance}')
+
+    def _check_held(self, observations: Observations) -> None:
+        """Refuse values of joints that cannot move: equal limits may be none at all."""
+        for k, value in self.chain.held.items():
+            name, joint = self.chain.joint_names[k], observations.joints[:, k]
+            led = any(each.startswith(f'{name}.coupling_') for each, _ in self.chain.effects)
+            if not led and np.abs(joint - value).max(initial=0.0) > SCATTER:
+                raise InputError(
+                    f'{name} was at {joint.min():.4g} to {joint.max():.4g}, but both its limits '
+                    f'are {value:.4g} in the chain file, and no coupling moves it'
+                )
 
     def _check_distances(self, distances: FloatArray) -> None:
         """Refuse distances that vary by more than the flange can move.

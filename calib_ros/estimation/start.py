@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.identifiability import DEGENERATE, excited, structurally_independent
 from calib_ros.estimation.leastsquares import System, factor_of, minimise, normal_equations
 from calib_ros.estimation.observations import SOME_POSES, Observations
@@ -35,11 +36,12 @@ from calib_ros.settings import EXCEPTION, Settings
 def start_frames(problem: Problem) -> Chain:
     """Return the model with base and tool frames that bring it close to the measurements.
 
-    Sets are processed in order; frames found by earlier sets are kept.
+    Sets with more equations come first, as one or two poses of a tool place no device; frames
+    found by them are kept.
     """
     chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()
-    for observations in problem.sets:
+    for observations in sorted(problem.sets, key=_equations, reverse=True):
         placed = {name: replace(chain.frame(name), fixed=True) for name in found}
         known = {**chain.all_frames, **placed}
         base, tool = observations.base, observations.tool
@@ -55,6 +57,11 @@ def start_frames(problem: Problem) -> Chain:
             chain = chain.with_frame(name, frame)
         found |= {base, tool}
     return chain
+
+
+def _equations(each: Observations) -> int:
+    rows = 6 if each.oriented.any() or each.pixels is not None else 3
+    return distinct(each.configurations) * (rows if each.distances is None else 1)
 
 
 def _start_one(

@@ -140,7 +140,7 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
     gravity = list(Chain.gravity) if gravity is None else gravity
     x, y, z = parse_numbers(gravity, 3, f'{where}: gravity').tolist()
     try:
-        chain = Chain(
+        return Chain(
             name=parse_name(content.get('name', Path(where).stem), f'{where}: name'),
             convention=content['convention'],
             joints=tuple(_joint(row, f'{where}: joint {k + 1}') for k, row in enumerate(rows)),
@@ -153,14 +153,6 @@ def parse_chain(text: str, where: str = 'chain file') -> Chain:
                 for name, value in dictionary(content.get('effects'), f'{where}: effects').items()
             }
         )
-        for k in chain.held:
-            coupled = f'{chain.joint_names[k]}.coupling_'
-            if not any(name.startswith(coupled) for name, _ in chain.effects):
-                raise ConfigError(
-                    f'joint {k + 1}: cannot move, because lower and upper are equal: give the '
-                    f'couplings that move it ("effects": {coupled}OTHER), or other limits'
-                )
-        return chain
     except UnknownNameError as err:
         what = err.what if where in err.what else f'{where}: {err.what}'
         raise UnknownNameError(what, err.name, err.alternatives) from err

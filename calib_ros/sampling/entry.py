@@ -21,6 +21,9 @@ Layout: TypeAlias = tuple[Columns, Index]
 OTHERS = 'none of the joints in the message'
 
 
+NOWHERE = -1  # column of a joint that needs no name
+
+
 class JointNames:
     """Finds the joints of a chain in messages that may name others, or only some of them.
 
@@ -35,13 +38,16 @@ class JointNames:
         """Names received if some of the chain's joints are never named."""
 
     def layout(self, key: tuple[str, ...]) -> Layout:
-        """Return the joints of the chain in messages, and the columns of their values."""
+        """Return the joints of the chain in messages, and the columns of their values.
+
+        Of held joints that are not named the column is NOWHERE.
+        """
         if key not in self._layouts:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
             known = {k: key.index(n) for k, n in enumerate(self._names) if n in key}
             if known.keys() - self.held.keys():
-                known = dict(sorted({**dict.fromkeys(self.held, 0), **known}.items()))
+                known = dict(sorted({**dict.fromkeys(self.held, NOWHERE), **known}.items()))
             else:
                 known = {}
             self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
@@ -157,8 +163,8 @@ class Entry:
                 self.miss(JOINTS, len(stamps), OTHERS)
                 continue
             values = numbers[:, index]
-            for k, end in self._names.held.items():
-                values[:, columns.index(k)] = end
+            for place in np.flatnonzero(index == NOWHERE):
+                values[:, place] = self._names.held[columns[place]]
             size, good = np.abs(values).max(axis=1), np.ones(len(stamps), dtype=bool)
             for wrong, cause in (
                 (stamps <= 0, NO_STAMP),

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import UR10E, worst_prediction
+from fits import NOISE, SIGMAS, UR10E, worst_prediction
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -253,3 +253,20 @@ def test_distances_place_an_arm_that_moves_in_a_plane(height, rng):
     q = nominal.random_joints(50, rng)
     left = [np.linalg.norm(each.forward(q)[:, :3, 3], axis=1) for each in (found, true)]
     np.testing.assert_allclose(*left, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_tool_measured_once_or_twice_places_no_device(oriented):
+    """It may come first: the start of all other tools relied on it, and arms were turned round."""
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        sets = []
+        for number, count in enumerate((1 + seed % 2, 2, 30)):
+            tool = f'tool_{number}' if number else 'tool'
+            arm = replace(true, tool=random_frame(rng, 0.2))
+            seen = measure(arm, UR10E.random_joints(count, rng), rng, *NOISE, oriented=oriented)
+            sets.append(replace(seen, tool=tool))
+        found = start_frames(Problem(UR10E, sets[0], more=sets[1:], **SIGMAS))
+        left = [found.forward(s.joints, tool=s.tool)[:, :3, 3] - s.positions for s in sets[2:]]
+        assert np.abs(left).max() < 0.02

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS
+from fits import NOISE, SIGMAS, rms
 from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 from urdfs import SCARA, ZERO, Z, limits, reference_forward, written
 
 from calib_ros import CalibrationSession, Problem, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.errors import ConfigError
-from calib_ros.kinematics.chain_file import dump_chain, parse_chain
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 
 Y = (0, 1, 0)
@@ -74,12 +74,7 @@ def test_what_the_coupled_joints_show_is_identified_and_the_rest_named_a_gauge(o
     assert not result.not_excited
     assert {'turn.a', 'level_2.theta'} <= result.gauges.keys()
     fresh = CHAIN.random_joints(200, rng)
-    errors = [
-        (each.forward(fresh) - true.forward(fresh))[:, :3, 3]
-        for each in (result.before, result.chain)
-    ]
-    before, after = (float(np.sqrt((each**2).sum(axis=1).mean())) for each in errors)
-    assert after < 0.05 * before
+    assert rms(result.chain, true, fresh) < 0.05 * rms(result.before, true, fresh)
 
 
 def test_without_couplings_in_the_chain_they_are_named(rng):
@@ -110,10 +105,28 @@ def test_joint_states_need_not_name_them(rng):
     np.testing.assert_allclose([each.joints for each in made.samples], q, atol=1e-3)
 
 
-def test_a_joint_that_nothing_moves_is_refused():
+def test_equal_limits_that_are_none_are_refused(rng):
     assert parse_chain(dump_chain(CHAIN)).held == CHAIN.held == {3: 0.0, 4: 0.1}
-    with pytest.raises(ConfigError, match='joint 4: cannot move'):
-        parse_chain(dump_chain(replace(CHAIN, effects=())))
+    moved = CHAIN.random_joints(30, rng)
+    moved[:, 4] += 0.05
+    seen = measure(CHAIN, moved, rng)
+    assert Problem(CHAIN, seen).free
+    with pytest.raises(InputError, match=r'level_2 was at .*, but both its limits are 0'):
+        Problem(replace(CHAIN, effects=()), seen)
     stuck = SCARA.replace('lower="-3.0" upper="3.0"', 'lower="0.0" upper="0.0"')
     with pytest.raises(ConfigError, match='limits of joint "wrist" are equal'):
         chain_from_urdf(stuck)
+
+
+def test_a_joint_that_never_moves_has_gauges(rng):
+    arm = load_chain('kuka_iiwa14')
+    third = replace(arm.joints[2], lower=0.3, upper=0.3)
+    nominal = replace(arm, joints=(*arm.joints[:2], third, *arm.joints[3:]))
+    true = faulty(nominal, Cell(), rng)
+    q = nominal.random_joints(60, rng)
+    result = identify(Problem(nominal, measure(true, q, rng, *NOISE), **SIGMAS))
+    assert result.accepted
+    assert not result.not_excited
+    assert result.region.whole
+    fresh = nominal.random_joints(200, rng)
+    assert rms(result.chain, true, fresh) < 0.05 * rms(result.before, true, fresh)
