@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from calib_ros.decision.comparison import Comparison
 from calib_ros.errors import InputError
@@ -161,6 +161,7 @@ def run_length(slope: float, height: float) -> float:
 @cache
 def limit(slope: float, nights: float) -> float:
     """Return the height that a CUSUM exceeds by chance after so many nights on average."""
+    from scipy import optimize  # slow to import, rarely needed
 
     def less(height: float) -> float:
         return float(np.log(run_length(slope, height) / nights))

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Literal, TypeAlias, TypeVar, get_args
 
@@ -221,9 +221,10 @@ class Chain(Shown):
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with a replaced or added frame."""
+        kept = ('joint_names', 'walk', '_joints', '_effect_values')
         if name in ('base', 'tool'):
-            return replace(self, base=frame) if name == 'base' else replace(self, tool=frame)
-        return replace(self, frames=tuple((dict(self.frames) | {name: frame}).items()))
+            return _with(self, {name: frame}, (*kept, 'frame_names', '_all_parameters'))
+        return _with(self, {'frames': tuple((dict(self.frames) | {name: frame}).items())}, kept)
 
     def with_effects(self, names: Sequence[str]) -> Chain:
         """Return the chain with further effects of value zero."""
