@@ -271,6 +271,8 @@ def test_approaches_are_the_last_moves():
     q = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.5], [0.5, 0.5], [0.5, 0.6]])
     expected = [[0, 0], [1, 0], [1, -1], [-1, -1], [-1, 1]]
     np.testing.assert_array_equal(approaches(q), expected)
+    with pytest.raises(InputError, match=r'approach must have the shape \(5, 6\)'):
+        compensate(Compensator(UR, UR_TRUE), np.zeros((5, 6)), np.array(expected))
 
 
 @pytest.mark.parametrize(
