@@ -218,11 +218,7 @@ def test_a_path_through_a_singularity_stays_smooth():
     assert 0 < len(refused) < 500
     assert (np.abs(q[refused, 4]) < 0.2).all()
     gentle = Compensator(
-        UR,
-        UR_TRUE,
-        largest_turn=0.02,
-        largest_orientation_error=5e-3,
-        orientation_weight=1e-3,
+        UR, UR_TRUE, largest_turn=0.02, largest_orientation_error=5e-3, orientation_weight=1e-3
     )
     result = compensate(gentle, q)
     assert result.refusals == ()

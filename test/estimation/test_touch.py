@@ -185,11 +185,7 @@ def with_positions(seed):
     for k, plane in enumerate(PLANES):
         true = true.with_frame(f'base_{k}', Frame(plane))
     return true, Problem(
-        UR,
-        replace(seen, tool='tool_ball'),
-        more=sets,
-        sigma_position=SIGMA,
-        sigma_touch=SIGMA,
+        UR, replace(seen, tool='tool_ball'), more=sets, sigma_position=SIGMA, sigma_touch=SIGMA
     )
 
 

@@ -21,11 +21,7 @@ from calib_ros.files.export import (
 )
 from calib_ros.files.programs import joints_csv
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
-from calib_ros.kinematics.chain_file import (
-    dump_chain,
-    load_chain,
-    shipped_robots,
-)
+from calib_ros.kinematics.chain_file import dump_chain, load_chain, shipped_robots
 from calib_ros.kinematics.parameter import DH_KINDS
 
 KEYS = ('x', 'y', 'z', 'roll', 'pitch', 'yaw')

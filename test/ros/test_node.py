@@ -152,9 +152,7 @@ def test_every_kind_of_measurement_is_heard(cell, recording):
     for k, (topic, kind) in enumerate(KINDS.items()):
         some = np.isin(stop, (2 * k, 2 * k + 1))
         streams[topic] = pose_messages(
-            *(recording.poses.select(some), kind, covariance),
-            child=topic,
-            distances=lengths[some],
+            *(recording.poses.select(some), kind, covariance), child=topic, distances=lengths[some]
         )
     cell.play(streams)
     cell.node.session.problem()  # has taken what was waiting

@@ -159,12 +159,7 @@ def test_a_bag_without_named_sources_lists_the_frames(tmp_path, rng, storage):
 @pytest.mark.parametrize(
     ('still', 'moving', 'source', 'said'),
     [
-        (
-            [],
-            [],
-            '/tf parent=world child=tool0',
-            '6 links move from world to tool0 (base_link',
-        ),
+        ([], [], '/tf parent=world child=tool0', '6 links move from world to tool0 (base_link'),
         ([], [], '/tf parent=world child=base_link', 'nothing moves from world to base_link'),
         (
             [('world', 'tracker'), ('tool0', 'tool')],
