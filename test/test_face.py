@@ -5,7 +5,6 @@
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 import calib_ros
@@ -30,12 +29,3 @@ def test_the_import_loads_nothing_else():
         [sys.executable, '-c', line], check=True, capture_output=True, text=True
     )
     assert shown.stdout.strip() == '[]'
-
-
-def test_the_first_lines_of_the_readme_work():
-    chain = calib_ros.load_chain('ur10e')
-    joints = chain.random_joints(20, np.random.default_rng(1))
-    poses = chain.forward(joints)
-    seen = calib_ros.Observations.from_arrays(joints, poses[:, :3, 3], poses[:, :3, :3])
-    found = calib_ros.identify(calib_ros.Problem(chain, seen))
-    assert not found.accepted  # nothing to gain
