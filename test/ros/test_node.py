@@ -75,16 +75,11 @@ def test_direct_bag_and_live_give_equal_observations(request, tmp_path, mode, st
             assert abs(live.delay.seconds - 0.03) < 0.002
 
 
-def with_a_hole(recording):
-    """Return a recording without the joint states of its last seven stops but for the end."""
-    stamps = recording.joint_stamps_ns
-    begin, end = stamps[0] + 17 * 10**9, stamps[-1] - 5 * 10**8
-    kept = (stamps < begin) | (stamps > end)
-    return replace(recording, joint_stamps_ns=stamps[kept], joints=recording.joints[kept])
-
-
 def test_what_looks_wrong_is_told_live_and_of_a_bag(tmp_path, capfd, recording):
-    recording, status = with_a_hole(recording), '20 Hz or more'
+    """The joint states of the last seven stops are missing but for the end."""
+    stamps, status = recording.joint_stamps_ns, '20 Hz or more'
+    kept = (stamps < stamps[0] + 17 * 10**9) | (stamps > stamps[-1] - 5 * 10**8)
+    recording = replace(recording, joint_stamps_ns=stamps[kept], joints=recording.joints[kept])
     said = f'max_gap (0.1 s): {status} are needed'
     write_bag(tmp_path / 'bag', recording, 'mcap')
     arguments = ['identify', str(tmp_path / 'bag'), '--chain', 'ur10e', '--json']
