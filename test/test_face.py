@@ -5,8 +5,6 @@
 import subprocess
 import sys
 
-import pytest
-
 import calib_ros
 
 
@@ -15,11 +13,6 @@ def test_all_public_names_are_there_and_sorted():
     for name in calib_ros.__all__:
         assert getattr(calib_ros, name).__name__ == name
     assert set(calib_ros.__all__) <= set(dir(calib_ros))
-
-
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match='identity'):
-        _ = calib_ros.identity
 
 
 def test_the_import_loads_nothing_else():

@@ -131,6 +131,12 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ({'folds': True}, 'parameter "folds" must be a finite number, not True'),
         ({'joint_names': [1, 2]}, 'parameter "joint_names" must be a list of strings such as ['),
         ({'shortest_stop': 6.0}, 'shortest_stop (6 s) must be shorter than longest_stop (5 s)'),
+        ({'tip_link': 'tool0'}, 'apply only to a URDF'),
+        ({'history': 'history'}, 'set serial as well'),
+        ({'data_dir': '~nobody-here/x'}, 'no such home folder'),
+        ({'candidates': '~nobody-here/x'}, 'no such home folder'),
+        ({'target_filename': '/x.yaml'}, 'choose target_filename in data_dir, or start'),
+        ({'calibration_filename': '/x.yaml'}, 'choose calibration_filename in data_dir, or start'),
         ({'settle': 100.0}, 'settle (100 s) must be shorter than longest_stop (5 s)'),
     ],
 )
