@@ -16,16 +16,8 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros import parameters as parameters_module
 
-TABLES = {
-    'dh_standard.csv',
-    'dh_modified.csv',
-    'dh_standard.yaml',
-    'dh_modified.yaml',
-    'kinematics.yaml',
-    'dh_without_beta.csv',
-    'joint_offsets.csv',
-    'ur_kinematics.yaml',
-}
+TABLES = {f'dh_{form}.{kind}' for form in ('standard', 'modified') for kind in ('csv', 'yaml')}
+TABLES |= {'kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv', 'ur_kinematics.yaml'}
 
 
 def urdf_of(chain):
