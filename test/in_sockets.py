@@ -56,11 +56,7 @@ def cell(seed, offset=0.03, noise=0.0, count=30):
             sets.append(replace(seen, base=base, socket=True))
         separations.append((*bases, DISTANCE))
     return true, Problem(
-        IIWA,
-        sets[0],
-        more=sets[1:],
-        separations=separations,
-        sigma_position=max(noise, 1e-5),
+        IIWA, sets[0], more=sets[1:], separations=separations, sigma_position=max(noise, 1e-5)
     )
 
 

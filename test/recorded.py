@@ -48,8 +48,7 @@ def joint_state(stamp_ns, values=(0.1, 0.2, 0.3), names=('a', 'b', 'c')):
 
 def pose(position=(1.0, 2.0, 3.0), quat=(0.0, 0.0, 0.0, 1.0)):
     return TYPES['geometry_msgs/msg/Pose'](
-        TYPES['geometry_msgs/msg/Point'](*position),
-        TYPES['geometry_msgs/msg/Quaternion'](*quat),
+        TYPES['geometry_msgs/msg/Point'](*position), TYPES['geometry_msgs/msg/Quaternion'](*quat)
     )
 
 
@@ -66,8 +65,7 @@ def transform_stamped(
     stamp_ns, position=(1.0, 2.0, 3.0), quat=(0.0, 0.0, 0.0, 1.0), child='target'
 ):
     transform = TYPES['geometry_msgs/msg/Transform'](
-        TYPES['geometry_msgs/msg/Vector3'](*position),
-        TYPES['geometry_msgs/msg/Quaternion'](*quat),
+        TYPES['geometry_msgs/msg/Vector3'](*position), TYPES['geometry_msgs/msg/Quaternion'](*quat)
     )
     kind = TYPES['geometry_msgs/msg/TransformStamped']
     return kind(header(stamp_ns), child, transform)

@@ -71,9 +71,7 @@ def inner(name):
 
 
 def test_every_folder_has_its_place():
-    assert {path.name for path in PACKAGE.iterdir() if (path / '__init__.py').exists()} == set(
-        LEVEL
-    )
+    assert {path.parent.name for path in PACKAGE.glob('*/__init__.py')} == set(LEVEL)
 
 
 def test_the_page_names_modules_that_exist():

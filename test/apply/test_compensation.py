@@ -218,11 +218,7 @@ def test_a_path_through_a_singularity_stays_smooth():
     assert 0 < len(refused) < 500
     assert (np.abs(q[refused, 4]) < 0.2).all()
     gentle = Compensator(
-        UR,
-        UR_TRUE,
-        largest_turn=0.02,
-        largest_orientation_error=5e-3,
-        orientation_weight=1e-3,
+        UR, UR_TRUE, largest_turn=0.02, largest_orientation_error=5e-3, orientation_weight=1e-3
     )
     result = compensate(gentle, q)
     assert result.refusals == ()
@@ -271,6 +267,8 @@ def test_approaches_are_the_last_moves():
     q = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.5], [0.5, 0.5], [0.5, 0.6]])
     expected = [[0, 0], [1, 0], [1, -1], [-1, -1], [-1, 1]]
     np.testing.assert_array_equal(approaches(q), expected)
+    with pytest.raises(InputError, match=r'approach must have the shape \(5, 6\)'):
+        compensate(Compensator(UR, UR_TRUE), np.zeros((5, 6)), np.array(expected))
 
 
 @pytest.mark.parametrize(

@@ -34,21 +34,17 @@ def wanted(chain, placements, which, task=TASK):
     return chain.frame('base').matrix @ frame @ task
 
 
-def true_errors(true, chain, placements, which):
-    """Return what the real arm misses when it goes to the joint values of a placement."""
-    there = true.forward(placements.joints[which])[:, :3, 3]
-    return np.linalg.norm(there - wanted(chain, placements, which)[:, :3, 3], axis=1)
-
-
 @pytest.mark.parametrize('aim', ['mean', 'worst'])
 def test_the_best_placement_beats_the_centre_on_the_true_arm(cell, arm, placed, aim):
     """Commanded by the nominal model; what is expected comes true."""
     true = cell[0]
     found = placed if aim == 'mean' else place(arm, TASK, aim, 'nominal', cells=6)
     over = np.mean if aim == 'mean' else np.max
-    best, centre = (
-        over(true_errors(true, arm.before, found, which)) for which in (found.best, found.centre)
-    )
+    missed = [
+        true.forward(found.joints[which]) - wanted(arm.before, found, which)
+        for which in (found.best, found.centre)
+    ]
+    best, centre = (over(np.linalg.norm(each[:, :3, 3], axis=1)) for each in missed)
     assert found.errors[found.best] < 0.7 * found.errors[found.centre]
     assert best < 0.7 * centre
     for which, there in ((found.best, best), (found.centre, centre)):

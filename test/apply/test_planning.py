@@ -186,23 +186,16 @@ def travel(q, order, speeds):
     return (np.abs(np.diff(q[list(order)], axis=0)) / speeds).max(axis=1).sum()
 
 
-@settings(max_examples=8)
-@given(st.integers(0, 10_000))
-def test_the_way_is_close_to_the_shortest(seed):
+@pytest.mark.parametrize(('count', 'seed'), [(1, 0), (2, 0), *((7, seed) for seed in range(8))])
+def test_the_way_is_close_to_the_shortest(count, seed):
     rng = np.random.default_rng(seed)
-    q, speeds = rng.uniform(-3.0, 3.0, (7, 3)), np.array([1.0, 2.0, 0.5])
+    q, speeds = rng.uniform(-3.0, 3.0, (count, 3)), np.array([1.0, 2.0, 0.5])
     order = visit_order(q, speeds)
-    assert sorted(order.tolist()) == list(range(7))
-    shortest = min(travel(q, each, speeds) for each in permutations(range(7)))
+    assert sorted(order.tolist()) == list(range(count))
+    shortest = min(travel(q, each, speeds) for each in permutations(range(count)))
     assert travel(q, order, speeds) <= 1.25 * shortest
     changed = order.copy()  # no part turned round is shorter
-    for i, j in combinations(range(8), 2):
+    for i, j in combinations(range(count + 1), 2):
         changed[i:j] = order[i:j][::-1]
         assert travel(q, changed, speeds) >= travel(q, order, speeds) - 1e-6
         changed[i:j] = order[i:j]
-
-
-@pytest.mark.parametrize('count', [1, 2])
-def test_the_way_of_few_poses(count):
-    q = some(arm(), count)
-    assert sorted(visit_order(q, np.ones(6)).tolist()) == list(range(count))

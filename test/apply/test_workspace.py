@@ -156,6 +156,7 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
     text = (tmp_path / 'map' / 'workspace.md').read_text()
     assert 'Where the calibration removes most' in text
     assert text.count('| expected to remain |') == 1
+    assert 'Expected to remain: its uncertainty' in text
     with (tmp_path / 'map' / 'workspace.csv').open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 500

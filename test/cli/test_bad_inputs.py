@@ -39,12 +39,10 @@ def bad_inputs():
         ': every parameter is fixed: nothing is left to identify\n',
     )
     yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
+    for wrong in ('0', '-1', 'nan', 'inf'):
+        yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be positive'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
-    yield (
-        'useless option',
-        (*good, '--sources', '/pose'),
-        '--sources does not apply to a table',
-    )
+    yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
     yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag'
     names = ('--joint-names', 'a,a,b,c,d,e,f')
     yield 'joint names', (*bag_of, 'folder', *names), 'wrist_3_joint; not a, a, b, c, d, e, f'
@@ -81,8 +79,7 @@ def bad_inputs():
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'complaint'),
-    [pytest.param(*rest, id=name) for name, *rest in bad_inputs()],
+    ('arguments', 'complaint'), [pytest.param(*rest, id=name) for name, *rest in bad_inputs()]
 )
 def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint):
     rows = rows_of(measured())

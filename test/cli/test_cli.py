@@ -137,22 +137,6 @@ def test_a_table_and_its_bag_give_the_same(run, identified, tmp_path, storage, h
     assert samples['dropped'] == {}
 
 
-def test_simulate_then_identify(run, identified, tmp_path):
-    bag = tmp_path / 'cells' / 'bag'
-    status, out, err = run('simulate', bag, '--chain', 'ur5e', '--poses', 25, '--seed', 3)
-    assert (status, err) == (0, '')
-    assert str(bag) in out
-    status, document = identified(bag, '--chain', 'ur5e')
-    assert status == 0
-    assert document['samples']['read'] == document['samples']['recorded'] > 0
-    assert document['samples']['samples'] == 25
-    assert document['samples']['configurations'] == 25
-    truth = load_chain(bag.parent / 'bag_truth.yaml')
-    for name, parameter in document['parameters'].items():
-        if parameter['std'] is not None and name.partition('.')[0] not in ('base', 'tool'):
-            assert abs(parameter['value'] - truth.value(name)) < 5.0 * parameter['std']
-
-
 def test_a_simulation_is_repeated_by_its_seed(run, tmp_path):
     truths = {}
     for name, seed in (('a', 1), ('b', 1), ('c', 2)):
@@ -209,17 +193,6 @@ def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, wri
         'calibration.yaml'
     }
     assert 'no gain on held-out poses' in (out / 'report.md').read_text()
-
-
-def test_fixed_parameters_stay_nominal(identified, table):
-    _, document = identified('--csv', table, '--chain', 'ur5e', '--fixed', '*.alpha,elbow*.a')
-    parameters = document['parameters']
-    held = {name for name in parameters if name.endswith('.alpha')} | {'elbow_joint.a'}
-    assert {name for name in parameters if parameters[name]['status'] == 'fixed'} == held
-    for name in held:
-        assert parameters[name]['offset'] == 0.0
-        assert parameters[name]['value'] == UR.value(name)
-        assert name not in document['unidentifiable']
 
 
 def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_path):

@@ -83,8 +83,7 @@ def session(seed, design='random', oriented=True, errors=1.0, unmodelled=False, 
 
 
 @pytest.mark.parametrize(
-    ('design', 'unmodelled'),
-    [('random', True), ('path', True), ('sweep', False), ('sweep', True)],
+    ('design', 'unmodelled'), [('random', True), ('path', True), ('sweep', False), ('sweep', True)]
 )
 @pytest.mark.parametrize(
     ('what', 'size'), [('tool', 1e-3), ('base', 1e-3), ('joint', 2e-3), ('joint', 9e-3)]

@@ -34,12 +34,7 @@ def test_the_minimum_is_that_of_an_independent_solver():
     *_, seen = measured_arm(4, 50, (2e-3, 2e-2))
     result = identify(
         Problem(
-            UR10E,
-            seen,
-            sigma_position=1e-3,
-            sigma_orientation=2e-2,
-            loss='none',
-            priors=NO_PRIOR,
+            UR10E, seen, sigma_position=1e-3, sigma_orientation=2e-2, loss='none', priors=NO_PRIOR
         )
     )
 

@@ -11,13 +11,7 @@ from scipy import stats
 
 from calib_ros.apply.simulation import measure
 from calib_ros.estimation import noise as noise_module
-from calib_ros.estimation.leastsquares import (
-    Prior,
-    System,
-    minimise,
-    stacked,
-    triangular_factor,
-)
+from calib_ros.estimation.leastsquares import Prior, System, minimise, stacked, triangular_factor
 from calib_ros.estimation.noise import noise_of
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.shared_errors import Shared

@@ -318,8 +318,7 @@ def test_the_mistake_comes_first_where_the_fit_does_not_end_well():
 
 
 @pytest.mark.parametrize(
-    ('kind', 'seed', 'on_flange'),
-    [('degrees', 1, False), ('sign', 4, False), ('shift', 2, False)],
+    ('kind', 'seed', 'on_flange'), [('degrees', 1, False), ('sign', 4, False), ('shift', 2, False)]
 )
 def test_a_fit_that_runs_away_is_told_in_figures(kind, seed, on_flange):
     _, seen = scene(seed, on_flange)

@@ -8,9 +8,7 @@ from fits import SIGMAS, UR10E, measured_arm, rms
 
 from calib_ros.apply.simulation import Cell
 from calib_ros.errors import TooFewObservationsError, UnknownNameError
-from calib_ros.estimation.identifiability import (
-    structurally_independent,
-)
+from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.parameter import Parameter

@@ -4,16 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import (
-    NO_PRIOR,
-    NOISE,
-    UR10E,
-    directions,
-    fitted,
-    measured_arm,
-    rms,
-    spoiled,
-)
+from fits import NO_PRIOR, NOISE, UR10E, directions, fitted, measured_arm, rms, spoiled
 
 from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.estimation.problem import Problem

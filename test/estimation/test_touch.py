@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A point at the tool that touches planes of unknown place."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -186,11 +185,7 @@ def with_positions(seed):
     for k, plane in enumerate(PLANES):
         true = true.with_frame(f'base_{k}', Frame(plane))
     return true, Problem(
-        UR,
-        replace(seen, tool='tool_ball'),
-        more=sets,
-        sigma_position=SIGMA,
-        sigma_touch=SIGMA,
+        UR, replace(seen, tool='tool_ball'), more=sets, sigma_position=SIGMA, sigma_touch=SIGMA
     )
 
 
@@ -258,18 +253,6 @@ def test_touches_in_a_table_are_as_given(tmp_path):
         assert each.plane
         np.testing.assert_array_equal(each.joints, given.joints)
         np.testing.assert_array_equal(each.distances, given.distances)
-
-
-def test_the_command_line_takes_touches(run, tmp_path):
-    write_csv(tmp_path / 'touched.csv', rows_of(cell(6)[1]))
-    given = ('identify', 'touched.csv', '--chain', 'ur10e', '--sigma-touch', SIGMA)
-    status, out, _ = run(*given, '--model', 'geometric', '--json')
-    document = json.loads(out)
-    assert (status, document['accepted']) == (0, True)
-    assert {'base_A.z', 'base_B.rx', 'base_C.ry'} <= {
-        name for name, each in document['parameters'].items() if each['status'] == 'fitted'
-    }
-    assert document['validation']['after']['rms_mm'] < 3e3 * SIGMA
 
 
 def test_a_plane_needs_heights_and_a_sigma():

@@ -79,16 +79,6 @@ def test_a_session_that_is_not_there_lists_those_that_are(read):
         read(POINTS, 'A')
 
 
-def test_a_single_session_needs_no_choice(read):
-    fitted, _ = read(SESSIONS.replace('B,', 'A,'))
-    assert len(fitted) == 3
-
-
-def test_a_bad_row_of_another_session_does_not_matter(read):
-    fitted, _ = read(SESSIONS.replace('B,2', 'B,nan'), 'A')
-    assert len(fitted) == 2
-
-
 def test_a_blank_quaternion_makes_a_position(read):
     fitted, _ = read(POSES.replace('0.5,-0.5,0.5,0.5', ',,,'))
     assert fitted.oriented.tolist() == [True, False]
@@ -118,10 +108,19 @@ def test_each_device_and_session_has_a_frame_of_its_own(tmp_path):
     assert table.world_frame == 'world'
 
 
-def test_a_row_that_was_taken_back_may_be_in_any_frame(read):
-    rows = ['1,1,0,1,0,0,world,', '2,2,0,2,0,0,map,', '2,2,0,2,0,0,map,removed']
-    fitted, _ = read('\n'.join(['stamp_ns,q1,q2,x,y,z,frame_id,split', *rows, '']))
-    assert len(fitted) == 1
+FRAMED = 'stamp_ns,q1,q2,x,y,z,frame_id,split\n1,1,0,1,0,0,world,\n2,2,0,2,0,0,map,\n'
+
+
+@pytest.mark.parametrize(
+    ('text', 'session', 'count'),
+    [
+        (SESSIONS.replace('B,', 'A,'), None, 3),  # a single one needs no choice
+        (SESSIONS.replace('B,2', 'B,nan'), 'A', 2),
+        (f'{FRAMED}2,2,0,2,0,0,map,removed\n', None, 1),
+    ],
+)
+def test_rows_of_other_sessions_and_rows_taken_back_may_be_anything(read, text, session, count):
+    assert len(read(text, session)[0]) == count
 
 
 TURN, FLAG = '0.5,-0.5,0.5,0.5', 'q1,q2,x,y,z,qx,qy,qz,qw,eye_in_hand\n1,0,1,0,0,0,0,0,1,'

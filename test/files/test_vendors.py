@@ -131,10 +131,14 @@ def test_frames_are_those_of_the_urdf_if_there_is_one(text, ends, tip, rng):
         np.testing.assert_allclose(row[:3], described[name][:3, 3], rtol=0, atol=1e-9)
 
 
-def test_a_tool_in_the_table_of_a_franka_is_no_flange():
+def test_arms_that_are_laid_out_otherwise_get_no_file():
+    """A tool in the table of a Franka is no flange."""
     nominal = replace(chain_from_urdf(PANDA, tip_link='panda_hand'), base=None, tool=None)
     longer = nominal.with_offsets({'panda_joint7.d': 0.1034})
     assert vendor_files(longer, longer) == ()
+    bent = load_chain('ur10e').with_offsets({'elbow_joint.alpha': np.pi / 2})
+    for other in (bent, *map(load_chain, ('kuka_iiwa14', 'puma560', 'meca500'))):
+        assert vendor_files(other, other) == ()
 
 
 def test_what_the_file_cannot_hold_is_said():
@@ -144,16 +148,6 @@ def test_what_the_file_cannot_hold_is_said():
     assert found.error == pytest.approx(abs(chain.joints[-1].a - nominal.joints[-1].a), rel=0.5)
     gear = replace(corrected(nominal), effects=(('elbow_joint.ratio', 1e-3),))
     assert vendor_files(gear, nominal)[0].error > 1e-4
-
-
-@pytest.mark.parametrize('name', ['kuka_iiwa14', 'puma560', 'meca500'])
-def test_other_arms_get_no_file(name):
-    assert vendor_files(load_chain(name), load_chain(name)) == ()
-
-
-def test_an_arm_that_is_laid_out_otherwise_gets_no_file():
-    nominal = load_chain('ur10e').with_offsets({'elbow_joint.alpha': np.pi / 2})
-    assert vendor_files(nominal, nominal) == ()
 
 
 def test_the_hash_is_that_of_the_robot_or_of_the_numbers():

@@ -39,10 +39,7 @@ def test_robots_with_what_their_group_says(tmp_path):
     assert first.since == datetime(2026, 11, 20, tzinfo=timezone.utc)
     assert second.chain.name == 'ur5e'
     assert second.settings == Settings()
-    assert second.measured == (
-        Pattern('s3://bags/B/*'),
-        Pattern(str(tmp_path / 'both.csv'), 'A'),
-    )
+    assert second.measured == (Pattern('s3://bags/B/*'), Pattern(str(tmp_path / 'both.csv'), 'A'))
     assert (second.tolerance, second.largest_loss, second.since) == (None, 0.2, None)
     assert first.settings_hash != second.settings_hash
 

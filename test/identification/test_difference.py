@@ -96,6 +96,10 @@ def test_a_joint_that_was_bumped_is_named(nights):
     words = found.in_words()
     assert 'elbow_joint.theta by +0.' in words
     assert 'nothing else: was it bumped?' in words
+    told = found.document()
+    sizes = [1e3 * each for each in (found.rms, found.limit, found.left)]
+    assert [told[f'{each}_mm'] for each in ('rms', 'limit', 'left')] == sizes
+    assert told['parameters']['elbow_joint.theta']['change'] == pytest.approx(3e-4, abs=1e-4)
     back = difference(calibrated(bumped, 1), first)
     assert back.changed[0][0].change[0] == pytest.approx(-reason.change[0], abs=5e-5)
 

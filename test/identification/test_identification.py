@@ -87,17 +87,13 @@ def test_known_frames_leave_the_first_and_last_link_identifiable(oriented):
     np.testing.assert_array_equal(result.chain.base.matrix, frames['base'].matrix)
 
 
-def scores_of(result, true):
-    """Return the errors of the parameters in their standard deviations."""
-    return [(p.value - true.value(p.name)) / p.std for p in result.parameters if p.std is not None]
-
-
 def test_standard_deviations_are_honest():
     """Deviations from the truth in units of the standard deviation given: spread 1, seeded."""
     scores = []
     for seed in range(40):
         _, true, seen = measured_arm(seed, 40, (5e-5, 5e-5 / 0.3))
-        scores += scores_of(fitted(Problem(UR10E, seen)), true)
+        rows = [p for p in fitted(Problem(UR10E, seen)).parameters if p.std is not None]
+        scores += [(p.value - true.value(p.name)) / p.std for p in rows]
     assert len(scores) == 40 * 30
     assert np.std(scores) == pytest.approx(1.0, abs=0.06)
     assert abs(np.mean(scores)) < 0.1

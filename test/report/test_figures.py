@@ -16,7 +16,7 @@ from calib_ros.decision.comparison import compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.effects import Verdict
-from calib_ros.report.figures import against_noise, coverage, cumulated, drives
+from calib_ros.report.figures import against_noise, coverage, cumulated, drives, forest
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import poses_to_verify
 
@@ -129,3 +129,18 @@ def test_the_share_of_poses_within_an_error_is_counted(rng, count):
             within = errors <= x * (1.0 + 1e-4)  # digits shown
             assert y == pytest.approx(100.0 * within.mean(), abs=0.1)
     assert drawing(figure, 200)
+
+
+@pytest.mark.parametrize(('limit', 'near'), [(1e-3, True), (1.0, False)])
+def test_offsets_have_their_intervals_and_a_limit_that_is_near(solved, limit, near):
+    arm = [p for p in solved[1].parameters if not UR10E.owns_frame(p.name)]
+    lengths = [p for p in arm if p.std is not None and p.name.is_length]
+    figure = forest(arm, True, limit)
+    (dots,) = figure['data']
+    assert dots['x'] == pytest.approx([1e3 * p.offset for p in lengths], rel=1e-3, abs=1e-4)
+    widths = [1e3 * p.half_width() for p in lengths]
+    assert dots['error_x']['array'] == pytest.approx(widths, rel=1e-3, abs=1e-4)
+    shown = [each['x0'] for each in figure['layout']['shapes']]
+    assert shown == [0.0, *([-1e3 * limit, 1e3 * limit] if near else [])]
+    reach = figure['layout']['xaxis']['range'][1]
+    assert max(map(abs, shown)) < reach < 10.0

@@ -67,14 +67,6 @@ def test_without_its_extra_the_other_files_are_written(run, tmp_path, monkeypatc
     assert {'calibration.yaml', 'residuals.csv', 'report.md'} <= names
 
 
-@pytest.mark.usefixtures('table')
-@pytest.mark.parametrize('wrong', ['0', '-1', 'nan', 'inf'])
-def test_a_tolerance_that_makes_no_sense_is_refused(run, wrong):
-    status, _, err = run(*IDENTIFY, f'--tolerance={wrong}')
-    assert status == 1
-    assert '--tolerance must be positive' in err
-
-
 def test_the_other_commands_write_their_pages(solved, run, tmp_path):
     (tmp_path / 'calibration.yaml').write_text(Calibration.of(solved[1]).dump())
     write_csv(tmp_path / 'new.csv', rows_of(measured(seed=8, count=12), held_out=0))

@@ -33,12 +33,14 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
     off = Residuals(away, np.nan * away, np.arange(20), np.nan * away)
     both = Comparison(off, off, np.ones(20, bool))
     now = both.figures[1]
-    for told in (
-        verdict(previous, now, now),
-        checked(previous, Recalibration(previous, (), 1.0, both, 1e-4, 1e-4, 0.0)),
-    ):
+    updates = [
+        Recalibration(previous, (), 1.0, both, 1e-4, 1e-4, 0.0, refitted=ratio)
+        for ratio in (0.9, 1.1)  # new frames make held-out errors larger by that
+    ]
+    for told in (verdict(previous, now, now), checked(previous, updates[0])):
         assert told[0] == holds
         assert ('no longer holds: RMS 0.160 mm' in told[1]) != holds
+    assert [each.accepted for each in updates] == [holds, True]
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])

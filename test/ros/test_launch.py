@@ -51,39 +51,29 @@ def test_the_parameter_file_holds_where_no_argument_is_given(launched, tmp_path,
     assert found == given | {'serial': '0012', 'max_gap': 1.0, 'use_sim_time': False}
 
 
+TYPED = {
+    'chain': ('/robots/my arm: "left".yaml', '/robots/my arm: "left".yaml'),
+    'resume': ('True', True),
+    'use_sim_time': ('true', True),
+    'folds': ('7', 7),
+    'settle': ('1', 1.0),
+    'still': ('1e-05', 1e-5),
+    'marker_scale': ('100', 100.0),
+    'priors': ('*.a=0.001', ['*.a=0.001']),
+    'sources': ("['/left device=a', '/w type=Range']", ['/left device=a', '/w type=Range']),
+}
+
+
 def test_every_type_arrives(launched):
-    (node,), _ = launched(
-        'calibration.launch.py',
-        chain='/robots/my arm: "left".yaml',
-        resume='True',
-        use_sim_time='true',
-        folds='7',
-        settle='1',
-        still='1e-05',
-        marker_scale='100',
-        priors='*.a=0.001',
-        sources="['/tracker/left device=tracker', '/wire type=Range']",
-        namespace='cell_1',
-        joint_states='/ur/joint_states',
-        measured_pose='tracker/pose',
-    )
+    topics = {'joint_states': '/ur/joint_states', 'measured_pose': 'tracker/pose'}
+    given = {name: text for name, (text, _) in TYPED.items()}
+    (node,), _ = launched('calibration.launch.py', **given, **topics, namespace='cell_1')
     words = node.kwargs['ros_arguments']
     assert node.kwargs['namespace'] == 'cell_1'
     assert [word for flag, word in zip(words[::2], words[1::2], strict=True) if flag == '-r'] == [
-        'joint_states:=/ur/joint_states',
-        'measured_pose:=tracker/pose',
+        f'{ours}:={theirs}' for ours, theirs in topics.items()
     ]
-    assert parameters_of(words) == {
-        'chain': '/robots/my arm: "left".yaml',
-        'resume': True,
-        'use_sim_time': True,
-        'folds': 7,
-        'settle': 1.0,
-        'still': 1e-5,
-        'marker_scale': 100.0,
-        'priors': ['*.a=0.001'],
-        'sources': ['/tracker/left device=tracker', '/wire type=Range'],
-    }
+    assert parameters_of(words) == {name: value for name, (_, value) in TYPED.items()}
 
 
 @pytest.mark.parametrize('text', ['0012', 'true', '1e3', "it's", 'a: b #c', '[x]', 'é\\', '', '~'])

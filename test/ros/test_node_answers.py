@@ -300,10 +300,7 @@ def test_a_calibration_that_could_be_loaded_is_named_but_not_published(saved):
         assert node.session.calibration is None
 
 
-@pytest.mark.parametrize(
-    ('content', 'said'),
-    [(None, 'there is no file'), ('puma', 'joints')],
-)
+@pytest.mark.parametrize(('content', 'said'), [(None, 'there is no file'), ('puma', 'joints')])
 def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
     tmp_path, recording, content, said
 ):

@@ -7,14 +7,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from ros_cell import (
-    Cell,
-    joint_messages,
-    part,
-    pose_messages,
-    topics,
-    values_of,
-)
+from ros_cell import Cell, joint_messages, part, pose_messages, topics, values_of
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import String

@@ -8,7 +8,6 @@ import pytest
 from ros_cell import Cell, true_arm
 from std_srvs.srv import Trigger
 
-from calib_ros.errors import ConfigError, InputError
 from calib_ros.identification.records import nominal_document
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 
@@ -144,12 +143,6 @@ def test_the_list_of_folders_is_the_operators(cell):
     assert not load(cell, '/etc/passwd.yaml').success
 
 
-@pytest.mark.parametrize('name', ['target_filename', 'calibration_filename'])
-def test_a_file_elsewhere_is_refused_at_the_start(data, tmp_path, name):
-    with Cell() as cell, pytest.raises(InputError, match=f'choose {name} in data_dir, or start'):
-        cell.start(chain='ur10e', data_dir=str(data), **{name: str(tmp_path / 'x.yaml')})
-
-
 def test_files_are_found_at_home_though_no_shell_expands_a_parameter(tmp_path, monkeypatch):
     monkeypatch.setenv('HOME', str(tmp_path))
     (tmp_path / 'arm.yaml').write_text(dump_chain(true_arm()))
@@ -163,14 +156,3 @@ def test_a_folder_is_told_from_the_root(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Cell(chain='ur10e', data_dir='data') as cell:
         assert cell.node._archive.folder == tmp_path / 'data'
-
-
-@pytest.mark.parametrize('name', ['data_dir', 'candidates'])
-def test_a_home_that_there_is_not_is_refused_at_the_start(data, name):
-    with Cell() as cell, pytest.raises(InputError, match='no such home folder'):
-        cell.start(**{'chain': 'ur10e', 'data_dir': str(data), name: '~nobody-here/x'})
-
-
-def test_a_history_without_a_serial_number_is_refused_at_the_start(tmp_path):
-    with Cell() as cell, pytest.raises(ConfigError, match='set serial as well'):
-        cell.start(chain='ur10e', data_dir=str(tmp_path), history=str(tmp_path / 'history'))

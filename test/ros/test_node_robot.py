@@ -16,16 +16,8 @@ from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros import parameters as parameters_module
 
-TABLES = {
-    'dh_standard.csv',
-    'dh_modified.csv',
-    'dh_standard.yaml',
-    'dh_modified.yaml',
-    'kinematics.yaml',
-    'dh_without_beta.csv',
-    'joint_offsets.csv',
-    'ur_kinematics.yaml',
-}
+TABLES = {f'dh_{form}.{kind}' for form in ('standard', 'modified') for kind in ('csv', 'yaml')}
+TABLES |= {'kinematics.yaml', 'dh_without_beta.csv', 'joint_offsets.csv', 'ur_kinematics.yaml'}
 
 
 def urdf_of(chain):
@@ -79,8 +71,3 @@ def test_a_description_that_does_not_come_is_missed(tmp_path, monkeypatch):
             cell.start(['__ns:=/cell_2'], chain='robot_description', data_dir=str(tmp_path))
         said = 'waiting up to 0.2 s for /cell_2/robot_description'
         cell.spin_until(lambda: said in [each.msg for each in told])
-
-
-def test_links_belong_to_a_urdf(tmp_path):
-    with Cell() as cell, pytest.raises(ConfigError, match='apply only to a URDF'):
-        cell.start(chain='ur10e', tip_link='tool0', data_dir=str(tmp_path))

@@ -38,10 +38,7 @@ def link(parent, child, stamp, matrix):
 def still():
     """Return where the tracker is, and what else stands still."""
     return TFMessage(
-        transforms=[
-            link('hall', 'tracker', 0, TRACKER),
-            link('hall', 'base_link', 0, np.eye(4)),
-        ]
+        transforms=[link('hall', 'tracker', 0, TRACKER), link('hall', 'base_link', 0, np.eye(4))]
     )
 
 

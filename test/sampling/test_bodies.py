@@ -184,9 +184,3 @@ def test_another_message_of_that_name_is_told(tmp_path, rng, text):
     path = defined_by(tmp_path / 'bag', text, come)
     _, warnings = session_of(path, sources=(line(MOCAP),))
     assert 'a message on /bodies cannot be decoded' in ' '.join(warnings)
-
-
-def test_bodies_need_their_names():
-    for text in ('/bodies type=RigidBodies', '/bodies type=NamedPoseArray child=tool'):
-        with pytest.raises(ConfigError, match='RigidBodies or NamedPoseArray, and only then'):
-            parse_source(text)

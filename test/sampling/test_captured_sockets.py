@@ -21,9 +21,12 @@ def captured(problem, count=4):
     session = CalibrationSession(IIWA, Settings(mode='triggered', sigma_position=1e-5))
     now = 10 * S
     for number, each in enumerate(problem.sets):
-        for row in each.joints[:count].tolist():
+        for row in each.joints[:count]:
             stamps = now + np.arange(0, 50) * 10_000_000
-            come = [of_joints(joint_state(t, IIWA.joint_names, row)) for t in stamps.tolist()]
+            come = [
+                of_joints(joint_state(t, IIWA.joint_names, (row + (-1) ** k * 1e-5).tolist()))
+                for k, t in enumerate(stamps.tolist())
+            ]
             take(session, *come)
             assert session.capture(f'place {number // 2}/{number % 2}') == (1, '')
             now += S

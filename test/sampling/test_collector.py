@@ -7,7 +7,6 @@ from arriving import (
     MOVE,
     NOISE,
     POSE,
-    REST,
     STAND,
     STOPS,
     WIRE,
@@ -150,32 +149,20 @@ def test_a_capture_that_gives_nothing_says_why():
     assert 'has not been still for 0.2 s' in why
 
 
-def test_a_capture_in_dwell_mode_does_not_sample_the_stop_again():
-    motion = stops(STOPS[:1], 1.0, 60.0)
-    made = collector()
-    asking, answers = ask([1.0])
-    samples = play(made, joint_events(motion, 8.0), pose_events(motion, 8.0), asking)
-    assert answers == [(1, '')]
-    assert len(samples) == 1
-    assert made.unused[REST] > 300
-
-
-def test_a_capture_leaves_the_stop_before_its_sample():
-    """It comes before `lateness` has passed since that stop."""
-    motion = stops(STOPS[:3], 0.3, 0.5)
-    made = collector()
-    asking, answers = ask([1.25])
-    samples = play(made, joint_events(motion, 2.4), pose_events(motion, 2.4), asking)
-    assert answers == [(1, '')]
-    np.testing.assert_allclose([each.joints for each in samples], STOPS[:3], atol=1e-3)
-
-
-def test_a_capture_that_gives_nothing_leaves_the_stop_its_sample():
-    motion = stops(STOPS[:2], 1.0, 1.0)
-    made = collector()
-    asking, answers = ask([2.35])
-    late = [(time + 0.4, *what) for time, *what in pose_events(motion, 8.0)]
-    samples = play(made, joint_events(motion, 8.0), late, asking)
-    assert answers == [(0, 'no measurement within this stop')]
-    assert len(samples) == 2
-    assert samples[1].count > 200
+@pytest.mark.parametrize(
+    ('count', 'move', 'stand', 'time', 'late', 'answer', 'least'),
+    [
+        (1, 1.0, 60.0, 1.0, 0.0, (1, ''), 10),  # it is not sampled again
+        (3, 0.3, 0.5, 1.25, 0.0, (1, ''), 10),  # before `lateness` has passed since the one before
+        (2, 1.0, 1.0, 2.35, 0.4, (0, 'no measurement within this stop'), 200),
+    ],
+)
+def test_a_capture_leaves_each_stop_one_sample(count, move, stand, time, late, answer, least):
+    motion = stops(STOPS[:count], move, stand)
+    end = 2.4 if count == 3 else 8.0
+    asking, answers = ask([time])
+    measured = [(at + late, *what) for at, *what in pose_events(motion, end)]
+    samples = play(collector(), joint_events(motion, end), measured, asking)
+    assert answers == [answer]
+    np.testing.assert_allclose([each.joints for each in samples], STOPS[:count], atol=1e-3)
+    assert samples[-1].count >= least

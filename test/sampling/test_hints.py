@@ -305,8 +305,7 @@ def test_of_a_pause_in_the_joint_states_a_tenth_must_have_been_measured(pause, c
 
 
 @pytest.mark.parametrize(
-    ('mode', 'step'),
-    [('dwell', 0.15), ('dwell', -0.4), ('continuous', -0.15)],
+    ('mode', 'step'), [('dwell', 0.15), ('dwell', -0.4), ('continuous', -0.15)]
 )
 def test_a_clock_that_is_moved_is_told_with_the_sample(step, mode):
     seconds = 79.0

@@ -55,19 +55,13 @@ def robot(stamp_ns, rng):
     return tf(*(link(*pair, stamp_ns, frame(rng)) for pair in itertools.pairwise(names)))
 
 
-def fixed_robot(rng):
-    return tf(
-        link('world', 'base_link', 0, frame(rng)),
-        link('link_6', 'flange', 0, frame(rng)),
-        link('flange', 'tool0', 0, frame(rng)),
-    )
-
-
 def events(rng, moving, still=(), with_robot=True):
     """Return a bag: the robot's own frames, and those of a tracker."""
     found = standing([])
     if with_robot:
-        found.insert(0, ('/tf_static', fixed_robot(rng)))
+        ends = ('world', 'base_link'), ('link_6', 'flange'), ('flange', 'tool0')
+        fixed = tf(*(link(*pair, 0, frame(rng)) for pair in ends))
+        found.insert(0, ('/tf_static', fixed))
         found += [('/tf', robot(ms * MS, rng)) for ms in range(10, 1000, 20)]
     found = [*(('/tf_static', each) for each in still), *found]
     return [*found, *(('/tf', each) for each in moving)]
@@ -159,12 +153,7 @@ def test_a_bag_without_named_sources_lists_the_frames(tmp_path, rng, storage):
 @pytest.mark.parametrize(
     ('still', 'moving', 'source', 'said'),
     [
-        (
-            [],
-            [],
-            '/tf parent=world child=tool0',
-            '6 links move from world to tool0 (base_link',
-        ),
+        ([], [], '/tf parent=world child=tool0', '6 links move from world to tool0 (base_link'),
         ([], [], '/tf parent=world child=base_link', 'nothing moves from world to base_link'),
         (
             [('world', 'tracker'), ('tool0', 'tool')],
