@@ -75,7 +75,7 @@ class Row(Shown):
     """A filed result; docs/fleet.md describes the columns.
 
     Figures are in mm and mrad; offsets and covariance (P, P) of the parameters `names` in m and
-    rad.
+    rad; the parameters follow T waves of wobble of size `tilt` by `tilts` (P, T).
     """
 
     serial: str
@@ -104,6 +104,8 @@ class Row(Shown):
     names: tuple[str, ...] = ()
     offsets: FloatArray = field(default_factory=lambda: np.zeros(0))
     covariance: FloatArray = field(default_factory=lambda: np.zeros(0))
+    tilt: float | None = None
+    tilts: FloatArray = field(default_factory=lambda: np.zeros(0))
     chain: str = ''
 
     @property
@@ -179,6 +181,8 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
         names=names,
         offsets=np.array([offsets[name] for name in names]),
         covariance=result.covariance,
+        tilt=result.posterior.tilts.size,
+        tilts=np.float32(result.posterior.tilts.followed),
     )
 
 
@@ -375,13 +379,15 @@ def _rows_of(table: Any) -> list[Row]:
             elif value is None and 'None' not in str(each.type):
                 raise InputError(f'{key}{ENDING} in the history has no {each.name}: {AWAY}')
         size = len(record['names'])
-        square, offsets = record['covariance'], record['offsets']
-        numbers = np.concatenate([square, offsets])
-        if (square.size, offsets.size) != (size**2, size) or not np.isfinite(numbers).all():
+        square, offsets, tilts = (record[name] for name in ('covariance', 'offsets', 'tilts'))
+        numbers = np.concatenate([square, offsets, tilts])
+        fits = (square.size, offsets.size, tilts.size % max(size, 1)) == (size**2, size, 0)
+        if not (fits and np.isfinite(numbers).all()):
             raise InputError(
                 f'the offsets or covariance of {key}{ENDING} in the history are not those of '
                 f'{size} names: {AWAY}'
             )
         record['covariance'] = square.reshape(size, size)
+        record['tilts'] = tilts.reshape(size, tilts.size // max(size, 1))
         rows.append(Row(**record))
     return rows
