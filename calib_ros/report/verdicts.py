@@ -1,11 +1,18 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A verification in words."""
+"""Whether a calibration holds, in words: a verification, and the answers of the node."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.verification import DECIDING, Verification
+from calib_ros.decision.changes import FALSE, changes_in_words
+from calib_ros.decision.validation import Comparison
 from calib_ros.estimation.levels import NEARER
+from calib_ros.identification.calibration import Calibration
+from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
@@ -81,3 +88,59 @@ def hints(found: Verification) -> list[str]:
             '--joint-angle, --columns), their rows, the robot, and the target (--new-tool)'
         )
     return lines
+
+
+def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
+    """Return whether a calibration holds at the last stops, and why."""
+    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
+    if found.changed:
+        reasons = changes_in_words(found.changed)
+        return False, (
+            f'the calibration in use no longer fits, {reasons}: was it bumped? {text}; measure '
+            'at least 8 poses and call ~/identify, or run calib_ros identify --previous'
+        )
+    if found.unexplained <= FALSE:
+        return False, (
+            f'{text}, more than the calibration in use and noise explain; no change of a few '
+            'parameters explains it: measure new poses and call ~/identify'
+        )
+    if previous.holds(_least_and_most(found.comparison, 0)[0]) is False:
+        return False, _lost(previous, text)
+    return True, f'the calibration in use agrees with the measurements: {text}'
+
+
+def verdict(
+    calibration: Calibration, found: Comparison, reused: float = 0.0
+) -> tuple[bool | None, str]:
+    """Return whether a calibration holds on samples, of which a share is `reused`, and why.
+
+    None if the interval of the error contains the limit, as for `verify`.
+    """
+    nominal, now = found.figures
+    text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
+    text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    if warning := reused_in_words(reused):
+        text += f'; {warning}'
+    if calibration.residual is None:
+        return True, text
+    least, most = _least_and_most(found, 1)
+    if not calibration.holds(least):
+        return False, _lost(calibration, text)
+    text += f'; it had {1e3 * calibration.residual:.3f} mm'
+    if not calibration.holds(most):
+        return None, f'too few poses to tell whether the calibration holds: {text}; measure more'
+    return True, f'the calibration holds: {text}'
+
+
+def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
+    """Return the 95 % interval [m] of the RMS error; the figure alone without positions."""
+    rms = 1e-3 * found.figures[when].rms_mm
+    limits = interval_of(found, when)
+    return limits if np.isfinite(limits[1]) else (rms, rms)
+
+
+def _lost(calibration: Calibration, text: str) -> str:
+    return (
+        f'the calibration no longer holds: {text}; it had '
+        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, target or robot moved?'
+    )

@@ -13,17 +13,13 @@ import numpy as np
 
 import calib_ros
 from calib_ros.apply.confidence import interval_of
-from calib_ros.decision.changes import FALSE, changes_in_words
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
-from calib_ros.decision.validation import Comparison, ErrorFigures
+from calib_ros.decision.validation import Comparison
 from calib_ros.estimation.fitting import ParameterRow
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise
-from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.recalibrated import Recalibration
-from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -158,47 +154,6 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     for name, value in asdict(settings).items():
         parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
     return dump_yaml({'/**': {'ros__parameters': parameters}})
-
-
-def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
-    """Return whether a calibration holds at the last stops, and why."""
-    text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
-    if found.changed:
-        reasons = changes_in_words(found.changed)
-        return False, (
-            f'the calibration in use no longer fits, {reasons}: was it bumped? {text}; measure '
-            'at least 8 poses and call ~/identify, or run calib_ros identify --previous'
-        )
-    if found.unexplained <= FALSE:
-        return False, (
-            f'{text}, more than the calibration in use and noise explain; no change of a few '
-            'parameters explains it: measure new poses and call ~/identify'
-        )
-    if previous.holds(1e-3 * found.before.rms_mm) is False:
-        return False, _lost(previous, text)
-    return True, f'the calibration in use agrees with the measurements: {text}'
-
-
-def verdict(
-    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures, reused: float = 0.0
-) -> tuple[bool, str]:
-    """Return whether a calibration holds on samples, of which a share is `reused`, and why."""
-    text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
-    if warning := reused_in_words(reused):
-        text += f'; {warning}'
-    if calibration.residual is None:
-        return True, text
-    if not calibration.holds(1e-3 * now.rms_mm):
-        return False, _lost(calibration, text)
-    return True, f'the calibration holds: {text}; it had {1e3 * calibration.residual:.3f} mm'
-
-
-def _lost(calibration: Calibration, text: str) -> str:
-    return (
-        f'the calibration no longer holds: {text}; it had '
-        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, target or robot moved?'
-    )
 
 
 def figures_document(which: Comparison, intervals: bool = True) -> dict[str, Any]:

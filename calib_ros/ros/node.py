@@ -35,7 +35,7 @@ from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate, years_since
-from calib_ros.report import words
+from calib_ros.report import verdicts, words
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
 from calib_ros.ros.diagnostics import Diagnostics
@@ -284,16 +284,16 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return True, f'pose {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> Answer:
-        figures = self.session.validate()
+        found = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # required to judge
-        holds, text = words.verdict(calibration, *figures, self.session.reused())
-        return holds, text + self._filer.validated(self.session, figures, holds)
+        holds, text = verdicts.verdict(calibration, found, self.session.reused())
+        return bool(holds), text + self._filer.validated(self.session, found.figures, holds)
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
         years = years_since(calibration.record)
-        return words.checked(calibration, recalibrate(calibration, problem, years))
+        return verdicts.checked(calibration, recalibrate(calibration, problem, years))
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

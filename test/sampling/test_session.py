@@ -12,7 +12,7 @@ from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.report.words import verdict
+from calib_ros.report.verdicts import verdict
 from calib_ros.sampling.messages import Source
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
@@ -225,13 +225,13 @@ def test_later_samples_are_judged_in_the_frames_of_their_targets(first):
     later.adopt(parse_calibration(made.calibration.dump(), 'c.yaml', UR5E))
     made.clear()
     drive(made, UR5E.random_joints(5, rng), sources[first : first + 1])
-    expected = made.validate()
+    expected = made.validate().figures
     later.restore(made.samples)
-    now, nominal = later.validate()
+    nominal, now = later.validate().figures
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
-    assert (now.rms_mm, nominal.rms_mm) == pytest.approx([each.rms_mm for each in expected])
+    assert (now.rms_mm, nominal.rms_mm) == pytest.approx([each.rms_mm for each in expected[::-1]])
     drive(made, UR5E.random_joints(5, rng), sources)
-    now, nominal = made.validate()
+    nominal, now = made.validate().figures
     assert now.count > 5
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
     assert made.calibration.chain is result.chain
@@ -243,7 +243,7 @@ def test_samples_that_were_fitted_are_known_again():
     made.identify()
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
-    words = verdict(made.calibration, *made.validate(), made.reused())[1]
+    words = verdict(made.calibration, made.validate(), made.reused())[1]
     assert 'these are measurements to which the calibration was fitted' in words
 
 
@@ -253,7 +253,7 @@ def test_what_was_there_before_does_not_judge():
     made.identify()
     made.remove_last()
     drive(made, 4, [tracker()])
-    now, _ = made.validate()
+    _, now = made.validate().figures
     assert now.count == 4
 
 
