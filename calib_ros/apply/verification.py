@@ -14,6 +14,8 @@ The figure is the RMS position error over poses like those measured, with its in
     FAIL        the whole interval is beyond it
     UNDECIDED   the tolerance lies in the interval: more poses are needed
 
+Without a tolerance the limit is that of a calibration that still holds.
+
 On request, frames of the new measurements are fitted to both arms: the base if the device was
 moved, the tool if the target was changed or remounted. The change of any other frame counts as an
 error of the arm.
@@ -50,7 +52,7 @@ from calib_ros.shown import LISTED, Shown
 from calib_ros.values import SAME
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
-HOLDS: dict[bool | None, Verdict] = {True: 'holds', False: 'does not hold', None: 'no verdict'}
+STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
 NEEDED = 1 + len(TILTED)
 """Configurations needed for a verdict, besides those for fitted frames: the test poses of ISO
 9283."""
@@ -94,8 +96,8 @@ class Verification(Shown):
     freedom: float
     """Degrees of freedom of that error."""
     verdict: Verdict
-    """Without a tolerance 'holds', 'does not hold', or 'no verdict' if unknown; no verdict either
-    if fitted measurements look good."""
+    """Without a tolerance 'holds' and 'does not hold' instead of PASS and FAIL, or 'no verdict' if
+    the former error is unknown; no verdict either if fitted measurements look good."""
     needed: int | None
     """Number of configurations that would decide with the same RMS error, if undecided; None if
     even DECIDING would not."""
@@ -105,8 +107,6 @@ class Verification(Shown):
     """Whether the wanted poses are those of the uncorrected program."""
     fitted: tuple[str, ...] = ()
     """Frames fitted to the new measurements."""
-    holds: bool | None = None
-    """Whether the error agrees with that of the calibration (`Calibration.holds`), if known."""
     reused: float = 0.0
     """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     uncorrected: bool = False
@@ -143,7 +143,8 @@ def verify(
 
     `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
     `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
-    calibration holds. `confidence` is that of the interval; `progress` receives the share done.
+    calibration holds: the limit is then `Calibration.limit`. `confidence` is that of the interval;
+    `progress` receives the share done.
 
     With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
     remounted. Their frames are fitted, and absorb the errors of as many configurations, of three
@@ -168,14 +169,18 @@ def verify(
     numbers = np.unique(np.geomspace(count, max(count, DECIDING), 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    holds, reused, common = arm.holds(rms), arm.reused(sets), 1.0
-    verdict = _decided(tolerance, lower, upper, numbers) if tolerance else (HOLDS[holds], None)
-    if reused and verdict[0] not in ('FAIL', 'does not hold'):
+    reused, common = arm.reused(sets), 1.0
+    verdict: tuple[Verdict, int | None] = ('no verdict', None)
+    if limit := tolerance or arm.limit:
+        verdict = _decided(limit, lower, upper, numbers)
+    if reused and verdict[0] != 'FAIL':
         verdict = ('no verdict', None)
+    if tolerance is None:
+        verdict = (STANDS.get(verdict[0], verdict[0]), verdict[1])
     if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, holds, reused, uncorrected)
+    known = (commanded is not None, fitted, reused, uncorrected)
     return Verification(comparison, tolerance, confidence, group, *found, *known)
 
 

@@ -55,13 +55,7 @@ from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import shipped_chains
-from calib_ros.kinematics.parameter import (
-    DELAY,
-    IN_A_FRAME,
-    LENS_KINDS,
-    Parameter,
-    parameters_of,
-)
+from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
 

@@ -78,6 +78,9 @@ class Tilts(NamedTuple):
         return 0.0 <= self.size < np.inf and self.followed.shape[1] == 8 * len(chain.joints)
 
 
+NO_TILTS = Tilts(0.0, np.zeros((0, 0)))
+
+
 def tilting(chain: Chain) -> list[Parameter]:
     """Return the parameters that tilt the axes of joints: those of rows, and turns of bases."""
     bases = [frame for frame in chain.frame_names if frame.startswith('base')]

@@ -26,7 +26,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy import linalg
 
-from calib_ros.estimation.considered import Tilts, lengths_of, products_with_doubts
+from calib_ros.estimation.considered import NO_TILTS, Tilts, lengths_of, products_with_doubts
 from calib_ros.estimation.leastsquares import Normal, System
 from calib_ros.estimation.levels import OUT_OF_SCALE, SCALE
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
@@ -94,7 +94,7 @@ class Posterior(Shown):
     """The same for a device out of scale: log odds, scale minus one, mean (P,) and covariance."""
     unmodelled: tuple[float, float] = (0.0, 0.0)
     """Sizes [rad] of turns and tilts of the joints beyond all names (`unmodelled.py`)."""
-    tilts: Tilts | None = None
+    tilts: Tilts = NO_TILTS
     """How wobble of the axes moves the fitted parameters."""
 
     @cached_property

@@ -182,13 +182,15 @@ def _rows_of(table: Any) -> list[Row]:
             elif value is None and 'None' not in str(each.type):
                 raise InputError(f'{key}{ENDING} in the history has no {each.name}: {AWAY}')
         size = len(record['names'])
-        square, offsets = record['covariance'], record['offsets']
-        numbers = np.concatenate([square, offsets])
-        if (square.size, offsets.size) != (size**2, size) or not np.isfinite(numbers).all():
+        square, offsets, tilts = (record[name] for name in ('covariance', 'offsets', 'tilts'))
+        numbers = np.concatenate([square, offsets, tilts])
+        fits = (square.size, offsets.size, tilts.size % max(size, 1)) == (size**2, size, 0)
+        if not (fits and np.isfinite(numbers).all()):
             raise InputError(
                 f'the offsets or covariance of {key}{ENDING} in the history are not those of '
                 f'{size} names: {AWAY}'
             )
         record['covariance'] = square.reshape(size, size)
+        record['tilts'] = tilts.reshape(size, tilts.size // max(size, 1))
         rows.append(Row(**record))
     return rows

@@ -58,7 +58,7 @@ class Row(Shown):
     """A filed result; docs/fleet.md describes the columns.
 
     Figures are in mm and mrad; offsets and covariance (P, P) of the parameters `names` in m and
-    rad.
+    rad; the parameters follow T waves of wobble of size `tilt` by `tilts` (P, T).
     """
 
     serial: str
@@ -87,6 +87,8 @@ class Row(Shown):
     names: tuple[str, ...] = ()
     offsets: FloatArray = field(default_factory=lambda: np.zeros(0))
     covariance: FloatArray = field(default_factory=lambda: np.zeros(0))
+    tilt: float | None = None
+    tilts: FloatArray = field(default_factory=lambda: np.zeros(0))
     chain: str = ''
 
     @property
@@ -162,6 +164,8 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
         names=names,
         offsets=np.array([offsets[name] for name in names]),
         covariance=result.covariance,
+        tilt=result.posterior.tilts.size,
+        tilts=np.float32(result.posterior.tilts.followed),
     )
 
 

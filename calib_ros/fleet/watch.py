@@ -2,17 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Did the arm change between nights, when, and which joint (docs/fleet.md)?
 
-Night k brings the arm's parameters x_k with covariance C_k, without base and tool. For each of the
-last m nights (LAGS) the mean of these m is compared with the mean of the earlier nights, both
-weighted by information:
+Night k brings the arm's parameters x_k with covariance C_k, without base and tool, and how they
+follow waves of its wobbling axes, T_k. For each of the last m nights (LAGS) the mean of these m is
+compared with the mean of the earlier nights, both weighted by information:
 
-    d = x_after - x_before,   S = s^2 (C_after + C_before),   u = S^-1 d,   W = S^-1
+    d = x_after - x_before,   t = T_after - T_before,   u = S^-1 d,   W = S^-1
+    S = s^2 (C_after + C_before + w^2 t t^T)
 
 That j alone, a joint or two, changed by d_j = W_jj^-1 u_j with covariance W_jj^-1 explains
 g_j = u_j^T W_jj^-1 u_j of the difference, which has an F distribution if nothing changed: as many
 degrees of freedom as j has parameters, over those of the noise, or of s^2 if fewer: those of the
 earlier nights and of the rest. s^2 is the scatter of the nights beyond their covariances (warming
-up, model error), or of the rest beside j, where clearly larger than 1.
+up, model error), or of the rest beside j, where clearly larger than 1; w is the median size of the
+waves. They are the same in all nights: in the same region they change nothing.
 
 An effect that only some nights fitted is nominal in the others too: with the information matrix I
 of all parameters of the arm, a fit of the common ones c alone has I_cc and (I x)_c. That does not
@@ -198,10 +200,12 @@ class _Tests(NamedTuple):
 
 def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
     information, pulls = _information(fitted, names)
-    count, size = pulls.shape
+    count, size = pulls.shape[:2]
     groups = _groups(names)
     owners = np.array([name.owner for name in names])
     freedom = np.array([row.freedom or KNOWN for row, _ in fitted])
+    sizes = [row.tilt or 0.0 for row, _ in fitted]
+    size_of = np.array([np.median(sizes[: k + 1]) for k in range(count)])
     whole, pulled = np.cumsum(information, axis=0), np.cumsum(pulls, axis=0)
     chances = np.ones((len(LAGS), count, len(groups)))
     several = np.ones((len(LAGS), count))
@@ -212,9 +216,9 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
         nights = np.arange(lag, count)
         before = np.linalg.inv(whole[nights - lag])
         after = np.linalg.inv(whole[nights] - whole[nights - lag])
-        moved = np.einsum('kpr,kr->kp', after, pulled[nights] - pulled[nights - lag])
-        moved -= np.einsum('kpr,kr->kp', before, pulled[nights - lag])
-        inverse = np.linalg.inv(after + before)
+        moved = after @ (pulled[nights] - pulled[nights - lag]) - before @ pulled[nights - lag]
+        moved, tilts = moved[..., 0], size_of[nights, np.newaxis, np.newaxis] * moved[..., 1:]
+        inverse = np.linalg.inv(after + before + tilts @ np.swapaxes(tilts, 1, 2))
         force = np.einsum('kpr,kr->kp', inverse, moved)
         whole_of = np.einsum('kp,kp->k', moved, force)
         if lag == 1:
@@ -242,17 +246,21 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
 def _information(
     fitted: Sequence[_Fitted], names: tuple[Parameter, ...]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the information (K, P, P) of nights about parameters, and that times values (K, P).
+    """Return the information (K, P, P) of nights about parameters, without their tilts.
 
-    Other arm parameters are nominal, base and tool free.
+    And that times values and tilts (K, P, 1 + T). Other arm parameters are nominal, base and tool
+    free.
     """
     information, pulls = [], []
+    most = max(row.tilts.size // len(row.names) for row, _ in fitted)
     for row, arm in fitted:
         own = [row.names.index(name) for name in arm]
         which = [arm.index(name) for name in names]
-        whole = np.linalg.inv(row.covariance[np.ix_(own, own)])
+        tilts = row.tilts[own] if row.tilts.size else np.zeros((len(own), most))
+        square = row.covariance[np.ix_(own, own)] - (row.tilt or 0.0) ** 2 * tilts @ tilts.T
+        whole = np.linalg.inv(square)
         information.append(whole[np.ix_(which, which)])
-        pulls.append((whole @ row.offsets[own])[which])
+        pulls.append((whole @ np.column_stack([row.offsets[own], tilts]))[which])
     return np.array(information), np.array(pulls)
 
 

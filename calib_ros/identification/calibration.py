@@ -181,9 +181,14 @@ class Calibration(Shown):
             )
         return left
 
+    @property
+    def limit(self) -> float | None:
+        """Return the RMS error [m] of new poses up to which it holds, if known."""
+        return None if self.residual is None else ALIKE * self.residual
+
     def holds(self, rms: float) -> bool | None:
         """Tell whether the RMS error [m] of new poses agrees with the earlier one, if known."""
-        return None if self.residual is None else rms <= ALIKE * self.residual
+        return None if self.limit is None else rms <= self.limit
 
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that this calibration was fitted to, if known."""

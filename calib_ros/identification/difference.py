@@ -42,6 +42,11 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
+INCOMPLETE = (
+    'not certain: a calibration by an earlier version does not tell how wobbling axes, at other '
+    'poses, would change it: identify it again'
+)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Difference(Shown):
@@ -52,7 +57,8 @@ class Difference(Shown):
     errors and unmodelled effects too. Predicted positions differ by `rms` [m] over the joint range
     in the best frames, by `limit` [m] at most (95 %); the first model cannot follow `left` [m] of
     it. `changed` lists the changes, each with those indistinguishable from it; `unexplained` is
-    the probability of the remaining difference.
+    the probability of the remaining difference. An `incomplete` calibration, of an earlier
+    version, does not tell how wobble moves its parameters.
     """
 
     names: tuple[Parameter, ...]
@@ -65,6 +71,7 @@ class Difference(Shown):
     left: float
     changed: tuple[tuple[Explanation, ...], ...]
     unexplained: float
+    incomplete: bool
 
     @property
     def same(self) -> bool:
@@ -73,6 +80,8 @@ class Difference(Shown):
 
     def in_words(self) -> str:
         """Return the difference in words."""
+        if self.incomplete:
+            return f'{replace(self, incomplete=False).in_words()} ({INCOMPLETE})'
         if self.same:
             return f'unchanged within {1e3 * self.limit:.3f} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
@@ -130,29 +139,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     names, chain, change, left = _in_parameters_of(first, second)
     if not names:
         raise InputError('neither calibration fitted a parameter of the arm')
-    square, lacking = np.zeros((2, len(names), len(names)))
-    size, apart = 0.0, np.zeros((len(names), 1))
-    for number, each in enumerate((first, second), 1):
-        if each.covariance is None:
-            raise InputError(
-                f'calibration {number} has no parameter covariance: identify it again with this '
-                'version'
-            )
-        alone = each.covariance
-        if each.tilts is not None:
-            alone, size = alone - each.tilts.square, max(size, each.tilts.size)
-            apart = _change(each.chain, names, each.names) @ each.tilts.followed - apart
-        own = whole = _in_names(each.chain, names, each.names, alone)
-        region = each.region
-        if region is not None:
-            arm, device = region.square, region.device @ region.device.T
-            if any(Parameter(n).of_dh and n not in each.names for n in region.names):
-                own = _in_names(region.chain, names, region.names, arm)
-            whole = own + _in_names(region.chain, names, region.names, device)
-        square += own
-        lacking += whole
-    wobble = size**2 * apart @ apart.T
-    square, lacking = square + wobble, lacking + wobble
+    square, lacking = _squares((first, second), names)
     freedom = min(first.freedom, second.freedom)
     columns = Columns(chain, names)
     left_over = _information(names, change, square)
@@ -177,7 +164,37 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         left,
         tuple(changed),
         _chance(left_over, freedom, sum(len(each[0].names) for each in changed)),
+        None in (first.tilts, second.tilts),
     )
+
+
+def _squares(
+    pair: Sequence[Calibration], names: tuple[Parameter, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (P, P) of differences, without and with smooth device errors."""
+    square, lacking = np.zeros((2, len(names), len(names)))
+    size, apart = 0.0, np.zeros((len(names), 1))
+    for number, each in enumerate(pair, 1):
+        if each.covariance is None:
+            raise InputError(
+                f'calibration {number} has no parameter covariance: identify it again with this '
+                'version'
+            )
+        alone = each.covariance
+        if each.tilts is not None:
+            alone, size = alone - each.tilts.square, max(size, each.tilts.size)
+            apart = _change(each.chain, names, each.names) @ each.tilts.followed - apart
+        own = whole = _in_names(each.chain, names, each.names, alone)
+        region = each.region
+        if region is not None:
+            arm, device = region.square, region.device @ region.device.T
+            if any(Parameter(n).of_dh and n not in each.names for n in region.names):
+                own = _in_names(region.chain, names, region.names, arm)
+            whole = own + _in_names(region.chain, names, region.names, device)
+        square += own
+        lacking += whole
+    wobble = size**2 * apart @ apart.T
+    return square + wobble, lacking + wobble
 
 
 def _in_parameters_of(

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.apply.confidence import interval_of
 from calib_ros.decision.changes import FALSE, changes_in_words
-from calib_ros.decision.comparison import Comparison, ErrorFigures
+from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CONFIDENT
@@ -159,24 +159,39 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
             f'{text}, more than the calibration in use and noise explain; no change of a few '
             'parameters explains it: measure new poses and call ~/identify'
         )
-    if previous.holds(1e-3 * found.before.rms_mm) is False:
+    if previous.holds(_least_and_most(found.comparison, 0)[0]) is False:
         return False, _lost(previous, text)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
 
 def verdict(
-    calibration: Calibration, now: ErrorFigures, nominal: ErrorFigures, reused: float = 0.0
-) -> tuple[bool, str]:
-    """Return whether a calibration holds on samples, of which a share is `reused`, and why."""
+    calibration: Calibration, found: Comparison, reused: float = 0.0
+) -> tuple[bool | None, str]:
+    """Return whether a calibration holds on samples, of which a share is `reused`, and why.
+
+    None if the interval of the error contains the limit, as for `verify`.
+    """
+    nominal, now = found.figures
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
     if warning := reused_in_words(reused):
         text += f'; {warning}'
     if calibration.residual is None:
         return True, text
-    if not calibration.holds(1e-3 * now.rms_mm):
+    least, most = _least_and_most(found, 1)
+    if not calibration.holds(least):
         return False, _lost(calibration, text)
-    return True, f'the calibration holds: {text}; it had {1e3 * calibration.residual:.3f} mm'
+    text += f'; it had {1e3 * calibration.residual:.3f} mm'
+    if not calibration.holds(most):
+        return None, f'too few poses to tell whether the calibration holds: {text}; measure more'
+    return True, f'the calibration holds: {text}'
+
+
+def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
+    """Return the 95 % interval [m] of the RMS error; the figure alone without positions."""
+    rms = 1e-3 * found.figures[when].rms_mm
+    limits = interval_of(found, when)
+    return limits if np.isfinite(limits[1]) else (rms, rms)
 
 
 def _lost(calibration: Calibration, text: str) -> str:

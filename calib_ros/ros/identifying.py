@@ -70,16 +70,20 @@ class Filer:
         return self._file(lambda: identified(result, self._about(problem, settings)))
 
     def validated(
-        self, session: CalibrationSession, figures: tuple[ErrorFigures, ErrorFigures], holds: bool
+        self,
+        session: CalibrationSession,
+        figures: tuple[ErrorFigures, ErrorFigures],
+        holds: bool | None,
     ) -> str:
         """File the validation of a session's calibration, as `identified`."""
         calibration = session.calibration
         assert calibration is not None  # required for the figures
-        chain, verdict = calibration.chain, 'holds' if holds else 'does not hold'
+        chain = calibration.chain
+        verdict = {True: 'holds', False: 'does not hold', None: 'UNDECIDED'}[holds]
 
         def row() -> Row:
             about = self._about(session.problem(), session.settings, table_hash(chain))
-            return judged(chain, figures[1], figures[0], verdict, about)
+            return judged(chain, *figures, verdict, about)
 
         return self._file(row)
 

@@ -285,11 +285,11 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return True, f'pose {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> Answer:
-        figures = self.session.validate()
+        found = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # required to judge
-        holds, text = words.verdict(calibration, *figures, self.session.reused())
-        return holds, text + self._filer.validated(self.session, figures, holds)
+        holds, text = words.verdict(calibration, found, self.session.reused())
+        return bool(holds), text + self._filer.validated(self.session, found.figures, holds)
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found

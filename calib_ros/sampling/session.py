@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from calib_ros.decision.comparison import ErrorFigures, compare
+from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.result import Identification
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation.configurations import configurations
@@ -319,14 +319,13 @@ class CalibrationSession:
         self._known = frozenset(self.samples if samples is None else samples)
         self.calibration = calibration
 
-    def validate(self) -> tuple[ErrorFigures, ErrorFigures]:
+    def validate(self) -> Comparison:
         """Judge the calibration on the poses measured since, without fitting.
 
-        Returns the errors of the calibration, and of the nominal chain in its frames.
+        Returns the errors of the nominal chain in its frames, and of the calibration.
         """
         calibration, sets = self._since()
-        nominal, now = compare(calibration.before, calibration.chain, sets).figures
-        return now, nominal
+        return compare(calibration.before, calibration.chain, sets)
 
     def reused(self) -> float:
         """Return the share of later samples that the calibration was fitted to."""

@@ -294,9 +294,23 @@ def test_limits_hold_where_some_places_are_worse_than_others():
 
 def test_a_session_is_judged_without_a_tolerance(arm, cell):
     seen = [measured(cell[0], UR.random_joints(10, np.random.default_rng(0)))]
-    for residual, verdict in ((1e9, 'holds'), (1e-6, 'does not hold'), (None, 'no verdict')):
+    rms = verify(arm, seen, None).rms
+    for residual, verdict, needed in (
+        (1e9, 'holds', 10),
+        (1e-6, 'does not hold', 10),
+        (None, 'no verdict', None),
+        (rms / 1.5 * 1.05, 'UNDECIDED', None),
+        (rms / 1.5 * 0.95, 'UNDECIDED', None),
+    ):
         found = verify(replace(arm, residual=residual), seen, None)
-        assert (found.verdict, found.needed, found.tolerance) == (verdict, None, None)
+        assert (found.verdict, found.tolerance) == (verdict, None)
+        if verdict == 'UNDECIDED':  # as the tolerance of the same size is
+            assert found.needed > 10
+            same = verify(arm, seen, 1.5 * residual)
+            assert (same.verdict, same.needed) == (verdict, found.needed)
+            assert f'about {found.needed} poses with the same RMS error' in in_words(found)
+        else:
+            assert found.needed == needed
         assert 'wanted is' not in in_words(found)
         assert f'poses like these is {rounded(1e3 * found.rms)} mm (' in in_words(found)
 

@@ -60,6 +60,33 @@ def test_a_bump_is_found_within_two_nights_and_its_joint_named(first, rng, name)
         assert name in str(change)
 
 
+def wobbling(first, rng, rows, stay):
+    """Yield the nights of an arm with axes that wobble, in another region after some."""
+    sigma = 1e4 * np.sqrt(np.diag(first.covariance))[:, np.newaxis]  # 20 sigma in all, of 0.1 mrad
+    followed = [3.0 * sigma * rng.normal(size=first.tilts.shape) for _ in range(2)]
+    waves = 1e-4 * rng.normal(size=first.tilts.shape[1])
+    for k, row in enumerate(rows):
+        own = followed[k >= stay]
+        covariance = row.covariance + 1e-8 * own @ own.T
+        offsets = row.offsets + own @ waves
+        yield replace(row, offsets=offsets, covariance=covariance, tilt=1e-4, tilts=own)
+
+
+def test_what_axes_wobble_in_other_regions_is_no_change_and_hides_none_in_the_same(first, rng):
+    for _ in range(5):
+        rows = list(wobbling(first, rng, nights(first, rng, 20), 10))
+        assert watch(rows, 100.0).changes == ()
+        known = [row.covariance - 1e-8 * row.tilts @ row.tilts.T for row in rows]
+        pairs = zip(rows, known, strict=True)
+        certain = [replace(r, tilt=None, tilts=np.zeros(0), covariance=c) for r, c in pairs]
+        assert watch(certain, 100.0).changes
+    for name in BUMPS:
+        rows = list(nights(first, rng, 12, (6, name)))
+        steady = watch(rows, 100.0).changes
+        found = watch(list(wobbling(first, rng, rows, 12)), 100.0).changes
+        assert [(str(x), x.seen) for x in found] == [(str(x), x.seen) for x in steady] != []
+
+
 def test_an_unchanged_arm_raises_no_alarm(first, rng):
     """1,000 nights at one false alarm in 100 years; 365 at ten a year, chance alone."""
     for scatter in (1.0, 2.0):
@@ -137,6 +164,7 @@ def without(row, *names):
         names=tuple(row.names[k] for k in few),
         offsets=row.offsets[few],
         covariance=row.covariance[np.ix_(few, few)],
+        tilts=row.tilts[few],
     )
 
 
@@ -194,6 +222,7 @@ def fitted_with_effects(first, rng):
         names=(*first.names, *EFFECTS),
         offsets=np.concatenate([first.offsets, values]),
         covariance=np.linalg.inv(whole),
+        tilts=np.pad(first.tilts, ((0, 2), (0, 0))),
         chain=json.dumps(chain_document(first.corrected().with_effect_values(known))),
     )
     return row, first.covariance @ shared @ values

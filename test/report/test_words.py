@@ -24,23 +24,28 @@ from calib_ros.report.words import between, checked, verdict
 from calib_ros.shown import rounded
 
 
-@pytest.mark.parametrize(('rms_mm', 'holds'), [(0.14, True), (0.16, False)])
+@pytest.mark.parametrize(
+    ('rms_mm', 'holds'), [(0.1, True), (0.14, None), (0.16, None), (0.3, False)]
+)
 def test_a_calibration_holds_by_one_rule(rms_mm, holds):
-    """By ~/validate, and by ~/check where no change shows besides."""
+    """By ~/validate, and by ~/check where no change shows besides: by the interval."""
     arm = load_chain('ur10e')
     previous = Calibration(arm, arm, residual=1e-4)
     away = np.tile([1e-3 * rms_mm, 0.0, 0.0], (20, 1))
     off = Residuals(away, np.nan * away, np.arange(20), np.nan * away)
     both = Comparison(off, off, np.ones(20, bool))
-    now = both.figures[1]
     updates = [
         Recalibration(previous, (), 1.0, both, 1e-4, 1e-4, 0.0, refitted=ratio)
         for ratio in (0.9, 1.1)  # new frames make held-out errors larger by that
     ]
-    for told in (verdict(previous, now, now), checked(previous, updates[0])):
-        assert told[0] == holds
-        assert ('no longer holds: RMS 0.160 mm' in told[1]) != holds
-    assert [each.accepted for each in updates] == [holds, True]
+    told = verdict(previous, both)
+    assert told[0] is holds
+    assert told[1].startswith('too few poses to tell') == (holds is None)
+    same = checked(previous, updates[0])
+    assert same[0] == (holds is not False)
+    for text in (told[1], same[1]):
+        assert ('no longer holds: RMS 0.300 mm' in text) == (holds is False)
+    assert [each.accepted for each in updates] == [rms_mm < 0.15, True]
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])

@@ -199,13 +199,13 @@ def test_later_samples_are_judged_in_the_frames_of_their_targets(first):
     later.adopt(parse_calibration(made.calibration.dump(), 'c.yaml', UR5E))
     made.clear()
     drive(made, UR5E.random_joints(5, rng), sources[first : first + 1])
-    expected = made.validate()
+    expected = made.validate().figures
     later.restore(made.samples)
-    now, nominal = later.validate()
+    nominal, now = later.validate().figures
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
-    assert (now.rms_mm, nominal.rms_mm) == pytest.approx([each.rms_mm for each in expected])
+    assert (now.rms_mm, nominal.rms_mm) == pytest.approx([each.rms_mm for each in expected[::-1]])
     drive(made, UR5E.random_joints(5, rng), sources)
-    now, nominal = made.validate()
+    nominal, now = made.validate().figures
     assert now.count > 5
     assert now.rms_mm < 0.15 < 0.5 < nominal.rms_mm
     assert made.calibration.chain is result.chain
@@ -217,7 +217,7 @@ def test_samples_that_were_fitted_are_known_again():
     made.identify()
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
-    words = verdict(made.calibration, *made.validate(), made.reused())[1]
+    words = verdict(made.calibration, made.validate(), made.reused())[1]
     assert 'these are measurements to which the calibration was fitted' in words
 
 
@@ -227,7 +227,7 @@ def test_what_was_there_before_does_not_judge():
     made.identify()
     made.remove_last()
     drive(made, 4, [tracker()])
-    now, _ = made.validate()
+    _, now = made.validate().figures
     assert now.count == 4
 
 
