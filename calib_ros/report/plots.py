@@ -139,7 +139,7 @@ def _png(figure: Figure) -> bytes:
 def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
     """Return a plotly figure as PNG in base64, `height` in pixels; None for one in space.
 
-    It supports the figures of `figures.py`: curves, dots with intervals, and heat maps.
+    It supports the figures of reports with a PDF: curves, dots with intervals, and heat maps.
     """
     data = [] if figure is None else figure['data']
     if figure is None or any(each['type'] == 'scatter3d' for each in data):
@@ -157,10 +157,7 @@ def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
         _draw_axes(axes, layout[f'xaxis{end}'], layout[f'yaxis{end}'])
         for line in layout.get('shapes', ()):
             style = {'color': line['line']['color'], 'linestyle': '--', 'linewidth': 1}
-            if line.get('xref') == 'paper':
-                axes.axhline(line['y0'], **style)
-            else:
-                axes.axvline(line['x0'], **style)
+            axes.axvline(line['x0'], **style)
         if any(each['type'] == 'scatter' for each in data):
             axes.legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=4, frameon=False)
     return base64.b64encode(_png(paper)).decode()
@@ -201,8 +198,6 @@ def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
         axes.set(**{f'{name}label': title})
         if 'range' in axis:
             axes.set(**{f'{name}lim': axis['range']})
-        if axis.get('type') == 'log':
-            axes.set(**{f'{name}scale': 'log'})
         if axis.get('rangemode') == 'tozero':
             axes.set_xlim(left=0.0)
     if y.get('autorange') == 'reversed':

@@ -66,22 +66,21 @@ def test_what_is_no_source_is_refused(texts, said):
             parse_source(text)
 
 
-def test_a_topic_is_named_once():
-    assert parse_sources(['/a', '/b']) == (Source('/a'), Source('/b'))
-    with pytest.raises(ConfigError, match='"/a" is named twice'):
-        parse_sources(['/a', '/b', '/a device=left'])
-
-
 def test_the_standard_sources_can_be_written_down():
     """What the node listens to by itself is what these lines say."""
     for source in STANDARD:
         assert parse_source(f'{source.topic} type={source.type}') == source
 
 
-def test_sources_of_one_topic_name_different_frames():
-    texts = ['/tf parent=world child=a', '/tf parent=world child=b']
-    a, b = parse_sources(texts)
-    assert a == Source('/tf', TRANSFORMS, parent='world', child='a')
-    assert b.child == 'b'
-    with pytest.raises(ConfigError, match='"/tf world a" is named twice'):
-        parse_sources([*texts, texts[0]])
+def test_a_topic_is_named_once_or_once_for_each_pair_of_frames():
+    assert parse_sources(['/a', '/b']) == (Source('/a'), Source('/b'))
+    pairs = ['/tf parent=world child=a', '/tf parent=world child=b']
+    assert parse_sources(pairs)[0] == Source('/tf', TRANSFORMS, parent='world', child='a')
+    bodies = [f'/x parent=w child=a type={kind}' for kind in ('RigidBodies', 'NamedPoseArray')]
+    for texts, said in (
+        (['/a', '/b', '/a device=left'], '"/a" is named twice'),
+        ([*pairs, pairs[0]], '"/tf world a" is named twice'),
+        ([bodies[0], bodies[1].replace('=a', '=b')], '"/x" is named with different types'),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            parse_sources(texts)
