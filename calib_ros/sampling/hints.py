@@ -167,7 +167,8 @@ def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     return [
         Reason(
             Rule.DROPPED,
-            f'{100.0 * share:.0f} % of the {name} {LOST}: {cause}, or {allowing(share)}',
+            f'{100.0 * share:.0f} % of the {name} {LOST}; {allowing(share)}, or remove the cause: '
+            f'{cause}',
         )
         for name, share, cause in found
         if share > largest_loss
@@ -257,8 +258,8 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
     where = ', '.join(f'{value:g}' for value in max(places, key=lambda key: len(places[key]))[3:])
     return Hint(
         f'{len(repeated)} poses repeat a position: is the device frozen?',
-        f'{len(repeated)} poses repeat a position to the last digit, such as {where} m: does the '
-        'device see the target, and does its driver send live data? Clear and measure again',
+        f'{len(repeated)} poses repeat a position to the last digit, such as {where} m (does the '
+        'device see the target and send live data?): call ~/clear and measure again',
         explains=False,
     )
 
