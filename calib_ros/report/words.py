@@ -166,13 +166,14 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
     if found.changed:
         reasons = changes_in_words(found.changed)
         return False, (
-            f'the calibration in use no longer fits, {reasons}: was it bumped? {text}; measure '
-            'at least 8 poses and call ~/identify, or run calib_ros identify --previous'
+            f'the calibration in use no longer fits, {reasons}: was it, the target or the device '
+            f'bumped? {text}; call ~/clear, measure 8 poses or more, ~/identify, or run calib_ros '
+            'identify --previous'
         )
     if found.unexplained <= FALSE:
         return False, (
             f'{text}, more than the calibration in use and noise explain; no change of a few '
-            'parameters explains it: measure new poses and call ~/identify'
+            'parameters explains it: call ~/clear, measure new poses and call ~/identify'
         )
     if previous.holds(1e-3 * found.before.rms_mm) is False:
         return False, _lost(previous, text)

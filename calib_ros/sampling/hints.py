@@ -79,9 +79,15 @@ class Hint(NamedTuple):
 
 
 def unheard(received: Mapping[str, int]) -> list[Hint]:
-    """Tell that nothing has come, or only joint states."""
+    """Tell that nothing has come, or only joint states or measurements."""
     if not received:
-        return [Hint('', 'nothing was received: check the topics (joint_topics, sources)')]
+        words = (
+            'nothing was received: check the topics (joint_topics, sources), their types and QoS'
+        )
+        return [Hint('', words)]
+    if not received[JOINTS]:
+        words = 'no joint states received: is the robot on, and its topic in joint_topics?'
+        return [Hint('', words)]
     if received[POSES] or received[JOINTS] < NO_ACCIDENT:
         return []
     words = (
