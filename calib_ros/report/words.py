@@ -151,13 +151,14 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
     if found.changed:
         reasons = changes_in_words(found.changed)
         return False, (
-            f'the calibration in use no longer fits, {reasons}: was it bumped? {text}; measure '
-            'at least 8 poses and call ~/identify, or run calib_ros identify --previous'
+            f'the calibration in use no longer fits, {reasons}: was it, the target or the device '
+            f'bumped? {text}; call ~/clear, measure 8 poses or more, ~/identify, or run calib_ros '
+            'identify --previous'
         )
     if found.unexplained <= FALSE:
         return False, (
             f'{text}, more than the calibration in use and noise explain; no change of a few '
-            'parameters explains it: measure new poses and call ~/identify'
+            'parameters explains it: call ~/clear, measure new poses and call ~/identify'
         )
     if previous.holds(_least_and_most(found.comparison, 0)[0]) is False:
         return False, _lost(previous, text)
@@ -247,9 +248,9 @@ def neighbours_in_words(noise: Noise) -> str:
 
 def chance_in_words(chance: float) -> str:
     """Return how well drift explains the gain."""
-    share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'below 0.1'
+    share = f'{100.0 * chance:.1f}' if chance >= 0.001 else 'less than 0.1'
     return (
-        f'Of time-shifted residuals {share} % are explained just as well: above '
+        f'Time-shifted residuals are explained just as well in {share} % of cases: above '
         f'{100.0 * (1.0 - CONFIDENT):.0f} % the improvement may only be drift of the device.'
     )
 

@@ -28,7 +28,7 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from calib_ros.atomic import given_path
-from calib_ros.errors import CalibrationError
+from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
@@ -62,11 +62,16 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
     """Calibrates one robot from its joint states and measurements."""
 
     def __init__(self, **node_options: Any) -> None:
-        super().__init__(
-            'calibration_node',
-            automatically_declare_parameters_from_overrides=True,  # see `parameters.py`
-            **node_options,
-        )
+        try:
+            super().__init__(
+                'calibration_node',
+                automatically_declare_parameters_from_overrides=True,  # see `parameters.py`
+                **node_options,
+            )
+        except ValueError as err:  # [] has no type in ROS
+            raise ConfigError(
+                f"a parameter file has an empty list []: write [''] or leave it out ({err})"
+            ) from err
         given, names = declare_all(self)
         home = os.environ.get('ROS_HOME', '~/.ros')
         chain, urdf = load_robot(self, given)

@@ -70,7 +70,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     if not own['chain']:
         raise ConfigError(
             'parameter "chain" is not set: give the chain file of the robot, for example '
-            '--ros-args -p chain:=ur10e'
+            '--ros-args -p chain:=ur10e; in a parameter file under the key /**'
         )
     return Given(**own, settings=settings), [*overrides]
 

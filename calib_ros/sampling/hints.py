@@ -79,9 +79,15 @@ class Hint(NamedTuple):
 
 
 def unheard(received: Mapping[str, int]) -> list[Hint]:
-    """Tell that nothing has come, or only joint states."""
+    """Tell that nothing has come, or only joint states or measurements."""
     if not received:
-        return [Hint('', 'nothing was received: check the topics (joint_topics, sources)')]
+        words = (
+            'nothing was received: check the topics (joint_topics, sources), their types and QoS'
+        )
+        return [Hint('', words)]
+    if not received[JOINTS]:
+        words = 'no joint states received: is the robot on, and its topic in joint_topics?'
+        return [Hint('', words)]
     if received[POSES] or received[JOINTS] < NO_ACCIDENT:
         return []
     words = (
@@ -167,7 +173,8 @@ def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
     return [
         Reason(
             Rule.DROPPED,
-            f'{100.0 * share:.0f} % of the {name} {LOST}: {cause}, or {allowing(share)}',
+            f'{100.0 * share:.0f} % of the {name} {LOST}; {allowing(share)}, or remove the cause: '
+            f'{cause}',
         )
         for name, share, cause in found
         if share > largest_loss
@@ -257,8 +264,8 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
     where = ', '.join(f'{value:g}' for value in max(places, key=lambda key: len(places[key]))[3:])
     return Hint(
         f'{len(repeated)} poses repeat a position: is the device frozen?',
-        f'{len(repeated)} poses repeat a position to the last digit, such as {where} m: does the '
-        'device see the target, and does its driver send live data? Clear and measure again',
+        f'{len(repeated)} poses repeat a position to the last digit, such as {where} m (does the '
+        'device see the target and send live data?): call ~/clear and measure again',
         explains=False,
     )
 

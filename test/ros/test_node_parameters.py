@@ -216,6 +216,16 @@ def test_a_node_does_not_start_with_the_parameters_of_another(tmp_path):
         assert 'but of /cell_2/calibration_node: use the key /**' in child.output
 
 
+def test_an_empty_list_in_a_parameter_file_is_told(tmp_path):
+    """ROS gives it no type, and rclpy no name."""
+    path = tmp_path / 'parameters.yaml'
+    path.write_text('/**: {ros__parameters: {chain: ur10e, sources: []}}')
+    with Child('--params-file', path, data_dir=tmp_path) as child:
+        assert child.end() == 1
+        assert "an empty list []: write [''] or leave it out" in child.output
+        assert 'Traceback' not in child.output
+
+
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):
     with open(SHIPPED) as file:
         text = file.read().replace("chain: ''", 'chain: meca500')

@@ -174,7 +174,10 @@ def test_the_status_is_never_an_error():
 def test_a_silent_device_is_told():
     """The status said only "0 poses"; a wrong topic is the most frequent first mistake."""
     made = CalibrationSession(UR5E, Settings())
-    assert made.warnings == ('nothing was received: check the topics (joint_topics, sources)',)
+    assert made.warnings[0].startswith('nothing was received: check the topics (joint_topics, so')
+    made.miss('measurements', 30, 'unusable')
+    assert made.warnings[0].startswith('no joint states received: is the robot on, and its topic')
+    made = CalibrationSession(UR5E, Settings())
     where = UR5E.random_joints(3, np.random.default_rng(1))
     drive(made, where, [])
     assert 'no measurements received: check sources' in made.status()
