@@ -14,6 +14,7 @@ from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 from calib_ros import Chain, Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 from calib_ros.report.words import summary
@@ -110,6 +111,18 @@ def test_a_place_is_left_out_of_an_arm_whose_axes_are_all_parallel():
     before, after = result.validation.figures
     assert after.rms_mm < min(before.rms_mm, 0.05)
     assert 'something that fixes the size and shape of the arm' in result.refusals[-1]
+
+
+def test_the_frames_that_places_determine_are_the_same_with_and_without_the_arm():
+    _, problem = cell(0)
+    frames = tuple(name for name in problem.free if problem.model.owns_frame(name))
+    assert problem.free[: len(frames)] == frames
+    alone, found = (
+        structurally_independent(problem.model, names, problem.kinds[1:])
+        for names in (frames, problem.free)
+    )
+    assert alone == tuple(name for name in found if name in frames)
+    assert len(alone) < len(frames) < len(found)
 
 
 def test_well_determined_parameters_are_not_named():
