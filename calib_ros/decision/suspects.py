@@ -247,6 +247,12 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         what = 'the joints are in the order from tool to base'
         published = 'reverse joint_names, start without resume'
         yield Suspect(what, f'--columns {columns}', (_joints(same[::-1]),), 2, published=published)
+    for k, stands in ((0, 'device moves'), (len(names) - 1, 'target does not move')):
+        what = f'the {stands} with {names[k]}'
+        remedy = 'leave this joint out of the chain file'
+        still = _joints(np.diag(np.arange(len(names)) != k).astype(float))
+        if len(names) > 1:
+            yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':
             coupled = same.copy()

@@ -142,9 +142,9 @@ class Chain(Shown):
 
     @cached_property
     def held(self) -> Mapping[int, float]:
-        """Return the values [rad or m] of joints that only couplings move, by number.
+        """Return the values [rad or m] of joints with equal limits, by number.
 
-        Their limits are equal. Reported values of such joints count for nothing.
+        They never move, or only by couplings; what is reported of them counts for nothing.
         """
         ends = ((k, joint.lower, joint.upper) for k, joint in enumerate(self.joints))
         return {k: lower for k, lower, upper in ends if lower is not None and lower == upper}

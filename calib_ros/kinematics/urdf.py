@@ -171,6 +171,8 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
 
 
 def _row(joint: DescribedJoint) -> Joint:
+    if joint.lower is not None and joint.lower == joint.upper and not joint.follows:
+        raise ConfigError(f'limits of joint "{joint.name}" are equal: it could not move')
     kind: JointType = 'prismatic' if joint.type == 'prismatic' else 'revolute'
     return Joint(joint.name, kind, lower=joint.lower, upper=joint.upper)
 

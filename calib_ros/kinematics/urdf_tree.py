@@ -236,8 +236,6 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
             for key, default in (('multiplier', '1'), ('offset', '0'))
         )
         follows, upper = (mimic.get('joint', ''), ratio), lower
-    elif lower is not None and lower == upper:
-        raise ConfigError(f'limits of {where} are equal: it could not move')
     origin = _origin(element, where)
     return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, follows)
 

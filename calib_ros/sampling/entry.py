@@ -19,8 +19,6 @@ from calib_ros.values import LARGEST, MOST_NAMES
 
 Layout: TypeAlias = tuple[Columns, Index]
 OTHERS = 'none of the joints in the message'
-
-
 NOWHERE = -1  # column of a joint that needs no name
 
 
@@ -46,10 +44,10 @@ class JointNames:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
             known = {k: key.index(n) for k, n in enumerate(self._names) if n in key}
-            if known.keys() - self.held.keys():
-                known = dict(sorted({**dict.fromkeys(self.held, NOWHERE), **known}.items()))
-            else:
-                known = {}
+            some = known.keys() - self.held.keys()
+            known = dict(
+                sorted((dict.fromkeys(self.held, NOWHERE) | known).items()) if some else ()
+            )
             self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
             named = {name for names in self._layouts for name in names}
             named |= {self._names[k] for k in self.held}

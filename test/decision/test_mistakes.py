@@ -152,6 +152,18 @@ def test_mistakes_are_named_with_the_option_to_give(mistake, oriented):
     assert '--' not in published.replace(' -- ', '')
 
 
+@pytest.mark.parametrize('number', [0, 6])
+def test_a_joint_that_comes_before_the_device_or_behind_the_target_is_named(number):
+    arm, rng = load_chain('ur10e_on_linear_axis'), np.random.default_rng(1)
+    q = arm.random_joints(40, rng)
+    q[:, number] = 0.0
+    seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, 2e-4, bool(number))
+    q[:, number] = rng.uniform(0.0, 2.0, 40)
+    found = explained(Problem(arm, replace(seen, joints=q))).suspects[0]
+    assert f'with {arm.joint_names[number]}' in found.what
+    assert f'q{number + 1}=0' in found.remedy
+
+
 @pytest.mark.parametrize('keys', [('base',), ('tool',), ('base', 'tool')])
 def test_frames_held_in_the_wrong_place_are_named(keys):
     """The device or the robot was said to have moved, and sent for."""

@@ -116,6 +116,7 @@ def test_equal_limits_that_are_none_are_refused(rng):
     stuck = SCARA.replace('lower="-3.0" upper="3.0"', 'lower="0.0" upper="0.0"')
     with pytest.raises(ConfigError, match='limits of joint "wrist" are equal'):
         chain_from_urdf(stuck)
+    assert len(chain_from_urdf(stuck, tip_link='lower').joints) == 3  # it is not in the way
 
 
 def test_a_joint_that_never_moves_has_gauges(rng):
