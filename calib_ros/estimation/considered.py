@@ -23,9 +23,10 @@ from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.leastsquares import Normal, System, gram, normal_equations
 from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.samples import BLOCK, Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
 
@@ -66,6 +67,23 @@ class Tilts(NamedTuple):
     def square(self) -> FloatArray:
         """Return the covariance (P, P) of the parameters."""
         return np.asarray(self.size**2 * self.followed @ self.followed.T)
+
+    def left(
+        self, chain: Chain, names: Sequence[str], ends: tuple[str, str], joints: FloatArray
+    ) -> FloatArray:
+        """Return the expected squares (N, 6) of pose errors at joint values (N, n).
+
+        By tilts that the names (P,) do not follow, between the `ends`.
+        """
+        every = tuple(dict.fromkeys((*names, *tilting(chain))))
+        model, squares = ErrorModel(chain, every, *ends), np.empty((len(joints), 6))
+        for first in range(0, len(joints), BLOCK):
+            part = joints[first : first + BLOCK]
+            rows = model.jacobian(part).transpose(2, 1, 0)
+            found = tilted(chain, every, part, rows)
+            found -= np.tensordot(self.followed, rows[: len(names)], (0, 0))
+            squares[first : first + BLOCK] = (found**2).sum(axis=0).T
+        return self.size**2 * squares
 
     def among(self, names: Sequence[str], own: Sequence[str]) -> Tilts:
         """Return how other parameters follow, of which only the `own` (P,) do."""

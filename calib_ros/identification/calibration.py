@@ -9,6 +9,8 @@ position rows of the error model, and the RMS error r on held-out poses:
     removed(q) = |p_nominal - p|      sigma(q)^2 = tr J C J^T      remaining(q)^2 = sigma^2 + r^2
 
 Errors of the joints that no parameter explains add to sigma but, being in r, not to `remaining`.
+Wobble of the axes that the parameters have absorbed shows only at other poses, and adds to sigma
+there.
 
 Commanded by its nominal model the arm is expected to miss by the root of removed^2 + remaining^2,
 by its calibrated model by `remaining`.
@@ -18,7 +20,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -152,8 +154,15 @@ class Calibration(Shown):
         Of orientations [rad] by other `components` of the pose. With a region it is the expected
         error, unmodelled effects included.
         """
-        if self.region is not None:
-            return self.region.sigma(joints, components)
+        if (region := self.region) is not None:
+            found = region.sigma(joints, components)
+            if self.tilts is None or not self.tilts.size:
+                return found
+            ends = region.base, region.tool  # tilts found at random may be these
+            left = self.tilts.left(self.chain, self.names, ends, self.chain.joint_values(joints))
+            known = replace(region, unmodelled=(0.0, 0.0)).sigma(joints, components)
+            wobble = np.sqrt(left[:, components].sum(axis=1))
+            return np.asarray(np.maximum(found, np.hypot(known, wobble)))
         if self.covariance is None:
             return np.full(len(joints), np.nan)
         return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)

@@ -92,6 +92,24 @@ def test_a_few_poses_in_another_region_show_no_change(seed):
     assert again.tilts.size == previous.tilts.size
 
 
+def test_expected_errors_contain_it_away_from_the_region():
+    """There the parameters that absorbed it are wrong; at the measured poses they are right."""
+    for seed in (1, 2, 3, 5):
+        arm = Wobbling(seed)
+        middle = arm.middle()
+        found = arm.calibrated(middle)
+        for q, least, most in (
+            (middle + arm.rng.uniform(-WIDTH, WIDTH, (200, 6)), 0.4, 1.3),
+            (UR10E.random_joints(1200, arm.rng), 0.3, 1.3),  # more than a block
+        ):
+            true = [arm.true.with_offsets(arm.tilts(x)).forward(x[None])[0] for x in q]
+            error = (found.chain.forward(q) - np.array(true))[:, :3, 3]
+            ratio = np.sqrt(np.mean((error**2).sum(axis=1)) / np.mean(found.sigma(q) ** 2))
+            assert least < ratio < most
+        certain = replace(found, tilts=None)
+        assert np.mean(certain.sigma(q) ** 2) < 0.5 * np.mean(found.sigma(q) ** 2)
+
+
 def test_a_loaded_calibration_knows_what_is_lacking():
     arm = Wobbling(1)
     first, second = arm.calibrated(arm.middle()), arm.calibrated(arm.middle())
