@@ -170,15 +170,15 @@ class Gathered(Shown):
     warnings: tuple[str, ...] = ()
     by_line: bool = False  # stamps are the lines of a table, in seconds
 
-    def problem(self, chain: Chain, settings: Settings, **more: Any) -> Problem:
-        """Return the problem for a chain, with `more` arguments."""
-        apart = settings.socket_distance
+    def problem(self, chain: Chain, settings: Settings | None = None, **more: Any) -> Problem:
+        """Return the problem for a chain, by default with the usual settings."""
+        settings = settings or Settings()
         return Problem(
             with_lenses(chain, self.lenses),
             self.fitted[0],
             self.held_out,
             more=self.fitted[1:],
-            separations=tuple((*pair, apart) for pair in self.pairs),
+            separations=tuple((*pair, settings.socket_distance) for pair in self.pairs),
             world_frame=self.world_frame,
             **settings.for_problem(),
             **more,

@@ -97,4 +97,4 @@ def test_without_the_messages_it_is_said_what_to_install(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('latched', [False, True])
 def test_frames_that_stand_still_may_be_silent(latched):
-    assert Hearing(last=-100.0, latched=latched).silent is not latched
+    assert Hearing(last=-1e9, latched=latched).silent is not latched
