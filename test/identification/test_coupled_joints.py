@@ -12,6 +12,7 @@ from urdfs import SCARA, ZERO, Z, limits, reference_forward, written
 
 from calib_ros import CalibrationSession, Problem, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
@@ -88,6 +89,15 @@ def test_without_couplings_in_the_chain_they_are_named(rng):
     seen = measure(faulty(alone, Cell(), rng), q, rng, *NOISE)
     refused = identify(Problem(replace(alone, base=None, tool=None), seen, **SIGMAS)).refusals
     assert any('only moved together' in text and 'lower' in text for text in refused)
+
+
+def test_only_joints_that_can_move_are_told_to_have_stood_still(rng):
+    q = CHAIN.random_joints(60, rng)
+    q[:, 1], q[:, 3:5] = 0.5, [0.0, 0.1] - q[:, 1:3]
+    seen = measure(faulty(CHAIN, Cell(), rng), q, rng, *NOISE)
+    refused = identify(Problem(replace(CHAIN, base=None, tool=None), seen, **SIGMAS)).refusals
+    (reason,) = (each for each in refused if each.rule is Rule.EXCITATION)
+    assert reason.startswith('lower stood still (or was not recorded): the poses do not')
 
 
 def test_joint_states_need_not_name_them(rng):
