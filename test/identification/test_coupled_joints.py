@@ -115,6 +115,12 @@ def test_joint_states_need_not_name_them(rng):
     np.testing.assert_allclose([each.joints for each in made.samples], q, atol=1e-3)
 
 
+def test_names_that_never_came_are_not_told_to_have_come():
+    made = CalibrationSession(CHAIN, Settings())
+    take(made, of_joints(joint_state(1_000_000_000, ['turn', 'other'], [0.0, 0.0])))
+    assert made.account().foreign_names == ('other', 'turn')
+
+
 def test_equal_limits_that_are_none_are_refused(rng):
     assert parse_chain(dump_chain(CHAIN)).held == CHAIN.held == {3: 0.0, 4: 0.1}
     moved = CHAIN.random_joints(30, rng)
