@@ -22,13 +22,7 @@ from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import (
-    each_in_words,
-    likely,
-    remarks,
-    standing,
-    verification_report,
-)
+from calib_ros.report.verdicts import each_in_words, likely, remarks, standing, verification_report
 from calib_ros.sampling.gathered import gathered
 from calib_ros.shown import rounded
 

@@ -209,11 +209,7 @@ def with_common_normals(chain: Chain) -> Chain:
 
 
 def _towards(
-    row: Joint,
-    frame: FloatArray,
-    axis: FloatArray,
-    point: FloatArray,
-    common_normal: bool = False,
+    row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray, common_normal: bool = False
 ) -> Joint:
     """Return a standard row that leads from a frame on its axis to the next axis.
 
