@@ -85,6 +85,8 @@ class Verification(Shown):
     """Residuals by the nominal and by the calibrated arm."""
     tolerance: float | None
     """Wanted RMS position error [m]."""
+    limit: float | None
+    """The tolerance, or else the largest error [m] of a calibration that holds, if known."""
     confidence: float
     """Of the interval."""
     group: Index
@@ -171,7 +173,8 @@ def verify(
     lower, upper = rms_limits(rms, freedom, confidence)
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
-    if limit := tolerance or arm.limit:
+    limit = tolerance or arm.limit
+    if limit is not None:
         verdict = _decided(limit, lower, upper, numbers)
     if reused and verdict[0] != 'FAIL':
         verdict = ('no verdict', None)
@@ -181,7 +184,7 @@ def verify(
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, reused, uncorrected)
-    return Verification(comparison, tolerance, confidence, group, *found, *known)
+    return Verification(comparison, tolerance, limit, confidence, group, *found, *known)
 
 
 def _compared(
