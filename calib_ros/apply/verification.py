@@ -14,8 +14,6 @@ The figure is the RMS position error over poses like those measured, with its in
     FAIL        the whole interval is beyond it
     UNDECIDED   the tolerance lies in the interval: more poses are needed
 
-Without a tolerance the limit is that of a calibration that still holds.
-
 On request, frames of the new measurements are fitted to both arms: the base if the device was
 moved, the tool if the target was changed or remounted. The change of any other frame counts as an
 error of the arm.
