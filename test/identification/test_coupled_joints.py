@@ -130,7 +130,7 @@ def test_equal_limits_that_are_none_are_refused(rng):
     with pytest.raises(InputError, match=r'level_2 was at .*, but both its limits are 0'):
         Problem(replace(CHAIN, effects=()), seen)
     stuck = SCARA.replace('lower="-3.0" upper="3.0"', 'lower="0.0" upper="0.0"')
-    with pytest.raises(ConfigError, match='limits of joint "wrist" are equal.*leave them out'):
+    with pytest.raises(ConfigError, match=r'limits of joint "wrist" are equal.*leave them out'):
         chain_from_urdf(stuck)
     assert len(chain_from_urdf(stuck, tip_link='lower').joints) == 3  # it is not in the way
 
