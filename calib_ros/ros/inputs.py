@@ -41,6 +41,7 @@ class Hearing:
     before: int = 0
     rate: float = 0.0
     last: float | None = None
+    continuous: bool = False  # true once two came in quick succession, not one for each stop
     deaf: str = ''  # the publisher's QoS that does not match the requested one
     latched: bool = False  # true if it is published only once
     lost: int = 0  # messages lost in transit, by DDS
@@ -67,12 +68,13 @@ class Hearing:
         lost, before = self.lost + self.full, self.lost_before
         self.losing, self.lost_before = lost > before, lost
         if fresh:
-            self.last = now
+            quick = self.last is not None and now - self.last < 0.5 * SILENCE
+            self.continuous, self.last = self.continuous or quick, now
 
     @property
     def silent(self) -> bool:
         """Tell whether it has become silent."""
-        if self.last is None or self.latched:
+        if self.last is None or self.latched or not self.continuous:
             return False
         return time.monotonic() - self.last > SILENCE
 
