@@ -112,7 +112,7 @@ class Evidence:
             if name in considered:
                 tried = np.tile(size, (3, 1))
                 tried[1:, k] = self._typical[k] + np.log(LEAST_SIZE), self._typical[k]
-                here, without, usual = self.of(tried).tolist()
+                here, without, usual = self._of(tried).tolist()
                 if not here - without > SHOWN and without - usual > REFUTED:
                     size = tried[1]
         return size, 2.0 * np.maximum(gamma, 0.0) + width
@@ -165,7 +165,7 @@ class Evidence:
         steps = (np.sqrt(len(some) / slope) * np.eye(len(size)))[some]
         tried = self._within(size + np.stack([steps, -steps], axis=1).reshape(-1, len(size)))
         unusual = (((tried - self._typical) / np.log(SPREAD)) ** 2).sum(axis=1)
-        likely = self.of(tried) - 0.5 * unusual
+        likely = self._of(tried) - 0.5 * unusual
         upper = special.expit(likely[::2] - likely[1::2])
         weights = np.stack([upper, 1.0 - upper], axis=1).ravel() / len(some)
         return list(zip(weights.tolist(), tried, strict=True))
@@ -211,7 +211,7 @@ class Evidence:
         """Return the inverse variances (G, P) of the parameters of each group."""
         return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
 
-    def of(self, sizes: FloatArray) -> FloatArray:
+    def _of(self, sizes: FloatArray) -> FloatArray:
         """Return the log evidence of log sizes (S, G)."""
         weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
         scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))

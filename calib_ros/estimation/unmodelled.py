@@ -7,9 +7,13 @@ with the distance of the target from these; the noise of a device does not. That
 even if the sigmas of the device are unknown.
 
 Axes that wobble, as in their bearings, tilt by waves (`considered.waved`) of the joint's value.
-Their size is the most probable one, with the parameters integrated out (`sizes.py`). In a small
-region parameters absorb waves without a trace in the residuals: unless the data rule it out, the
-typical size counts.
+Their size s is the most probable one, with the parameters integrated out: with the products W of
+their columns and p of these with the residuals, both beside the parameters, the log evidence is
+
+    (p^T (W + I / s^2)^-1 p - log det(I + s^2 W)) / 2
+
+In a small region parameters absorb waves without a trace in the residuals: unless the data rule it
+out, the typical size counts.
 
 The rest is random, from stop to stop. With the columns Q of the posterior, and of waves that show,
 scaled by a root of the covariance, the residuals r have the covariance B V B + B - B^2, B = I -
@@ -40,7 +44,7 @@ from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.shared_errors import gathered, nonnegative
-from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, TYPICAL, Evidence, solved
+from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
 from calib_ros.kinematics.se3 import FloatArray, Index
 
 
@@ -93,6 +97,7 @@ def _sizes(
     none = np.zeros(len(rows) - 1 - count)
     offsets, precision = np.append(posterior.offsets, none), given
     own, waves = np.s_[:count], np.s_[count:]
+    tried = typical * np.geomspace(LEAST_SIZE, 1.0 / LEAST_SIZE, 201)  # the typical one amidst
     for _ in range(SEVERAL):
         variances = _variances(products, offsets, precision, counts)
         if not variances.all():
@@ -101,27 +106,28 @@ def _sizes(
         matrix, vector = total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
         mean, root = solved(matrix[own, own], vector[own], given)
         along = matrix[waves, own] @ root
-        alone = matrix[waves, waves] - along @ along.T
-        pulled = vector[waves] - matrix[waves, own] @ mean
-        evidence = Evidence(alone, pulled, none, ['tilt'] * len(none), {'tilt': typical})
-        size = evidence.most_probable(set())[0]
-        tried = [size, np.log([typical * LEAST_SIZE]), np.log([typical])]
-        here, without, usual = evidence.of(np.array(tried)).tolist()
-        shown = here - without > SHOWN
-        least = typical * (here - usual < 2.0 * REFUTED)  # arms with less are unusual themselves
-        wave = float(max(least, shown * np.exp(size[0])))
+        known, axes = np.linalg.eigh(matrix[waves, waves] - along @ along.T)
+        seen = np.outer(tried**2, np.maximum(known, 0.0))
+        pulled = (vector[waves] - matrix[waves, own] @ mean) @ axes
+        squares = np.outer(tried**2, pulled**2) / (1.0 + seen)
+        odds = 0.5 * (squares - np.log1p(seen)).sum(axis=1)  # against none
+        best = np.argmax(odds - 0.5 * (np.log(tried / typical) / np.log(SPREAD)) ** 2)
+        shown = odds[best] > SHOWN
+        least = typical * (odds[best] - odds[len(tried) // 2] < 2.0 * REFUTED)  # less is unusual
+        wave = float(max(least, shown * tried[best]))
         if not shown:
             break
-        precision = np.append(given, evidence.precision(size))
+        precision = np.append(given, none + tried[best] ** -2.0)
     own = np.s_[: len(precision)]
     mean, root = solved(matrix[own, own], vector[own], precision)
     scale = np.sqrt(variances)[part_of, np.newaxis]
-    turned, tilted, rows = ((each / scale).transpose(2, 1, 0) for each in (*random, rows))
-    residual = rows[..., -1] + rows[..., own] @ (offsets[own] - mean)
-    whites = rows.any(axis=2) & (part_of == np.arange(len(variances))[:, np.newaxis, np.newaxis])
+    every = *random, rows[own], rows[-1:]
+    turned, tilted, fitted, left = ((each / scale).transpose(2, 1, 0) for each in every)
+    residual = left[..., 0] + fitted @ (offsets[own] - mean)
+    whites = rows.any(axis=0).T & (part_of == np.arange(len(variances))[:, np.newaxis, np.newaxis])
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
-    turn, tilt = _random(np.array(kernels), rows[..., own] @ root, residual).tolist()
+    turn, tilt = _random(np.array(kernels), fitted @ root, residual).tolist()
     return turn, tilt, wave
 
 
@@ -137,7 +143,7 @@ def _variances(
     for _ in range(SEVERAL):
         total = np.tensordot(1.0 / variances, products, 1)
         mean, root = solved(total[own, own], total[own, -1] - pulled, precision)
-        taken = ((products[:, own, own] @ root) * root).sum(axis=(1, 2)) / variances
+        taken = np.tensordot(products[:, own, own], root @ root.T) / variances
         left = products[:, -1, -1] - 2.0 * products[:, -1, own] @ mean
         left += mean @ products[:, own, own] @ mean
         if not ((left > 0.0) & (taken < counts)).all():

@@ -110,7 +110,7 @@ def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual
     found = object.__new__(Evidence)
     found._names = ('length', 'angle', 'drive', 'scale')
     found._typical = np.log([TYPICAL['length'], TYPICAL['angle'], TYPICAL['drive'], 1.0])
-    found.of = lambda tried: 0.3 * (tried - found._typical)[:, 0]
+    found._of = lambda tried: 0.3 * (tried - found._typical)[:, 0]
     size = np.add(found._typical, [0.5, -0.3, -50.0, 0.0])
     told = found.near(size, np.array([2.0, 8.0, 1.0, 1.0]))
     assert sum(weight for weight, _ in told) == pytest.approx(1.0)
