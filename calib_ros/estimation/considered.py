@@ -148,11 +148,9 @@ def moved(chain: Chain, names: Sequence[str], rows: FloatArray) -> tuple[FloatAr
     tilts = [own[f'{name}.{kind}'] for name in chain.joint_names for kind in ('alpha', 'beta')]
     if chain.convention == 'standard':
         bases = [frame for frame in chain.frame_names if frame.startswith('base')]
-        turned = [
-            np.tensordot(chain.frame(frame).matrix[:3, :2], [own[n] for n in turns], (0, 0))
-            for frame, turns in ((frame, parameters_of(frame)[3:]) for frame in bases)
-        ]
-        tilts = [*np.sum(turned, axis=0), *tilts[:-2]]
+        turns = [[own[name] for name in parameters_of(frame)[3:]] for frame in bases]
+        axes = [chain.frame(frame).matrix[:3, :2] for frame in bases]
+        tilts = [*np.tensordot(axes, turns, ((0, 1), (0, 1))), *tilts[:-2]]
     return np.array([own[joint.driven] for joint in chain.joints]), np.array(tilts)
 
 
