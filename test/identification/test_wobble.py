@@ -34,8 +34,8 @@ class Wobbling:
         pairs = zip(('alpha', 'beta'), waves[:, 1:], strict=True)
         return {f'{names[k]}.{kind}': x for kind, own in pairs for k, x in enumerate(own)}
 
-    def measured(self, middle, count):
-        q = middle + self.rng.uniform(-WIDTH, WIDTH, (count, 6))
+    def measured(self, middle, count, width=WIDTH):
+        q = middle + self.rng.uniform(-width, width, (count, 6))
         poses = np.array([self.true.with_offsets(self.tilts(x)).forward(x[None])[0] for x in q])
         seen = measure(self.true, q, self.rng)
         noise = self.rng.normal(size=(2, count, 3)) * np.reshape(NOISE, (2, 1, 1))
@@ -119,10 +119,23 @@ def test_a_loaded_calibration_knows_what_is_lacking():
     read = [parse_calibration(each.dump(), 'here.yaml', UR10E) for each in (first, second)]
     np.testing.assert_allclose(read[0].unmodelled.followed, first.unmodelled.followed, rtol=1e-8)
     assert difference(*read).limit == pytest.approx(difference(first, second).limit, rel=1e-3)
-    damaged = first.unmodelled._replace(followed=first.unmodelled.followed[:, 1:])
-    wrong = replace(first, unmodelled=damaged)
-    with pytest.raises(ConfigError, match='covariance is damaged'):
-        parse_calibration(wrong.dump(), 'here.yaml', UR10E)
+    assert read[0].unmodelled.sizes == first.unmodelled.sizes
+    for change in ({'followed': first.unmodelled.followed[:, 1:]}, {'tilts': -1.0}):
+        wrong = replace(first, unmodelled=first.unmodelled._replace(**change))
+        with pytest.raises(ConfigError, match='covariance is damaged'):
+            parse_calibration(wrong.dump(), 'here.yaml', UR10E)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_waves_explain_is_not_random_too(seed):
+    """Over the whole range they show; of an arm without, the data rule out the typical size."""
+    arm = Wobbling(seed)
+    wobbling = identify(arm.measured(np.zeros(6), 150, 3.1)).posterior.unmodelled
+    assert 5e-5 < wobbling.waves < 1.5e-4
+    assert wobbling.turns == wobbling.tilts == 0.0
+    arm.sizes *= 0.0
+    still = identify(arm.measured(np.zeros(6), 150, 3.1)).posterior.unmodelled
+    assert not any(still.sizes.values())
 
 
 @pytest.mark.parametrize('name', ['ur10e', 'franka_panda'])
