@@ -16,10 +16,7 @@ from calib_ros.identification.calibration import (
     Calibration as Calibration,
     load_calibration as load_calibration,
 )
-from calib_ros.identification.difference import (
-    Difference as Difference,
-    difference as difference,
-)
+from calib_ros.identification.difference import Difference as Difference, difference as difference
 from calib_ros.identification.identification import (
     identify as identify,
     identify_model as identify_model,

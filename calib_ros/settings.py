@@ -109,11 +109,7 @@ class Settings:
     lateness: float = _setting(
         1.0, 'how much later measurements may arrive than joint states of the same stamp [s]', 0.0
     )
-    delay: float = _setting(
-        0.0,
-        'known delay of measurement stamps after joint stamps [s]',
-        -10.0,
-    )
+    delay: float = _setting(0.0, 'known delay of measurement stamps after joint stamps [s]', -10.0)
     sources: tuple[str, ...] = _setting(
         (),
         'measurement topics, each as "TOPIC key=value ..."; keys: type, device, target, '

@@ -50,6 +50,12 @@ def test_every_refusal_and_every_public_name_has_its_place():
         assert f'.{name}\n' in reference
 
 
+def test_lines_are_as_wide_as_those_of_the_code():
+    pages = *(ROOT / 'docs').rglob('*.md'), ROOT / 'README.md', ROOT / 'CHANGELOG.rst'
+    lines = (line for page in pages for line in page.read_text().splitlines())
+    assert [line for line in lines if len(line) > 99 and not line.startswith('|')] == []
+
+
 def test_every_page_is_in_the_site():
     site = yaml.safe_load((ROOT / 'mkdocs.yml').read_text())
     listed = re.findall(r"'([\w/]+\.md)'", str(site['nav']))

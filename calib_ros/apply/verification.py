@@ -14,8 +14,6 @@ The figure is the RMS position error over poses like those measured, with its in
     FAIL        the whole interval is beyond it
     UNDECIDED   the tolerance lies in the interval: more poses are needed
 
-Without a tolerance the limit is that of a calibration that still holds.
-
 On request, frames of the new measurements are fitted to both arms: the base if the device was
 moved, the tool if the target was changed or remounted. The change of any other frame counts as an
 error of the arm.
@@ -85,6 +83,8 @@ class Verification(Shown):
     """Residuals by the nominal and by the calibrated arm."""
     tolerance: float | None
     """Wanted RMS position error [m]."""
+    limit: float | None
+    """The tolerance, or else the largest error [m] of a calibration that holds, if known."""
     confidence: float
     """Of the interval."""
     group: Index
@@ -171,7 +171,8 @@ def verify(
     lower, upper = rms_limits(rms, freedom, confidence)
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
-    if limit := tolerance or arm.limit:
+    limit = tolerance or arm.limit
+    if limit is not None:
         verdict = _decided(limit, lower, upper, numbers)
     if reused and verdict[0] != 'FAIL':
         verdict = ('no verdict', None)
@@ -181,7 +182,7 @@ def verify(
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
     known = (commanded is not None, fitted, reused, uncorrected)
-    return Verification(comparison, tolerance, confidence, group, *found, *known)
+    return Verification(comparison, tolerance, limit, confidence, group, *found, *known)
 
 
 def _compared(

@@ -51,18 +51,15 @@ def kind_of(path: Path) -> str:
         inside = {'bag': 'bag', 'image': 'images'}
         found += [inside[kind] for kind in map(_by_suffix, names) if kind in inside]
         return found[0] if found else ''
+    begin = b''
     if path.is_file():
         with path.open('rb') as file:
-            begin = file.read(16)
-        for mark, kind in BEGINNINGS:
-            if begin.lower().startswith(mark.lower()):
-                return kind
+            begin = file.read(100_000)
+    for mark, kind in BEGINNINGS:
+        if begin[:16].lower().startswith(mark.lower()):
+            return kind
     kind = _by_suffix(path.name)
-    if kind == 'chain' and path.is_file():
-        with path.open('rb') as file:
-            if b'points:' in file.read(100_000):
-                return 'program'
-    return kind
+    return 'program' if kind == 'chain' and b'points:' in begin else kind
 
 
 def proposal(path: Path) -> str | None:

@@ -13,6 +13,7 @@ from calib_ros.cli import common, given
 from calib_ros.cli.kinds import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
+from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.programs import read_joints
 from calib_ros.files.rows import verified
@@ -22,13 +23,7 @@ from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import (
-    each_in_words,
-    likely,
-    remarks,
-    standing,
-    verification_report,
-)
+from calib_ros.report.verdicts import each_in_words, likely, remarks, standing, verification_report
 from calib_ros.sampling.gathered import gathered
 from calib_ros.shown import rounded
 
@@ -86,6 +81,8 @@ def show(found: Verification, screen: Screen) -> None:
         orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
+    elif found.limit is not None:
+        tolerance += f': {rounded(1e3 * found.limit)} mm, {ALIKE:g} x former error'
     state, steps = standing(found)
     screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
     rows = {

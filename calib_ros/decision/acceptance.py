@@ -86,8 +86,10 @@ def _of_the_fit(
 def _together(problem: Problem) -> str:
     """Return which joints stood still, or only moved together, and a colon; empty if none."""
     joints = np.concatenate([each.joints for each in problem.sets])
-    moved = np.ptp(joints, axis=0) > STILL
-    names, found = np.array(problem.chain.joint_names), ''
+    turns = problem.chain.forward(joints)[:, :3, :3]
+    held = [*problem.chain.held]  # reported or not, they stand still or are coupled
+    joints, names = (np.delete(x, held, -1) for x in (joints, problem.chain.joint_names))
+    moved, found = np.ptp(joints, axis=0) > STILL, ''
     if not moved.all():
         found = f'{", ".join(names[~moved])} stood still (or was not recorded): '
     own = joints[:, moved] - joints[:, moved].mean(axis=0)
@@ -97,7 +99,6 @@ def _together(problem: Problem) -> str:
         if len(alike) > 1 and sizes[-1] <= STILL * np.sqrt(len(own)):
             found += f'{", ".join(alike)} only moved together (if the arm couples them, give '
             found += 'their couplings and equal limits in the chain file): '
-    turns = problem.chain.forward(joints)[:, :3, :3]
     least = np.linalg.norm((turns - turns.mean(axis=0)).reshape(-1, 3), -2) / len(turns) ** 0.5
     level = 'the tool points one way in all poses (tilt it): '
     return found or (level if least < DEGENERATE else '')
@@ -233,7 +234,7 @@ def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) ->
     for names, others, does, are in ((ours, listed, 'omits', ''), (listed, ours, 'has', 'not ')):
         if wrong := [name for name in names if name not in others]:
             found.append(
-                f'"parallel" in the chain file {does} {", ".join(wrong)}, although the axes that '
-                f'this row connects are {are}parallel: leave "parallel" out to derive it'
+                f'"parallel" in the chain file {does} {", ".join(wrong)}, but the axes connected '
+                f'there are {are}parallel: leave "parallel" out to derive it'
             )
     return tuple(found)

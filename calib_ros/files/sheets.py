@@ -191,7 +191,8 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
         usual = max(set(counts), key=counts.count)
         agreed = counts.count(usual) if usual > 1 else 0
         finer = agreed == len(lines) and usual > cells  # as if tabs are mixed with blanks
-        if agreed > 1.2 * most or (finer and all(_is_number(x, '.') for row in rows for x in row)):
+        below = [cell for row in rows[len(rows) // 2 :] for cell in row]  # the header
+        if agreed > 1.2 * most or (finer and all(_is_number(cell, '.') for cell in below)):
             best, most, cells = name, agreed, usual
     if best != 'comma':
         notes.append(f'cells are separated by {best}s (--separator)')

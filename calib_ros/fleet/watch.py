@@ -204,8 +204,8 @@ def _tests(fitted: Sequence[_Fitted], names: tuple[Parameter, ...]) -> _Tests:
     groups = _groups(names)
     owners = np.array([name.owner for name in names])
     freedom = np.array([row.freedom or KNOWN for row, _ in fitted])
-    sizes = [row.tilt or 0.0 for row, _ in fitted]
-    size_of = np.array([np.median(sizes[: k + 1]) for k in range(count)])
+    sizes = [[r.tilt for r, _ in fitted[:k] if r.tilt is not None] for k in range(1, count + 1)]
+    size_of = np.array([np.median(each or 0.0) for each in sizes])
     whole, pulled = np.cumsum(information, axis=0), np.cumsum(pulls, axis=0)
     chances = np.ones((len(LAGS), count, len(groups)))
     several = np.ones((len(LAGS), count))

@@ -132,22 +132,18 @@ def _recalibrated(
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
+    rows, fitted = system.rows, len(names)
     left = found.squares - float(found.information.vector @ found.information.mean(arm.doubted)[0])
     result = Recalibration(
         _updated(arm, found, problem, changed),
         tuple(changed),
-        chance_of(left, system.rows, previous.freedom),
+        chance_of(left, rows, previous.freedom),
         _judged(arm, earlier, found, system, sets),
         *_known(arm, before, found),
         previous.reused(sets),
-        _left_out_ratio(system.rows, len(names)),
+        float(np.sqrt((rows + fitted) / (rows - fitted))) if rows > fitted else np.inf,
     )
     return result, earlier
-
-
-def _left_out_ratio(rows: int, fitted: int) -> float:
-    """Return the ratio of held-out to fitted errors."""
-    return float(np.sqrt((rows + fitted) / (rows - fitted))) if rows > fitted else np.inf
 
 
 def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:

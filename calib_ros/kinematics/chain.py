@@ -221,9 +221,9 @@ class Chain(Shown):
 
     def with_frame(self, name: str, frame: Frame) -> Chain:
         """Return the chain with a replaced or added frame."""
-        kept = ('joint_names', 'walk', '_joints', '_effect_values')
+        kept = ('joint_names', 'walk', 'held', '_joints', '_effect_values')
         if name in ('base', 'tool'):
-            return _with(self, {name: frame}, (*kept, 'frame_names', '_all_parameters'))
+            return _with(self, {name: frame}, (*kept, 'frame_names', 'all_parameters'))
         return _with(self, {'frames': tuple((dict(self.frames) | {name: frame}).items())}, kept)
 
     def with_effects(self, names: Sequence[str]) -> Chain:

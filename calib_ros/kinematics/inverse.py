@@ -20,13 +20,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.newton import Normal, minimise
-from calib_ros.kinematics.se3 import (
-    ROUNDING,
-    ROUNDS,
-    Flags,
-    FloatArray,
-    Index,
-)
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, Flags, FloatArray, Index
 from calib_ros.settings import LEVER
 from calib_ros.values import SAME
 

@@ -172,7 +172,10 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
 
 def _row(joint: DescribedJoint) -> Joint:
     if joint.lower is not None and joint.lower == joint.upper and not joint.follows:
-        raise ConfigError(f'limits of joint "{joint.name}" are equal: it could not move')
+        raise ConfigError(
+            f'limits of joint "{joint.name}" are equal: correct them or, if it never moves, '
+            'leave them out and give them in the chain file (calib_ros chain)'
+        )
     kind: JointType = 'prismatic' if joint.type == 'prismatic' else 'revolute'
     return Joint(joint.name, kind, lower=joint.lower, upper=joint.upper)
 
@@ -209,11 +212,7 @@ def with_common_normals(chain: Chain) -> Chain:
 
 
 def _towards(
-    row: Joint,
-    frame: FloatArray,
-    axis: FloatArray,
-    point: FloatArray,
-    common_normal: bool = False,
+    row: Joint, frame: FloatArray, axis: FloatArray, point: FloatArray, common_normal: bool = False
 ) -> Joint:
     """Return a standard row that leads from a frame on its axis to the next axis.
 

@@ -12,7 +12,6 @@ import numpy as np
 
 import calib_ros
 from calib_ros.decision.comparison import Comparison
-from calib_ros.decision.region import Region
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.fitting import ParameterRow
 from calib_ros.report import words
@@ -32,7 +31,8 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         found['half_width_95'] = p.half_width()
         return found | {'unit': p.name.unit, 'status': p.status}
 
-    judged = result.validation
+    judged, region = result.validation, result.region
+    limit = None if region is None or region.whole else 1e3 * region.limit
     by = {'by': result.validated_by}
     lower = [row[: k + 1] for k, row in enumerate(result.covariance.tolist())]
     return {
@@ -63,7 +63,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'predicted_sigma_mm': words.sigma_over_range(result),
         'sizes': dict(result.posterior.sizes),
         'unmodelled': result.posterior.unmodelled.sizes,
-        'region': None if result.region is None else region_figures(result.region),
+        'region': region and {'whole': region.whole, 'share': region.share, 'limit_mm': limit},
         'priors': result.priors,
         'effects': dict(result.chain.effects),
         'verdicts': [asdict(verdict) for verdict in result.verdicts],
@@ -84,12 +84,6 @@ def figures_document(which: Comparison, intervals: bool = True) -> dict[str, Any
     for when, rms in enumerate(found.values() if intervals else ()):
         rms['rms_lower_mm'], rms['rms_upper_mm'] = words.limits_mm(which, when) or (None, None)
     return found
-
-
-def region_figures(region: Region) -> dict[str, Any]:
-    """Return the region in figures; the limit is None for everywhere."""
-    limit = None if region.whole else 1e3 * region.limit
-    return {'whole': region.whole, 'share': region.share, 'limit_mm': limit}
 
 
 def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:

@@ -158,10 +158,14 @@ def verification_report(
     ]
     if found.fitted:
         text.append('The interval allows for the refitted frames.')
-    if found.tolerance is not None:
+    if found.limit is not None:
+        names = ('Tolerance', 'PASS', 'FAIL')
+        if found.tolerance is None:
+            names = (f'{ALIKE:g} times the former error', 'it holds', 'it no longer holds')
+        what, good, bad = names
         text.append(
-            f'Tolerance: {1e3 * found.tolerance:g} mm. PASS: the whole interval is within it; '
-            'FAIL: the whole interval is beyond it.'
+            f'{what}: {rounded(1e3 * found.limit)} mm. If the whole interval is within it: '
+            f'{good}; beyond it: {bad}; else UNDECIDED.'
         )
     text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))
     state, steps = standing(found)

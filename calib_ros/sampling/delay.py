@@ -101,18 +101,12 @@ def find_delay(
     left, middle, right = score[best - 1 : best + 2]
     bend = left - 2.0 * middle + right
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
+    others = peaks(score, RISE)
+    apart = np.sqrt(1.0 - np.maximum(score, 0.0) ** 2)
+    rivals = others[(others != best) & (apart[others] < ALIKE * apart[best])]
     return Delay(
-        float(lags[best] + shift * STEP),
-        float(score[best]),
-        tuple(lags[_rivals(score, best)].tolist()),
+        float(lags[best] + shift * STEP), float(score[best]), tuple(lags[rivals].tolist())
     )
-
-
-def _rivals(score: FloatArray, best: int) -> Index:
-    found = peaks(score, RISE)
-    others = found[found != best]
-    left, least = (np.sqrt(1.0 - np.maximum(score[k], 0.0) ** 2) for k in (others, best))
-    return np.asarray(others[left < ALIKE * least])
 
 
 def peaks(score: FloatArray, rise: float) -> Index:

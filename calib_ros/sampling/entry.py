@@ -50,9 +50,8 @@ class JointNames:
             )
             self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
             named = {name for names in self._layouts for name in names}
-            named |= {self._names[k] for k in self.held}
-            missing = [name for name in self._names if name not in named]
-            self.foreign = tuple(sorted(named)) if missing else ()
+            needed = {n for k, n in enumerate(self._names) if k not in self.held}
+            self.foreign = () if needed <= named else tuple(sorted(named))
         return self._layouts[key]
 
     def foreign_ones(self, missing: Sequence[int]) -> str:

@@ -237,6 +237,5 @@ def problem_since(
 ) -> Problem:
     """Return sets between the frames of a calibration as a problem of the nominal chain."""
     cameras = {each.camera for each in sets if each.pixels is not None}
-    known = {name: calibration.chain.frame(name).lens for name in cameras}
-    seen = {name: lens for name, lens in known.items() if lens}
+    seen = {name: lens for name in cameras if (lens := calibration.chain.frame(name).lens)}
     return Gathered(sets, lenses=seen).problem(chain, settings)

@@ -80,20 +80,15 @@ class Hint(NamedTuple):
 
 def unheard(received: Mapping[str, int]) -> list[Hint]:
     """Tell that nothing has come, or only joint states or measurements."""
-    if not received:
-        words = (
-            'nothing was received: check the topics (joint_topics, sources), their types and QoS'
-        )
-        return [Hint('', words)]
-    if not received[JOINTS]:
+    if not received or not received[JOINTS]:
         words = 'no joint states received: is the robot on, and its topic in joint_topics?'
+        if not received:
+            words = 'nothing was received: check joint_topics, sources, their types and QoS'
         return [Hint('', words)]
     if received[POSES] or received[JOINTS] < NO_ACCIDENT:
         return []
-    words = (
-        'no measurements received: is the device on, and its topic measured_pose or in sources?'
-    )
-    return [Hint('no measurements received: check sources', words)]
+    words = 'no measurements received: is the device on, and its topic measured_pose or'
+    return [Hint('no measurements received: check sources', f'{words} in sources?')]
 
 
 def restless(needed: float, still: float) -> Hint:

@@ -300,14 +300,10 @@ class LiveEstimate:
 
 
 def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:
-    """Return the joints whose values (N, n) span too little to determine them."""
-    span = np.ptp(joints, axis=0)
+    """Return the movable joints whose values (N, n) span too little to determine them."""
     least = [LITTLE if joint.type == 'revolute' else 0.1 * LITTLE for joint in chain.joints]
-    return tuple(
-        joint.name
-        for joint, reached, wanted in zip(chain.joints, span.tolist(), least, strict=True)
-        if reached < wanted
-    )
+    little = np.flatnonzero(np.ptp(joints, axis=0) < least).tolist()
+    return tuple(chain.joint_names[k] for k in little if k not in chain.held)
 
 
 def _spread(samples: Sequence[Sample]) -> list[Sample]:

@@ -309,6 +309,11 @@ def test_a_session_is_judged_without_a_tolerance(arm, cell):
             same = verify(arm, seen, 1.5 * residual)
             assert (same.verdict, same.needed) == (verdict, found.needed)
             assert f'about {found.needed} poses with the same RMS error' in in_words(found)
+            page = verification_report(
+                UR, found, poses_to_verify(UR, seen, found.comparison), Origin()
+            )
+            said = f'1.5 times the former error: {rounded(1.5e3 * residual)} mm. If the whole'
+            assert any(said in text for text in page.verdict.text)
         else:
             assert found.needed == needed
         assert 'wanted is' not in in_words(found)

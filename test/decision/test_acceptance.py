@@ -135,7 +135,7 @@ def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing
     [
         (None, ()),
         (('shoulder_lift_joint', 'elbow_joint'), ()),
-        (('elbow_joint',), ('omits shoulder_lift_joint, although', 'connects are parallel')),
+        (('elbow_joint',), ('omits shoulder_lift_joint, but', 'connected there are par')),
         (
             ('elbow_joint', 'wrist_1_joint'),
             ('omits shoulder_lift', 'has wrist_1_joint', 'not par'),

@@ -248,8 +248,10 @@ def test_a_log_without_names_whose_cells_stand_apart_by_tabs_and_blanks(tmp_path
     with pytest.raises(InputError, match=r'no column q1; .*: give --columns "q\*=#\*" or'):
         read_table(tmp_path / 'table.csv', 2, foreign=Foreign(Layout(), None, log))
     layout = Layout(columns={'q1': '#2', 'q2': '#3'})
-    found = read_table(tmp_path / 'table.csv', 2, foreign=Foreign(Layout(), None, log, layout))
-    np.testing.assert_array_equal(found.fitted[0].joints, np.tile(JOINTS, (4, 1)))
+    for header in ('', 't\tq1\tq2\tn\n'):
+        log.write_text(header + log.read_text())
+        found = read_table(tmp_path / 'table.csv', 2, foreign=Foreign(Layout(), None, log, layout))
+        np.testing.assert_array_equal(found.fitted[0].joints, np.tile(JOINTS, (4, 1)))
 
 
 def test_rows_in_which_nothing_was_measured_are_left_out_and_said(read):

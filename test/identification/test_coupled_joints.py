@@ -12,6 +12,7 @@ from urdfs import SCARA, ZERO, Z, limits, reference_forward, written
 
 from calib_ros import CalibrationSession, Problem, Settings, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
@@ -90,6 +91,15 @@ def test_without_couplings_in_the_chain_they_are_named(rng):
     assert any('only moved together' in text and 'lower' in text for text in refused)
 
 
+def test_only_joints_that_can_move_are_told_to_have_stood_still(rng):
+    q = CHAIN.random_joints(60, rng)
+    q[:, 1], q[:, 3:5] = 0.5, [0.0, 0.1] - q[:, 1:3]
+    seen = measure(faulty(CHAIN, Cell(), rng), q, rng, *NOISE)
+    refused = identify(Problem(replace(CHAIN, base=None, tool=None), seen, **SIGMAS)).refusals
+    (reason,) = (each for each in refused if each.rule is Rule.EXCITATION)
+    assert reason.startswith('lower stood still (or was not recorded): the poses do not')
+
+
 def test_joint_states_need_not_name_them(rng):
     true = faulty(CHAIN, Cell(), rng)
     q = CHAIN.random_joints(5, rng)
@@ -105,6 +115,12 @@ def test_joint_states_need_not_name_them(rng):
     np.testing.assert_allclose([each.joints for each in made.samples], q, atol=1e-3)
 
 
+def test_names_that_never_came_are_not_told_to_have_come():
+    made = CalibrationSession(CHAIN, Settings())
+    take(made, of_joints(joint_state(1_000_000_000, ['turn', 'other'], [0.0, 0.0])))
+    assert made.account().foreign_names == ('other', 'turn')
+
+
 def test_equal_limits_that_are_none_are_refused(rng):
     assert parse_chain(dump_chain(CHAIN)).held == CHAIN.held == {3: 0.0, 4: 0.1}
     moved = CHAIN.random_joints(30, rng)
@@ -114,7 +130,7 @@ def test_equal_limits_that_are_none_are_refused(rng):
     with pytest.raises(InputError, match=r'level_2 was at .*, but both its limits are 0'):
         Problem(replace(CHAIN, effects=()), seen)
     stuck = SCARA.replace('lower="-3.0" upper="3.0"', 'lower="0.0" upper="0.0"')
-    with pytest.raises(ConfigError, match='limits of joint "wrist" are equal'):
+    with pytest.raises(ConfigError, match=r'limits of joint "wrist" are equal.*leave them out'):
         chain_from_urdf(stuck)
     assert len(chain_from_urdf(stuck, tip_link='lower').joints) == 3  # it is not in the way
 

@@ -115,6 +115,13 @@ def test_a_frame_moves_by_its_offsets(seed):
     np.testing.assert_allclose(moved.offsets(start), second, atol=1e-12)
 
 
+@pytest.mark.parametrize('name', ['joint_names', 'frame_names', 'all_parameters', 'held', 'walk'])
+def test_another_base_changes_nothing_else(name):
+    chain = row_of((0.0, HALF), 'standard', 'rr')
+    known = getattr(chain, name)
+    assert getattr(chain.with_frame('base', Frame()), name) is known
+
+
 def test_delays_of_a_frame_add_up():
     assert Frame().moved({'x': 1.0}).delay is None
     later = Frame().moved({DELAY: 0.25})

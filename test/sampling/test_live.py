@@ -233,7 +233,8 @@ def test_after_a_restart_a_sample_that_was_taken_back_counts_no_longer(rng):
 
 
 def test_joints_that_hardly_moved_are_named():
-    chain = Chain('arm', 'standard', (Joint('a'), Joint('b'), Joint('c', 'prismatic')))
-    joints = np.array([[0.0, 0.0, 0.0], [1.0, 0.3, 0.02], [-1.0, 0.1, 0.1]])
+    held = Joint('held', lower=0.0, upper=0.0)
+    chain = Chain('arm', 'standard', (Joint('a'), Joint('b'), Joint('c', 'prismatic'), held))
+    joints = np.array([[0.0, 0.0, 0.0, 0.0], [1.0, 0.3, 0.02, 0.0], [-1.0, 0.1, 0.1, 0.0]])
     assert barely_moved(chain, joints) == ('b',)
     assert barely_moved(chain, joints[:1]) == ('a', 'b', 'c')

@@ -174,7 +174,7 @@ def test_the_status_is_never_an_error():
 def test_a_silent_device_is_told():
     """The status said only "0 poses"; a wrong topic is the most frequent first mistake."""
     made = CalibrationSession(UR5E, Settings())
-    assert made.warnings[0].startswith('nothing was received: check the topics (joint_topics, so')
+    assert made.warnings[0].startswith('nothing was received: check joint_topics, sources, their')
     made.miss('measurements', 30, 'unusable')
     assert made.warnings[0].startswith('no joint states received: is the robot on, and its topic')
     made = CalibrationSession(UR5E, Settings())
