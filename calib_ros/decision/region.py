@@ -15,7 +15,7 @@ for.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,10 +23,10 @@ from scipy import special
 
 from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.evidence import Mixed, Posterior, with_unmodelled
+from calib_ros.estimation.considered import NOTHING
+from calib_ros.estimation.evidence import Mixed, Posterior
 from calib_ros.estimation.levels import KNOWN, UNUSUAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
-from calib_ros.estimation.samples import BLOCK
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
@@ -47,8 +47,7 @@ class Region(Shown):
     K) times its transpose. Predicted positions may be off by `limit` [m], infinite if the whole
     joint range is used; `share` is the used share of it. It was measured between `base` and
     `tool`. `by_scale`, unknown for a loaded region, is the probability that the device is out of
-    scale and makes the arm worse there. `unmodelled` are the sizes [rad] of random turns and
-    tilts of the joints beyond the parameters.
+    scale and makes the arm worse there.
     """
 
     chain: Chain
@@ -60,20 +59,12 @@ class Region(Shown):
     base: str = 'base'
     tool: str = 'tool'
     by_scale: float = 0.0
-    unmodelled: tuple[float, float] = (0.0, 0.0)
-
-    def sigma(self, joints: FloatArray, components: slice = np.s_[:3]) -> FloatArray:
-        """Return the expected error (N,) [m] of positions predicted at joint values (N, n).
-
-        Of orientations [rad] by other `components` of the pose.
-        """
-        names, square = with_unmodelled(self.chain, self.names, self.square, self.unmodelled)
-        model = ErrorModel(self.chain, names, self.base, self.tool)
-        return sigma_of(model, square, joints, components)
 
     def known(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] by the parameters alone, compared with `limit`."""
-        return replace(self, unmodelled=(0.0, 0.0)).sigma(joints)
+        known = self.chain, self.names, self.square, (self.base, self.tool)
+        squares = NOTHING.expected(*known, joints)[:, :3, :3]
+        return np.asarray(np.sqrt(np.trace(squares, axis1=1, axis2=2)))
 
     def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""
@@ -107,29 +98,7 @@ class Region(Shown):
             'names': list(self.names),
             'root': packed(self.square),
             'device': rows_of(self.device),
-            'unmodelled': list(self.unmodelled),
         }
-
-
-def sigma_of(
-    model: ErrorModel, square: FloatArray, joints: FloatArray, components: slice = np.s_[:3]
-) -> FloatArray:
-    """Return the expected size (N,) of some components of pose errors at joint values (N, n).
-
-    `square` (P, P) are the expected squares of the parameter errors.
-    """
-    found = np.empty(len(joints))
-    for first in range(0, len(joints), BLOCK):
-        part = slice(first, first + BLOCK)
-        found[part] = _sizes(model.jacobian(joints[part])[:, components], square)
-    return found
-
-
-def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the expected sizes (N,) of rows (N, c, P) times errors of squares (P, P)."""
-    flat = rows.reshape(-1, rows.shape[2])
-    squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 def packed(square: FloatArray) -> list[str]:
@@ -192,7 +161,6 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             if frame not in chain.frame_names:
                 raise UnknownNameError('frame', frame, chain.frame_names)
         limit = document['limit']
-        turn, tilt = map(float, document.get('unmodelled', (0.0, 0.0)))
         region = Region(
             chain,
             names,
@@ -201,15 +169,13 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
             np.inf if limit is None else float(limit),
             float(document['share']),
             *ends,
-            unmodelled=(turn, tilt),
         )
     except UnknownNameError as err:
         what = f'{where}: calibration.region: {err.what}'
         raise UnknownNameError(what, err.name, err.alternatives) from err
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
         raise damaged('region', where, err) from err
-    fine = 0.0 <= turn < np.inf and 0.0 <= tilt < np.inf
-    if not (fine and region.limit > 0.0 and 0.0 <= region.share <= 1.0):
+    if not (region.limit > 0.0 and 0.0 <= region.share <= 1.0):
         raise damaged('region', where)
     return region
 
@@ -249,7 +215,14 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     share = float(np.mean(far <= limit))
     limit = np.inf if share == 1.0 else limit
     known = posterior.chain, posterior.names, posterior.square, posterior.device
-    return Region(*known, limit, share, *ends, by_scale, posterior.unmodelled)
+    return Region(*known, limit, share, *ends, by_scale)
+
+
+def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
+    """Return the expected sizes (N,) of rows (N, c, P) times errors of squares (P, P)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 _Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]

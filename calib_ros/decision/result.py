@@ -125,7 +125,7 @@ class Identification(Shown):
         jacobian = ErrorModel(self.chain, self.names).jacobian(q)[:, :3]
         sources = self.uncertainty.parts
         shares = np.array([np.einsum('ncp,pr,ncr->n', jacobian, s, jacobian) for s in sources])
-        shares[-1] = 0.0  # tilts are not in the expected squares
+        shares[-1] = 0.0  # waves: their size is hardly known
         freedom = self.uncertainty.freedom_of(shares)
         posterior, squares = self.posterior, self.pose_covariance(q)[:, :3, :3]
         biased = ErrorModel(posterior.chain, posterior.names).jacobian(q)[:, :3] @ posterior.shift

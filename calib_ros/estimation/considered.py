@@ -57,75 +57,112 @@ def lenses(chain: Chain) -> dict[Parameter, float]:
     }
 
 
-class Tilts(NamedTuple):
-    """Size [rad] of the waves of wobbling axes, and how P parameters follow each (P, T)."""
+class Unmodelled(NamedTuple):
+    """Errors of joints [rad] that no parameter explains.
 
-    size: float
-    followed: FloatArray
+    At random each joint turns about its axis (slides along it [m], if prismatic), and the axis
+    tilts. The axis also wobbles by waves, which the parameters `names` (P,) follow by `followed`
+    (P, T) a unit.
+    """
+
+    turns: float = 0.0
+    tilts: float = 0.0
+    waves: float = 0.0
+    names: tuple[str, ...] = ()
+    followed: FloatArray = np.zeros((0, 1))
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Return the sizes by name; without them nothing is lacking."""
+        return {'turns': self.turns, 'tilts': self.tilts, 'waves': self.waves}
 
     @property
     def square(self) -> FloatArray:
-        """Return the covariance (P, P) of the parameters."""
-        return np.asarray(self.size**2 * self.followed @ self.followed.T)
+        """Return the covariance (P, P) of the parameters by waves."""
+        return np.asarray(self.waves**2 * self.followed @ self.followed.T)
 
-    def left(
-        self, chain: Chain, names: Sequence[str], ends: tuple[str, str], joints: FloatArray
-    ) -> FloatArray:
-        """Return the expected squares (N, 6) of pose errors at joint values (N, n).
-
-        By tilts that the names (P,) do not follow, between the `ends`.
-        """
-        every = tuple(dict.fromkeys((*names, *tilting(chain))))
-        model, squares = ErrorModel(chain, every, *ends), np.empty((len(joints), 6))
-        for first in range(0, len(joints), BLOCK):
-            part = joints[first : first + BLOCK]
-            rows = model.jacobian(part).transpose(2, 1, 0)
-            found = tilted(chain, every, part, rows)
-            found -= np.tensordot(self.followed, rows[: len(names)], (0, 0))
-            squares[first : first + BLOCK] = (found**2).sum(axis=0).T
-        return self.size**2 * squares
-
-    def among(self, names: Sequence[str], own: Sequence[str]) -> Tilts:
-        """Return how other parameters follow, of which only the `own` (P,) do."""
-        rows = dict(zip(own, self.followed, strict=True))
+    def among(self, names: Sequence[str]) -> Unmodelled:
+        """Return the same of other parameters, of which only its own follow."""
+        rows = dict(zip(self.names, self.followed, strict=True))
         none = np.zeros(self.followed.shape[1])
-        return Tilts(self.size, np.array([rows.get(name, none) for name in names]))
+        followed = np.array([rows.get(name, none) for name in names])
+        return self._replace(names=tuple(names), followed=followed.reshape(-1, len(none)))
 
-    def of(self, chain: Chain) -> bool:
-        """Tell whether they may be those of a chain."""
-        return 0.0 <= self.size < np.inf and self.followed.shape[1] == 8 * len(chain.joints)
+    def columns(
+        self, chain: Chain, names: Sequence[str], joints: FloatArray, rows: FloatArray
+    ) -> FloatArray:
+        """Return the columns (K, c, N) at joint values (N, n), waves last; rows as in `moved`."""
+        turns, tilts = moved(chain, names, rows)
+        own = rows[[names.index(name) for name in self.names]]
+        left = waved(tilts, joints) - np.tensordot(self.followed, own, (0, 0))
+        return np.concatenate([self.turns * turns, self.tilts * tilts, self.waves * left])
+
+    def expected(
+        self,
+        chain: Chain,
+        names: Sequence[str],
+        square: FloatArray,
+        ends: tuple[str, str],
+        joints: FloatArray,
+    ) -> FloatArray:
+        """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
+
+        Between the `ends`, in world axes, with expected squares (P, P) of the parameters `names`.
+        """
+        some, joints = any(self.sizes.values()), chain.joint_values(joints)
+        every = tuple(dict.fromkeys((*names, *(moving(chain) if some else ()))))
+        model, squares = ErrorModel(chain, every, *ends), np.empty((len(joints), 6, 6))
+        for first in range(0, len(joints), BLOCK):
+            block = np.s_[first : first + BLOCK]
+            jacobian = model.jacobian(joints[block])
+            own = jacobian[..., : len(names)]
+            squares[block] = own @ square @ np.swapaxes(own, 1, 2)
+            if some:
+                rows = jacobian.transpose(2, 1, 0)
+                off = self.columns(chain, every, joints[block], rows)
+                squares[block] += off.T @ off.transpose(2, 0, 1)
+        return squares
 
 
-NO_TILTS = Tilts(0.0, np.zeros((0, 0)))
+NOTHING = Unmodelled()
 
 
-def tilting(chain: Chain) -> list[Parameter]:
-    """Return the parameters that tilt the axes of joints: those of rows, and turns of bases."""
+def moving(chain: Chain) -> list[Parameter]:
+    """Return the parameters that turn joints about their axes, and those that tilt the axes.
+
+    The latter are those of rows, and turns of bases.
+    """
     bases = [frame for frame in chain.frame_names if frame.startswith('base')]
     turns = [name for frame in bases for name in parameters_of(frame)[3:]]
-    return [*turns, *(Parameter(n, kind) for n in chain.joint_names for kind in ('alpha', 'beta'))]
+    tilts = (Parameter(name, kind) for name in chain.joint_names for kind in ('alpha', 'beta'))
+    return [*turns, *tilts, *(joint.driven for joint in chain.joints)]
 
 
-def tilted(chain: Chain, names: Sequence[str], joints: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the columns (T, c, N) of wobbling axes at joint values (N, n).
+def moved(chain: Chain, names: Sequence[str], rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of turns (n, c, N) about the axes, and of two tilts (2 n, c, N) of each.
 
-    Each of the n axes tilts in two directions by sine and cosine of the first and second harmonic
-    of its own joint, T = 8 n. `rows` (P, c, N) are those of the names, with all that are
-    `tilting`. In the standard convention the row before a joint tilts its axis, or the base does.
+    `rows` (P, c, N) are those of the names, with all that are `moving`. In the standard convention
+    the row before a joint tilts its axis, or the base does.
     """
     own = dict(zip(names, rows, strict=False))
-    pairs = [[own[f'{n}.{kind}'] for kind in ('alpha', 'beta')] for n in chain.joint_names]
+    tilts = [own[f'{name}.{kind}'] for name in chain.joint_names for kind in ('alpha', 'beta')]
     if chain.convention == 'standard':
         bases = [frame for frame in chain.frame_names if frame.startswith('base')]
-        turned = [
-            np.tensordot(chain.frame(frame).matrix[:3, :2], [own[n] for n in turns], (0, 0))
-            for frame, turns in ((frame, parameters_of(frame)[3:]) for frame in bases)
-        ]
-        pairs = [list(np.sum(turned, axis=0)), *pairs[:-1]]
-    angles = np.multiply.outer((1.0, 2.0), joints.T)  # (2, n, N)
-    waves = np.concatenate([np.cos(angles), np.sin(angles)])
-    every = ((tilt, waves[:, k]) for k, pair in enumerate(pairs) for tilt in pair)
-    return np.array([wave * tilt for tilt, own in every for wave in own])
+        turns = [[own[name] for name in parameters_of(frame)[3:]] for frame in bases]
+        axes = [chain.frame(frame).matrix[:3, :2] for frame in bases]
+        tilts = [*np.tensordot(axes, turns, ((0, 1), (0, 1))), *tilts[:-2]]
+    return np.array([own[joint.driven] for joint in chain.joints]), np.array(tilts)
+
+
+def waved(tilts: FloatArray, joints: FloatArray) -> FloatArray:
+    """Return the columns (8 n, c, N) of wobbling axes at joint values (N, n).
+
+    Each tilt (2 n, c, N) follows sine and cosine of the first and second harmonic of its joint.
+    """
+    angles = np.multiply.outer(joints.T, (1.0, 2.0))  # (n, N, 2)
+    waves = np.concatenate([np.cos(angles), np.sin(angles)], axis=2).repeat(2, axis=0)
+    found = tilts[:, np.newaxis] * waves.transpose(0, 2, 1)[:, :, np.newaxis]
+    return np.asarray(found.reshape(-1, *tilts.shape[1:]))
 
 
 def products_with_doubts(
@@ -138,7 +175,7 @@ def products_with_doubts(
     by_device: bool,
     known: Normal | None,
     most: int = 10 * SOME_POSES,
-    tilts: Tilts | None = None,
+    unmodelled: Unmodelled = NOTHING,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return products of columns and residual, and their products with doubtful columns.
 
@@ -146,16 +183,16 @@ def products_with_doubts(
     and of the residual. A^T N (P + 1, K) and N^T N + 1 (K, K) follow, with N scaled by its
     standard deviations. All are in units of `noise` [sigma given], without priors. `doubts` are
     standard deviations of parameters that something else moves too; `by_device` includes smooth
-    device errors, `tilts` what the names do not follow already. Larger systems are thinned to
-    `most` samples; `known` holds the products of all samples for the names alone.
+    device errors, `unmodelled` waves that the names do not follow already. Larger systems are
+    thinned to `most` samples; `known` holds the products of all samples for the names alone.
     """
-    columns = list(dict.fromkeys([*names, *lengths, *(tilting(chain) if tilts else ())]))
+    columns = list(dict.fromkeys([*names, *lengths, *(moving(chain) if unmodelled.waves else ())]))
     share = -(-system.count // most)
     if known is not None and share == 1 and not lengths and not by_device:
         products = known.products.sum(axis=0)
     else:
         few = replace(system.spread(most), prior=None)
-        products = share * _products(chain, columns, few, by_device, tilts is not None)
+        products = share * _products(chain, columns, few, by_device, unmodelled)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own = [*range(len(columns)), -1]
     products[np.ix_(own, own)] += share * (extra.T @ extra)
@@ -165,10 +202,6 @@ def products_with_doubts(
     grown = grown.sum(axis=1)[:, np.newaxis][:, : len(lengths)]  # none without lengths
     doubted = every[:, [row[str(name)] for name in doubts]] * [*doubts.values()]
     fields = every[:, len(columns) : -1]
-    if tilts is not None:
-        waves = fields[:, -tilts.followed.shape[1] :]
-        waves[: len(names)] -= tilts.followed
-        waves *= tilts.size
     kept = np.column_stack([every[:, : len(names)], grown, every[:, -1]])
     mixing = np.column_stack([kept, doubted, fields])
     mixed = mixing.T @ (products / noise**2) @ mixing
@@ -195,12 +228,12 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
 
 
 def _products(
-    chain: Chain, columns: Sequence[str], system: System, by_device: bool, wobbling: bool
+    chain: Chain, columns: Sequence[str], system: System, by_device: bool, unmodelled: Unmodelled
 ) -> FloatArray:
     fields = bends(system.sets) if by_device else []
-    if not (any(map(len, fields)) or wobbling):
+    waves = 8 * len(chain.joints) if unmodelled.waves else 0
+    if not (any(map(len, fields)) or waves):
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
-    waves = 8 * len(chain.joints) * wobbling
     found = np.zeros((len(columns) + len(fields[0]) + waves + 1,) * 2)
     for samples, field in zip(system.sets, fields, strict=True):
         first = 0
@@ -209,7 +242,7 @@ def _products(
             joints = samples.observations.joints[block]
             for number, rows in enumerate(parts):
                 bent = field[:, :, block] * (number == 0)  # distortion does not turn
-                more = [tilted(chain, columns, joints, rows)] if wobbling else []
+                more = [unmodelled.columns(chain, columns, joints, rows)[-waves:]] if waves else []
                 found += gram(np.concatenate([rows[:-1], bent, *more, rows[-1:]]))
     return found
 

@@ -26,13 +26,12 @@ from typing import TypeAlias
 import numpy as np
 from scipy import linalg
 
-from calib_ros.estimation.considered import NO_TILTS, Tilts, lengths_of, products_with_doubts
+from calib_ros.estimation.considered import NOTHING, Unmodelled, lengths_of, products_with_doubts
 from calib_ros.estimation.leastsquares import Normal, System
 from calib_ros.estimation.levels import OUT_OF_SCALE, SCALE
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
@@ -54,25 +53,6 @@ def _group(name: str) -> str:
     return group if group in TYPICAL else 'drive'
 
 
-def turns_and_tilts(chain: Chain) -> tuple[list[Parameter], list[Parameter]]:
-    """Return parameters that turn each joint (slide it, if prismatic), and that tilt its axis."""
-    tilts = [Parameter(name, kind) for name in chain.joint_names for kind in ('alpha', 'beta')]
-    return [joint.driven for joint in chain.joints], tilts
-
-
-def with_unmodelled(
-    chain: Chain, names: tuple[str, ...], square: FloatArray, sizes: Sequence[float]
-) -> tuple[tuple[str, ...], FloatArray]:
-    """Return names and expected squares (P, P) with turns and tilts of some sizes [rad]."""
-    for size, turns in zip(sizes, turns_and_tilts(chain), strict=True):
-        if size:
-            names = tuple(dict.fromkeys((*names, *turns)))
-            square = np.pad(square, (0, len(names) - len(square)))
-            index = [names.index(name) for name in turns]
-            square[index, index] += size**2
-    return names, square
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Posterior(Shown):
     """Posterior of a fitted arm, given the data and the sizes of its errors."""
@@ -92,10 +72,8 @@ class Posterior(Shown):
     scale error and rounded joint values may be off."""
     rival: tuple[float, float, FloatArray, FloatArray] | None = None
     """The same for a device out of scale: log odds, scale minus one, mean (P,) and covariance."""
-    unmodelled: tuple[float, float] = (0.0, 0.0)
-    """Sizes [rad] of turns and tilts of the joints beyond all names (`unmodelled.py`)."""
-    tilts: Tilts = NO_TILTS
-    """How wobble of the axes moves the fitted parameters."""
+    unmodelled: Unmodelled = NOTHING
+    """What none of the names explains (`unmodelled.py`)."""
 
     @cached_property
     def square(self) -> FloatArray:
@@ -107,9 +85,8 @@ class Posterior(Shown):
 
         In world axes, unmodelled effects included.
         """
-        names, square = with_unmodelled(self.chain, self.names, self.square, self.unmodelled)
-        rows = ErrorModel(self.chain, names, base, tool).jacobian(joints)
-        return np.asarray(rows @ square @ np.swapaxes(rows, 1, 2))
+        known = self.chain, self.names, self.square, (base, tool)
+        return self.unmodelled.expected(*known, joints)
 
     def stds_of(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations (K,) of undetermined parameters of the arm."""

@@ -70,13 +70,14 @@ class Stops:
 
     `parts` are (P + 1, c, n), by position and orientation, zero if not measured; `count` (n,)
     samples per stop; `place` (n, D) in joint space, angles on the unit circle, and `time` (n,) the
-    stop number; both far apart between sets.
+    stop number; both far apart between sets; `joints` (n, J) their joint values.
     """
 
     parts: list[FloatArray]
     count: FloatArray
     place: FloatArray
     time: FloatArray
+    joints: FloatArray
 
     def __len__(self) -> int:
         return len(self.count)
@@ -264,20 +265,11 @@ def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> t
     return _gather(chain, names, system, share, most // 20), share
 
 
-def joints_at(chain: Chain, place: FloatArray) -> FloatArray:
-    """Return the joint values (n, J), angles within a turn, at the places (n, D) of stops."""
-    circular = np.array([joint.type == 'revolute' for joint in chain.joints])
-    cos, sin, straight = np.split(place[:, :-1], np.arange(1, 3) * circular.sum(), axis=1)
-    found = np.empty((len(place), len(circular)))
-    found[:, circular], found[:, ~circular] = np.arctan2(sin, cos), straight
-    return found
-
-
 def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run: int) -> Stops:
     """Return the stops of all sets; of many, every `share`-th run of `run` stops."""
     widths = (max(samples.width for samples in system.sets), 3)
     parts: list[list[FloatArray]] = [[], []]
-    counts, places, times = [], [], []
+    counts, places, times, joints = [], [], [], []
     circular = np.array([joint.type == 'revolute' for joint in chain.joints])
     for number, samples in enumerate(system.sets):
         all_numbers = samples.observations.stops
@@ -304,12 +296,13 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
         turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
         places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
         times.append(numbers[begins] + ELSEWHERE * number)
+        joints.append(q)
         counts.append(count)
     if not counts:
-        return Stops([], np.zeros(0), np.zeros((0, 0)), np.zeros(0))
+        return Stops([], np.zeros(0), *np.zeros((3, 0, 0)))
     return Stops(
         [np.concatenate(part, axis=2) for part in parts],
-        *(np.concatenate(each) for each in (counts, places, times)),
+        *(np.concatenate(each) for each in (counts, places, times, joints)),
     )
 
 

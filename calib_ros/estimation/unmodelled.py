@@ -1,11 +1,23 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the arm that no parameter explains: how far its joints turn and tilt at random.
+"""Errors of the arm that no parameter explains: how far its joints turn and their axes tilt.
 
 Play, gear harmonics, wobbling bearings and a rocking base act at the joints, so their errors grow
 with the distance of the target from these; the noise of a device does not. That tells them apart
-even if the sigmas of the device are unknown. With the columns Q of the posterior, scaled by a root
-of its covariance, its residuals r have the covariance B V B + B - B^2, B = I - Q Q^T. In
+even if the sigmas of the device are unknown.
+
+Axes that wobble, as in their bearings, tilt by waves (`considered.waved`) of the joint's value.
+Their size s is the most probable one, with the parameters integrated out: with the products W of
+their columns and p of these with the residuals, both beside the parameters, the log evidence is
+
+    (p^T (W + I / s^2)^-1 p - log det(I + s^2 W)) / 2
+
+In a small region parameters absorb waves without a trace in the residuals: unless the data rule it
+out, the typical size counts.
+
+The rest is random, from stop to stop. With the columns Q of the posterior, and of waves that show,
+scaled by a root of the covariance, the residuals r have the covariance B V B + B - B^2, B = I -
+Q Q^T. In
 
     V = v_0 I_position + v_1 I_orientation + v_2 K_turns + v_3 K_tilts
 
@@ -13,11 +25,9 @@ K holds the products, stop by stop, of the columns of turns of all joints about 
 tilts. If a test finds r^T K r larger than white noise allows, sizes v >= 0 equate these forms with
 their expected values (MINQUE, Rao 1971).
 
-They move the fitted parameters too. Turns, as of gears, average out like noise. Considered effects
-(`evidence.py`) of columns A and expected squares S add H^-1 (J^T A S A^T J) H^-1. So do tilts that
-change slowly with the value of their joint, as of bearings: waves (`considered.tilted`) of one
-size, the most probable one. In a small region parameters absorb them without a trace in the
-residuals, and the typical size counts.
+Waves move the fitted parameters too, and so do considered effects (`evidence.py`): those of
+columns A and expected squares S add H^-1 (J^T A S A^T J) H^-1 to the covariance. Random errors
+average out like noise.
 """
 
 from __future__ import annotations
@@ -27,113 +37,122 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.considered import Tilts, tilted, tilting
-from calib_ros.estimation.evidence import Posterior, turns_and_tilts
+from calib_ros.estimation.considered import Unmodelled, moved, moving, waved
+from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.shared_errors import gathered, joints_at, nonnegative
-from calib_ros.estimation.sizes import LEAST_SIZE, SPREAD, TYPICAL, Evidence, solved
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.estimation.shared_errors import gathered, nonnegative
+from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
+from calib_ros.kinematics.se3 import FloatArray, Index
 
 
 def unmodelled_errors(
     posterior: Posterior, factor: FloatArray, system: System
-) -> tuple[tuple[float, float], FloatArray, Tilts]:
-    """Return the sizes [rad] of random turns and tilts of the joints, zero without evidence.
+) -> tuple[Unmodelled, FloatArray]:
+    """Return what no parameter explains; random turns and tilts are zero without evidence.
 
-    Those of a prismatic joint along its axis [m] count as turns. Then follow the expected squares
-    (F, F) that considered effects add to the F parameters of the fit with that `factor` (F, F),
-    the first of the posterior's names, and the tilts, which add to them too. Parameters held at
-    nominal have no prior: the fit includes them already.
+    Then follow the expected squares (F, F) that considered effects and waves add to the F
+    parameters of the fit with that `factor` (F, F), the first of the posterior's names. Parameters
+    held at nominal have no prior: the fit includes them already.
     """
     chain, names = posterior.chain, posterior.names
-    groups, fitted = turns_and_tilts(chain), np.s_[: len(factor)]
-    every = tuple(dict.fromkeys((*names, *groups[0], *tilting(chain))))
+    count, own = len(names), len(factor)
+    every = tuple(dict.fromkeys((*names, *moving(chain))))
     units, share = gathered(chain, every, system, SOME_POSES)
-    rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= len(factor)]
-    columns = [[every.index(name) for name in group] for group in groups]
-    parts, along = [], np.zeros((len(factor), len(rest) + 4 * len(columns[1])))  # 4 waves each
-    for part in units.parts:
-        waves = tilted(chain, every, joints_at(chain, units.place), part)
-        others = np.concatenate([part[rest], waves])
-        along += share * np.einsum('pcn,qcn->pq', part[fitted], others)
-        parts += [np.concatenate([part[:-1], waves, part[-1:]])] * bool(part.any())
-    found = ((0.0, 0.0), TYPICAL['drive'])
+    used = [part for part in units.parts if part.any()]
+    rows = np.concatenate([np.zeros((len(every) + 1, 0, len(units))), *used], axis=1)
+    part_of = np.arange(len(used)).repeat([part.shape[1] for part in used])
+    random = moved(chain, every, rows)
+    rows = np.concatenate([rows[:count], waved(random[1], units.joints), rows[-1:]])
+    products = np.array([gram(rows[:, part_of == k]) for k in range(len(used))])
+    sizes = 0.0, 0.0, TYPICAL['drive']
     if len(units) >= TELLING:
-        found = _found(posterior, parts, columns, len(every))
-    own, pushed = np.split(along, [len(rest)], axis=1)
-    tilts = Tilts(found[1], covariance(factor) @ pushed)
-    moved = covariance(factor, own @ posterior.square[np.ix_(rest, rest)] @ own.T)
-    return found[0], moved, tilts
+        sizes = _sizes(posterior, rows, part_of, products, random)
+    rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= own]
+    along = share * products.sum(axis=0)[:own, :-1]
+    middle = along[:, rest] @ posterior.square[np.ix_(rest, rest)] @ along[:, rest].T
+    followed = covariance(factor) @ along[:, count:]
+    found = Unmodelled(*sizes, names[:own], followed)
+    return found, covariance(factor, middle)
 
 
-def _found(
-    posterior: Posterior, parts: Sequence[FloatArray], groups: Sequence[Sequence[int]], first: int
-) -> tuple[tuple[float, float], float]:
-    """Return the sizes of turns and tilts, whose columns are the `groups`, and of waves.
+def _sizes(
+    posterior: Posterior,
+    rows: FloatArray,
+    part_of: Index,
+    products: FloatArray,
+    random: Sequence[FloatArray],
+) -> tuple[float, float, float]:
+    """Return the sizes of turns, tilts and waves.
 
-    By weighted rows, those of waves from the `first` on.
+    From weighted rows (P + T + 1, c, n), those of T waves and the residual last, their `products`
+    by part, and rows of `random` turns and tilts. Waves have at least the typical size, unless the
+    data rule that out.
     """
-    count = len(posterior.names)
-    found = _explained(posterior, [part[[*range(count), -1]] for part in parts])
-    if found is None:
-        return (0.0, 0.0), TYPICAL['drive']
-    step, root, scales = found
-    parts = [part / scale for part, scale in zip(parts, scales, strict=True)]
-    wide = np.concatenate(parts, axis=1)
-    rows = wide.transpose(2, 1, 0)  # (n, c, P)
-    residual = rows[..., -1] + rows[..., :count] @ step
-    part_of = np.repeat(np.arange(len(parts)), [part.shape[1] for part in parts])
-    whites = rows.any(axis=2) & (part_of == np.arange(len(parts))[:, np.newaxis, np.newaxis])
+    count, typical = len(posterior.names), TYPICAL['drive']
+    given = np.array([posterior.priors.get(name, np.inf) for name in posterior.names]) ** -2.0
+    counts = np.bincount(part_of, rows.any(axis=0).sum(axis=1))
+    none = np.zeros(len(rows) - 1 - count)
+    offsets, precision = np.append(posterior.offsets, none), given
+    own, waves = np.s_[:count], np.s_[count:]
+    tried = typical * np.geomspace(LEAST_SIZE, 1.0 / LEAST_SIZE, 201)  # the typical one amidst
+    for _ in range(SEVERAL):
+        variances = _variances(products, offsets, precision, counts)
+        if not variances.all():
+            return 0.0, 0.0, typical
+        total = np.tensordot(1.0 / variances, products, 1)
+        matrix, vector = total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
+        mean, root = solved(matrix[own, own], vector[own], given)
+        along = matrix[waves, own] @ root
+        known, axes = np.linalg.eigh(matrix[waves, waves] - along @ along.T)
+        seen = np.outer(tried**2, np.maximum(known, 0.0))
+        pulled = (vector[waves] - matrix[waves, own] @ mean) @ axes
+        squares = np.outer(tried**2, pulled**2) / (1.0 + seen)
+        odds = 0.5 * (squares - np.log1p(seen)).sum(axis=1)  # against none
+        best = np.argmax(odds - 0.5 * (np.log(tried / typical) / np.log(SPREAD)) ** 2)
+        shown = odds[best] > SHOWN
+        least = typical * (odds[best] - odds[len(tried) // 2] < 2.0 * REFUTED)  # less is unusual
+        wave = float(max(least, shown * tried[best]))
+        if not shown:
+            break
+        precision = np.append(given, none + tried[best] ** -2.0)
+    own = np.s_[: len(precision)]
+    mean, root = solved(matrix[own, own], vector[own], precision)
+    scale = np.sqrt(variances)[part_of, np.newaxis]
+    every = *random, rows[own], rows[-1:]
+    turned, tilted, fitted, left = ((each / scale).transpose(2, 1, 0) for each in every)
+    residual = left[..., 0] + fitted @ (offsets[own] - mean)
+    whites = rows.any(axis=0).T & (part_of == np.arange(len(variances))[:, np.newaxis, np.newaxis])
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
-    kernels += [rows[..., group] @ np.swapaxes(rows[..., group], 1, 2) for group in groups]
-    turn, tilt = _sizes(np.array(kernels), rows[..., :count] @ root, residual).tolist()
-    return (turn, tilt), _size_of_waves(posterior, wide[[*range(count), *range(first, len(wide))]])
+    kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
+    turn, tilt = _random(np.array(kernels), fitted @ root, residual).tolist()
+    return turn, tilt, wave
 
 
-def _size_of_waves(posterior: Posterior, rows: FloatArray) -> float:
-    """Return the size [rad] of waves, whose rows (P + T + 1, c, n) follow the posterior's.
+def _variances(
+    products: FloatArray, offsets: FloatArray, precision: FloatArray, counts: Index
+) -> FloatArray:
+    """Return the variance (K,) of noise by part of so many rows; zero if nothing is left.
 
-    At least the typical one, unless the data rule that out and show none.
+    By the products of the first P columns, with the prior `precision` (P,) of their `offsets`.
     """
-    products, count, group = gram(rows), len(posterior.names), 'tilt'
-    none = np.zeros(len(products) - 1 - count)
-    given = [1.0 / posterior.priors.get(name, np.inf) ** 2 for name in posterior.names]
-    matrix, typical = products[:-1, :-1], TYPICAL['drive']
-    vector = matrix @ np.append(posterior.offsets, none) + products[:-1, -1]
-    groups = [None] * count + [group] * len(none)
-    sought = Evidence(matrix, vector, np.append(given, none), groups, {group: typical})
-    size = float(np.exp(sought.most_probable({group})[0][0]))
-    return max(size, typical) if size > SPREAD * LEAST_SIZE * typical else 0.0
-
-
-def _explained(
-    posterior: Posterior, parts: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-    """Return step to the posterior mean (P,), root (P, P) of its covariance, and noise by part.
-
-    From weighted rows (P + 1, c, n) of each part; None if nothing is left to judge by.
-    """
-    inverse = np.array([1.0 / posterior.priors.get(name, np.inf) for name in posterior.names])
-    products = np.array([gram(part) for part in parts])
-    counts = np.array([np.count_nonzero(part.any(axis=0)) for part in parts])
-    variances = np.ones(len(parts))
+    own = np.s_[: len(precision)]
+    variances, pulled = np.ones(len(products)), offsets[own] * precision
     for _ in range(SEVERAL):
         total = np.tensordot(1.0 / variances, products, 1)
-        vector = total[:-1, -1] - posterior.offsets * inverse**2
-        mean, root = solved(total[:-1, :-1], vector, inverse**2)
-        last = np.append(-mean, 1.0)
-        taken = ((products[:, :-1, :-1] @ root) * root).sum(axis=(1, 2)) / variances
-        left = last @ products @ last
+        mean, root = solved(total[own, own], total[own, -1] - pulled, precision)
+        taken = np.tensordot(products[:, own, own], root @ root.T) / variances
+        left = products[:, -1, -1] - 2.0 * products[:, -1, own] @ mean
+        left += mean @ products[:, own, own] @ mean
         if not ((left > 0.0) & (taken < counts)).all():
-            return None
+            return np.zeros(len(products))
         variances = left / (counts - taken)
-    return -mean, root, np.sqrt(variances)
+    return variances
 
 
-def _sizes(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> FloatArray:
+def _random(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> FloatArray:
     """Return the standard deviations (2,) of the last two kernels (K, n, c, c).
 
     For the posterior's columns (n, c, P), scaled, and its residuals (n, c).

@@ -164,8 +164,8 @@ def identified(result: Identification, about: Filing, warnings: Sequence[str] = 
         names=names,
         offsets=np.array([offsets[name] for name in names]),
         covariance=result.covariance,
-        tilt=result.posterior.tilts.size,
-        tilts=np.float32(result.posterior.tilts.followed),
+        tilt=result.posterior.unmodelled.waves,
+        tilts=np.float32(result.posterior.unmodelled.followed),
     )
 
 

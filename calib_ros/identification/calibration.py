@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,10 @@ from typing import Any
 import numpy as np
 
 import calib_ros
-from calib_ros.decision.region import Region, packed, region_of_record, rows_of, sigma_of
+from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.considered import Tilts
+from calib_ros.estimation.considered import NOTHING, Unmodelled
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
@@ -45,7 +45,6 @@ from calib_ros.kinematics.chain_file import (
     read_text,
     table_hash,
 )
-from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
@@ -64,8 +63,8 @@ class Calibration(Shown):
     """Fitted parameters, (P,)."""
     covariance: FloatArray | None = None
     """Of the fitted parameters, (P, P)."""
-    tilts: Tilts | None = None
-    """The share of unmodelled wobble in it."""
+    unmodelled: Unmodelled = NOTHING
+    """What no parameter explains; it has a share in the covariance."""
     freedom: float = np.inf
     """Degrees of freedom of the covariance estimate."""
     residual: float | None = None
@@ -114,7 +113,7 @@ class Calibration(Shown):
             before=result.before,
             names=result.names,
             covariance=result.covariance,
-            tilts=result.posterior.tilts,
+            unmodelled=result.posterior.unmodelled,
             freedom=result.uncertainty.overall,
             residual=1e-3 * rms_mm,
             noise=noise,
@@ -134,9 +133,11 @@ class Calibration(Shown):
                 'freedom': None if np.isinf(self.freedom) else self.freedom,
                 'root': packed(self.covariance),
             }
-            if self.tilts is not None:
-                size, followed = self.tilts
-                record['covariance'] |= {'tilt': size, 'tilts': rows_of(followed)}
+            if self.unmodelled.names:
+                record['covariance']['unmodelled'] = {
+                    **self.unmodelled.sizes,
+                    'followed': rows_of(self.unmodelled.followed),
+                }
         if self.rows is not None:
             record['rows'] = self.rows.document()
         return HEAD + dump_chain(self.chain, record)
@@ -155,17 +156,14 @@ class Calibration(Shown):
         error, unmodelled effects included.
         """
         if (region := self.region) is not None:
-            found = region.sigma(joints, components)
-            if self.tilts is None or not self.tilts.size:
-                return found
-            ends = region.base, region.tool  # tilts found at random may be these
-            left = self.tilts.left(self.chain, self.names, ends, self.chain.joint_values(joints))
-            known = replace(region, unmodelled=(0.0, 0.0)).sigma(joints, components)
-            wobble = np.sqrt(left[:, components].sum(axis=1))
-            return np.asarray(np.maximum(found, np.hypot(known, wobble)))
-        if self.covariance is None:
+            ends, lacking = (region.base, region.tool), self.unmodelled
+            known = region.chain, region.names, region.square, ends
+        elif self.covariance is not None:
+            lacking, known = NOTHING, (self.chain, self.names, self.covariance, ('base', 'tool'))
+        else:
             return np.full(len(joints), np.nan)
-        return sigma_of(ErrorModel(self.chain, self.names), self.covariance, joints, components)
+        squares = lacking.expected(*known, joints)
+        return np.asarray(np.sqrt(np.diagonal(squares, 0, 1, 2)[:, components].sum(axis=1)))
 
     def remaining(self, joints: FloatArray) -> FloatArray:
         """Return the expected remaining error (N,) [m] at joint values (N, n); NaN if unknown.
@@ -294,14 +292,14 @@ def parse_calibration(
     nominal = nominal or record.nominal(chain)
     record.check(chain, nominal, settings)
     content = record.content
-    names, covariance, freedom, tilts = record.covariance(chain)
+    names, covariance, freedom, unmodelled = record.covariance(chain)
     residual = content.get('rms_mm_after')
     return Calibration(
         chain=chain,
         before=record.before(nominal, chain),
         names=names,
         covariance=covariance,
-        tilts=tilts,
+        unmodelled=unmodelled,
         freedom=freedom,
         residual=None if residual is None else 1e-3 * residual,
         noise=record.noise(),

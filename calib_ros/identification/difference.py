@@ -164,7 +164,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         left,
         tuple(changed),
         _chance(left_over, freedom, sum(len(each[0].names) for each in changed)),
-        None in (first.tilts, second.tilts),
+        not (first.unmodelled.names and second.unmodelled.names),
     )
 
 
@@ -180,10 +180,9 @@ def _squares(
                 f'calibration {number} has no parameter covariance: identify it again with this '
                 'version'
             )
-        alone = each.covariance
-        if each.tilts is not None:
-            alone, size = alone - each.tilts.square, max(size, each.tilts.size)
-            apart = _change(each.chain, names, each.names) @ each.tilts.followed - apart
+        waves = each.unmodelled.among(each.names)
+        alone, size = each.covariance - waves.square, max(size, waves.waves)
+        apart = _change(each.chain, names, each.names) @ waves.followed - apart
         own = whole = _in_names(each.chain, names, each.names, alone)
         region = each.region
         if region is not None:

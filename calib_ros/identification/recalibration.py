@@ -27,7 +27,7 @@ from calib_ros.decision.comparison import Comparison, residuals
 from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
-from calib_ros.estimation.considered import Tilts, products_with_doubts
+from calib_ros.estimation.considered import products_with_doubts
 from calib_ros.estimation.leastsquares import System, minimise, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.noise import Noise
@@ -192,8 +192,8 @@ class _Found:
 class _Arm:
     """The earlier arm with considered effects, and the covariance (P, P) of its parameters.
 
-    `device` (P, P) is added for a moved or another device; that is no change of the arm. Nor are
-    `tilts` in other regions than before.
+    `device` (P, P) is added for a moved or another device; that is no change of the arm. Nor
+    are unmodelled waves in other regions than before.
     """
 
     previous: Calibration
@@ -201,7 +201,6 @@ class _Arm:
     names: tuple[Parameter, ...]
     square: FloatArray
     device: FloatArray
-    tilts: Tilts | None
 
     @classmethod
     def of(
@@ -221,19 +220,15 @@ class _Arm:
                     f'{each.base} and {each.tool}'
                 )
         chain, names, square = previous.chain, previous.names, previous.covariance
-        device, tilts = np.zeros_like(square), previous.tilts
-        if tilts is not None:
-            square = square - tilts.square
+        square, device = square - previous.unmodelled.among(names).square, np.zeros_like(square)
         if (region := previous.region) is not None:
             chain, names = region.chain, region.names
             square, device = region.square, region.device @ region.device.T
-            if tilts is not None:
-                tilts = tilts.among(names, previous.names)
         named = tuple(map(Parameter, names))
         grown = growth / changes.SIZES['m']  # a year
         sizes = [grown * changes.SIZES[n.unit] if n.of_dh else 0.0 for n in named]
         wandered = np.diag(np.square(sizes)) * max(years, 0.0)
-        return cls(previous, chain, named, square + wandered, device, tilts)
+        return cls(previous, chain, named, square + wandered, device)
 
     @property
     def doubted(self) -> FloatArray:
@@ -287,7 +282,7 @@ class _Arm:
                 by_device=True,
                 known=None,
                 most=system.count,
-                tilts=self.tilts,
+                unmodelled=self.previous.unmodelled,
             )
             products = plain - cross @ np.linalg.solve(doubtful, cross.T)
             matrix, gradient = products[:-1, :-1], products[:-1, -1]
@@ -357,10 +352,7 @@ def _updated(
     left = found.change - arm.applied(found.change, found.covariance)
     square = found.covariance + np.outer(left, left)
     names = tuple(arm.names[k] for k in own)
-    covariance, tilts = square[np.ix_(own, own)], arm.tilts
-    if tilts is not None:
-        tilts = tilts.among(names, arm.names)
-        covariance = covariance + tilts.square
+    unmodelled = previous.unmodelled.among(names)
     if region is not None:
         effects = [name for name, _ in region.chain.effects]
         region = replace(region, chain=chain.with_effects(effects), square=square)
@@ -377,8 +369,8 @@ def _updated(
         chain=chain,
         before=before,
         names=names,
-        covariance=covariance,
-        tilts=tilts,
+        covariance=square[np.ix_(own, own)] + unmodelled.square,
+        unmodelled=unmodelled,
         region=region,
         record=record,
         rows=Fingerprint.of(problem.all_sets, previous.rows),

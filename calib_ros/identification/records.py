@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib_ros.decision.region import damaged, parse_rows, unpacked
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.considered import Tilts
+from calib_ros.estimation.considered import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.start import fit_to_arm, movable
@@ -204,24 +204,28 @@ class Record:
 
     def covariance(
         self, chain: Chain
-    ) -> tuple[tuple[str, ...], FloatArray | None, float, Tilts | None]:
-        """Return the fitted parameters, their covariance (P, P), its freedom, and their tilts."""
-        known, tilts = self._part('covariance'), None
+    ) -> tuple[tuple[str, ...], FloatArray | None, float, Unmodelled]:
+        """Return fitted parameters, their covariance (P, P), its freedom, and what is lacking."""
+        known, lacking = self._part('covariance'), NOTHING
         if not known:
-            return (), None, math.inf, None
+            return (), None, math.inf, lacking
         try:
             names = tuple(known['names'])
             square = unpacked(known['root'], len(names))
             freedom = math.inf if known['freedom'] is None else float(known['freedom'])
             ours = set(names) <= set(chain.parameter_names) and len(set(names)) == len(names)
-            if 'tilts' in known:
-                tilts = Tilts(float(known['tilt']), parse_rows(known['tilts'], len(names)))
-                ours = ours and tilts.of(chain)
+            if 'unmodelled' in known:
+                more = known['unmodelled']
+                sizes = {key: float(more[key]) for key in lacking.sizes}
+                followed = parse_rows(more['followed'], len(names))
+                lacking = Unmodelled(names=names, followed=followed, **sizes)
+                fine = all(0.0 <= size < math.inf for size in sizes.values())
+                ours = ours and fine and followed.shape[1] == 8 * len(chain.joints)
             if not (ours and (np.diag(square) > 0.0).all() and freedom > 0.0):
                 raise ValueError('no covariance of this chain')
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as err:
             raise damaged('covariance', self.where, err) from err
-        return names, square, freedom, tilts
+        return names, square, freedom, lacking
 
     def noise(self) -> Noise | None:
         """Return the noise of the measurements, if recorded."""

@@ -62,7 +62,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'observability': asdict(result.observability),
         'predicted_sigma_mm': words.sigma_over_range(result),
         'sizes': dict(result.posterior.sizes),
-        'unmodelled': dict(zip(('turns', 'tilts'), result.posterior.unmodelled, strict=True)),
+        'unmodelled': result.posterior.unmodelled.sizes,
         'region': region and {'whole': region.whole, 'share': region.share, 'limit_mm': limit},
         'priors': result.priors,
         'effects': dict(result.chain.effects),

@@ -118,7 +118,7 @@ def drawn(rng, count=20, width=4):
     parts = [rng.normal(size=(width + 1, 3, count)) for _ in range(2)]
     parts[1][:, :, ::3] = 0.0
     place = rng.normal(size=(count, 2))
-    return shared_errors.Stops(parts, np.ones(count), place, np.arange(count, dtype=float))
+    return shared_errors.Stops(parts, np.ones(count), place, np.arange(count, dtype=float), place)
 
 
 def test_the_moments_of_the_forms_leave_out_what_was_not_measured():
@@ -165,7 +165,7 @@ def test_where_no_more_was_measured_than_fitted_nothing_is_shared():
     for _ in range(20):
         place, time = rng.normal(size=(count, 2)), np.arange(count, dtype=float)
         parts = [rng.normal(size=(2 * count, 2, count)), np.zeros((2 * count, 3, count))]
-        units = shared_errors.Stops(parts, np.ones(count), place, time)
+        units = shared_errors.Stops(parts, np.ones(count), place, time, place)
         forms = shared_errors._Forms(units, np.zeros((0, 2 * count - 1)))
         assert forms.test(0, units.links('near')) == (0.0, 0.0)
         sizes = forms.sizes({0: kernels})[0]
@@ -180,7 +180,7 @@ def test_neighbours_are_the_next_stop_and_the_three_nearest():
     number = np.repeat([0.0, 1.0], [11, 3])
     place = np.column_stack([rng.normal(size=(count, 2)), far * number])
     time = np.array([0, 1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 3, 4, 6]) + far * number
-    units = shared_errors.Stops([], np.arange(1.0, 15.0), place, time)
+    units = shared_errors.Stops([], np.arange(1.0, 15.0), place, time, place)
     assert len(units) == count
     apart = cdist(place, place)
     nearest = np.argsort(apart, axis=1)[:, 1:4]

@@ -118,7 +118,7 @@ def test_the_size_that_planes_do_not_tell_is_as_uncertain_as_lengths_are(seed):
     q = true.random_joints(200, np.random.default_rng(0))
     before, after = (_apart(chain, true, q) for chain in (UR, result.chain))
     assert after < 0.6 * before
-    assert after < 2.0 * np.median(result.region.sigma(q))
+    assert after < 2.0 * np.median(result.region.known(q))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from fits import NOISE, SIGMAS, UR10E
 from calib_ros import Calibration, Problem, difference, identify, load_chain, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.considered import tilted, tilting
+from calib_ros.estimation.considered import NOTHING, moved, moving, waved
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.jacobian import ErrorModel
@@ -34,8 +34,8 @@ class Wobbling:
         pairs = zip(('alpha', 'beta'), waves[:, 1:], strict=True)
         return {f'{names[k]}.{kind}': x for kind, own in pairs for k, x in enumerate(own)}
 
-    def measured(self, middle, count):
-        q = middle + self.rng.uniform(-WIDTH, WIDTH, (count, 6))
+    def measured(self, middle, count, width=WIDTH):
+        q = middle + self.rng.uniform(-width, width, (count, 6))
         poses = np.array([self.true.with_offsets(self.tilts(x)).forward(x[None])[0] for x in q])
         seen = measure(self.true, q, self.rng)
         noise = self.rng.normal(size=(2, count, 3)) * np.reshape(NOISE, (2, 1, 1))
@@ -58,7 +58,7 @@ def test_two_regions_of_an_arm_that_lacks_nothing_else_are_the_same(seed):
     found = difference(first, second)
     assert found.same, found.in_words()
     certain = [
-        replace(each, tilts=None, covariance=each.covariance - each.tilts.square)
+        replace(each, unmodelled=NOTHING, covariance=each.covariance - each.unmodelled.square)
         for each in (first, second)
     ]
     before = difference(*certain)  # as earlier versions did
@@ -87,17 +87,18 @@ def test_a_few_poses_in_another_region_show_no_change(seed):
     found = recalibrate(previous, arm.measured(arm.middle(), 8), 0.0)
     assert not found.changed
     again = found.calibration
-    left = again.covariance - again.tilts.square
+    left = again.covariance - again.unmodelled.square
     assert np.linalg.eigvalsh(left).min() > 0.0
-    assert again.tilts.size == previous.tilts.size
+    assert again.unmodelled.waves == previous.unmodelled.waves
 
 
 def test_expected_errors_contain_it_away_from_the_region():
     """There the parameters that absorbed it are wrong; at the measured poses they are right."""
-    for seed in (1, 2, 3, 5):
+    for seed in (1, 2, 3, 4, 5):
         arm = Wobbling(seed)
         middle = arm.middle()
-        found = arm.calibrated(middle)
+        result = identify(arm.measured(middle, 60))
+        found = Calibration.of(result)
         for q, least, most in (
             (middle + arm.rng.uniform(-WIDTH, WIDTH, (200, 6)), 0.4, 1.3),
             (UR10E.random_joints(1200, arm.rng), 0.3, 1.3),  # more than a block
@@ -106,7 +107,9 @@ def test_expected_errors_contain_it_away_from_the_region():
             error = (found.chain.forward(q) - np.array(true))[:, :3, 3]
             ratio = np.sqrt(np.mean((error**2).sum(axis=1)) / np.mean(found.sigma(q) ** 2))
             assert least < ratio < most
-        certain = replace(found, tilts=None)
+            stated = np.trace(result.pose_covariance(q)[:, :3, :3], axis1=1, axis2=2)
+            np.testing.assert_allclose(found.sigma(q) ** 2, stated)
+        certain = replace(found, unmodelled=NOTHING)
         assert np.mean(certain.sigma(q) ** 2) < 0.5 * np.mean(found.sigma(q) ** 2)
 
 
@@ -114,11 +117,25 @@ def test_a_loaded_calibration_knows_what_is_lacking():
     arm = Wobbling(1)
     first, second = arm.calibrated(arm.middle()), arm.calibrated(arm.middle())
     read = [parse_calibration(each.dump(), 'here.yaml', UR10E) for each in (first, second)]
-    np.testing.assert_allclose(read[0].tilts.followed, first.tilts.followed, rtol=1e-8)
+    np.testing.assert_allclose(read[0].unmodelled.followed, first.unmodelled.followed, rtol=1e-8)
     assert difference(*read).limit == pytest.approx(difference(first, second).limit, rel=1e-3)
-    wrong = replace(first, tilts=first.tilts._replace(followed=first.tilts.followed[:, 1:]))
-    with pytest.raises(ConfigError, match='covariance is damaged'):
-        parse_calibration(wrong.dump(), 'here.yaml', UR10E)
+    assert read[0].unmodelled.sizes == first.unmodelled.sizes
+    for change in ({'followed': first.unmodelled.followed[:, 1:]}, {'tilts': -1.0}):
+        wrong = replace(first, unmodelled=first.unmodelled._replace(**change))
+        with pytest.raises(ConfigError, match='covariance is damaged'):
+            parse_calibration(wrong.dump(), 'here.yaml', UR10E)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_waves_explain_is_not_random_too(seed):
+    """Over the whole range they show; of an arm without, the data rule out the typical size."""
+    arm = Wobbling(seed)
+    wobbling = identify(arm.measured(np.zeros(6), 150, 3.1)).posterior.unmodelled
+    assert 5e-5 < wobbling.waves < 1.5e-4
+    assert wobbling.turns == wobbling.tilts == 0.0
+    arm.sizes *= 0.0
+    still = identify(arm.measured(np.zeros(6), 150, 3.1)).posterior.unmodelled
+    assert not any(still.sizes.values())
 
 
 @pytest.mark.parametrize('name', ['ur10e', 'franka_panda'])
@@ -128,9 +145,9 @@ def test_columns_are_those_of_axes_that_tilt(name):
     rng = np.random.default_rng(0)
     chain = faulty(chain, Cell(), rng)
     q = chain.random_joints(5, rng)
-    names = list(dict.fromkeys([*chain.parameter_names, *tilting(chain)]))
+    names = list(dict.fromkeys([*chain.parameter_names, *moving(chain)]))
     rows = np.moveaxis(ErrorModel(chain, names).jacobian(q), 2, 0).transpose(0, 2, 1)
-    found = tilted(chain, names, q, rows).reshape(len(chain.joints), 2, 4, 6, len(q))
+    found = waved(moved(chain, names, rows)[1], q).reshape(len(chain.joints), 2, 4, 6, len(q))
     waves = [np.cos(q.T), np.cos(2.0 * q.T), np.sin(q.T), np.sin(2.0 * q.T)]
     axes = [ErrorModel(chain, [joint.driven]).jacobian(q)[:, 3:, 0] for joint in chain.joints]
     for joint, (own, axis) in enumerate(zip(found, axes, strict=True)):
