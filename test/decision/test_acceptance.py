@@ -102,8 +102,8 @@ def test_few_poses_and_manufacturing_tolerances_are_judged_by_leaving_out_one(
     assert np.max(np.divide(errors, nominal_errors)) < share
     # the estimate by fits to one pose less is cautious, the predicted sigma is right
     assert 1.0 < np.median(np.divide(estimates, errors)) < 2.5
-    # of effects that so few poses cannot refute it takes account
-    assert 0.4 < np.median(np.divide(errors, sigmas)) < 1.35
+    # of effects and wobble that so few poses cannot refute it takes account
+    assert 0.35 < np.median(np.divide(errors, sigmas)) < 1.35
 
 
 def test_few_poses_and_priors_of_an_arm_without_errors_gain_nothing():
