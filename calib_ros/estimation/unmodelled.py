@@ -91,33 +91,20 @@ def _sizes(
     by part, and rows of `random` turns and tilts. Waves have at least the typical size, unless the
     data rule that out.
     """
-    count, typical = len(posterior.names), TYPICAL['drive']
     given = np.array([posterior.priors.get(name, np.inf) for name in posterior.names]) ** -2.0
     counts = np.bincount(part_of, rows.any(axis=0).sum(axis=1))
-    none = np.zeros(len(rows) - 1 - count)
+    none = np.zeros(len(rows) - 1 - len(given))
     offsets, precision = np.append(posterior.offsets, none), given
-    own, waves = np.s_[:count], np.s_[count:]
-    tried = typical * np.geomspace(LEAST_SIZE, 1.0 / LEAST_SIZE, 201)  # the typical one amidst
     for _ in range(SEVERAL):
         variances = _variances(products, offsets, precision, counts)
         if not variances.all():
-            return 0.0, 0.0, typical
+            return 0.0, 0.0, TYPICAL['drive']
         total = np.tensordot(1.0 / variances, products, 1)
         matrix, vector = total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
-        mean, root = solved(matrix[own, own], vector[own], given)
-        along = matrix[waves, own] @ root
-        known, axes = np.linalg.eigh(matrix[waves, waves] - along @ along.T)
-        seen = np.outer(tried**2, np.maximum(known, 0.0))
-        pulled = (vector[waves] - matrix[waves, own] @ mean) @ axes
-        squares = np.outer(tried**2, pulled**2) / (1.0 + seen)
-        odds = 0.5 * (squares - np.log1p(seen)).sum(axis=1)  # against none
-        best = np.argmax(odds - 0.5 * (np.log(tried / typical) / np.log(SPREAD)) ** 2)
-        shown = odds[best] > SHOWN
-        least = typical * (odds[best] - odds[len(tried) // 2] < 2.0 * REFUTED)  # less is unusual
-        wave = float(max(least, shown * tried[best]))
-        if not shown:
+        waves, found = _size_of_waves(matrix, vector, given)
+        if found is None:
             break
-        precision = np.append(given, none + tried[best] ** -2.0)
+        precision = np.append(given, none + found**-2.0)
     own = np.s_[: len(precision)]
     mean, root = solved(matrix[own, own], vector[own], precision)
     scale = np.sqrt(variances)[part_of, np.newaxis]
@@ -128,7 +115,29 @@ def _sizes(
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
     turn, tilt = _random(np.array(kernels), fitted @ root, residual).tolist()
-    return turn, tilt, wave
+    return turn, tilt, waves
+
+
+def _size_of_waves(
+    matrix: FloatArray, vector: FloatArray, given: FloatArray
+) -> tuple[float, float | None]:
+    """Return the size of waves that counts, and the most probable one if waves show.
+
+    From normal matrix and vector of P parameters, with prior precisions `given` (P,), and waves.
+    """
+    own, waves, typical = np.s_[: len(given)], np.s_[len(given) :], TYPICAL['drive']
+    mean, root = solved(matrix[own, own], vector[own], given)
+    along = matrix[waves, own] @ root
+    known, axes = np.linalg.eigh(matrix[waves, waves] - along @ along.T)
+    pulled = (vector[waves] - matrix[waves, own] @ mean) @ axes
+    tried = typical * np.geomspace(LEAST_SIZE, 1.0 / LEAST_SIZE, 201)  # the typical one amidst
+    seen = np.outer(tried**2, np.maximum(known, 0.0))
+    squares = np.outer(tried**2, pulled**2) / (1.0 + seen)
+    odds = 0.5 * (squares - np.log1p(seen)).sum(axis=1)  # against none
+    best = np.argmax(odds - 0.5 * (np.log(tried / typical) / np.log(SPREAD)) ** 2)
+    found = float(tried[best]) if odds[best] > SHOWN else None
+    refuted = odds[best] - odds[len(tried) // 2] >= 2.0 * REFUTED  # less is unusual
+    return max(0.0 if refuted else typical, found or 0.0), found
 
 
 def _variances(
