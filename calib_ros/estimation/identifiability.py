@@ -216,11 +216,8 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     inverse *= scale[:, np.newaxis]
     if middle is None:
         return np.asarray(inverse @ inverse.T)
-    scaled = inverse.T @ middle @ inverse
-    if not np.isfinite(scaled).all():
-        raise np.linalg.LinAlgError('no finite covariance')
-    root, order, rank, _ = lapack.dpstrf(scaled, lower=1, overwrite_a=1)
-    root = inverse[:, order - 1] @ np.tril(root)[:, :rank]  # no rounding below zero
+    sizes, directions = np.linalg.eigh(inverse.T @ middle @ inverse)
+    root = inverse @ (directions * np.sqrt(np.maximum(sizes, 0.0)))  # no rounding below zero
     return np.asarray(root @ root.T)
 
 

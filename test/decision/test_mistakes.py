@@ -345,31 +345,6 @@ def test_good_results_are_not_searched(monkeypatch):
     assert identify(Problem(UR, seen_of())).accepted
 
 
-@pytest.mark.parametrize(
-    ('row', 'lost', 'where'), [(9, 'positions', 'below'), (31, 'joints', 'above')]
-)
-@pytest.mark.parametrize('oriented', [True, False])
-def test_a_row_lost_in_one_of_two_tables_is_named(row, lost, where, oriented):
-    """Joint values and measurements were put side by side, row by row."""
-    seen = seen_of(oriented=oriented)
-    without = np.delete(np.arange(len(seen)), row)
-    measured = seen.select(without if lost == 'positions' else slice(-1))
-    kept = seen.joints[:-1] if lost == 'positions' else seen.joints[without]
-    result = identify(Problem(UR, replace(measured, joints=kept)))
-    assert not result.accepted
-    assert result.refusals[0].startswith(
-        f'from pose {row + 1} on the joint values stand 1 row {where} their measurement'
-    )
-
-
-@pytest.mark.parametrize('count', [20, 40])
-def test_shuffled_rows_have_not_lost_one(count):
-    rng = np.random.default_rng(count)
-    seen = seen_of(count=count)
-    found = explained(Problem(UR, replace(seen, joints=seen.joints[rng.permutation(count)])))
-    assert found is None
-
-
 @pytest.mark.parametrize('oriented', [True, False])
 @pytest.mark.parametrize('joint', [0, 2, 5])
 def test_one_joint_in_another_unit_than_the_others_is_named(joint, oriented):

@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that one of two tables lacks: joint values and measurements stand side by side no more."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, UR10E, arm
+
+from calib_ros import Problem, identify
+from calib_ros.apply.simulation import measure
+from calib_ros.decision.mistakes import explained
+
+
+def seen_of(count, oriented):
+    rng = np.random.default_rng(1)
+    return measure(arm(rng), UR10E.random_joints(count, rng), rng, *NOISE, oriented)
+
+
+@pytest.mark.parametrize(
+    ('row', 'lost', 'where'), [(9, 'positions', 'below'), (31, 'joints', 'above')]
+)
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_row_lost_in_one_of_two_tables_is_named(row, lost, where, oriented):
+    """Joint values and measurements were put side by side, row by row."""
+    seen = seen_of(40, oriented)
+    without = np.delete(np.arange(len(seen)), row)
+    measured = seen.select(without if lost == 'positions' else slice(-1))
+    kept = seen.joints[:-1] if lost == 'positions' else seen.joints[without]
+    result = identify(Problem(UR10E, replace(measured, joints=kept)))
+    assert not result.accepted
+    assert result.refusals[0].startswith(
+        f'from pose {row + 1} on the joint values stand 1 row {where} their measurement'
+    )
+
+
+@pytest.mark.parametrize('count', [20, 40])
+def test_shuffled_rows_have_not_lost_one(count):
+    rng = np.random.default_rng(count)
+    seen = seen_of(count, True)
+    found = explained(Problem(UR10E, replace(seen, joints=seen.joints[rng.permutation(count)])))
+    assert found is None
