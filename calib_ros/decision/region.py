@@ -23,8 +23,8 @@ from scipy import special
 
 from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.considered import NOTHING
 from calib_ros.estimation.evidence import Mixed, Posterior
+from calib_ros.estimation.joint_errors import NOTHING
 from calib_ros.estimation.levels import KNOWN, UNUSUAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.kinematics.chain import Chain

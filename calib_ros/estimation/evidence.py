@@ -26,7 +26,8 @@ from typing import TypeAlias
 import numpy as np
 from scipy import linalg
 
-from calib_ros.estimation.considered import NOTHING, Unmodelled, lengths_of, products_with_doubts
+from calib_ros.estimation.considered import lengths_of, products_with_doubts
+from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.leastsquares import Normal, System
 from calib_ros.estimation.levels import OUT_OF_SCALE, SCALE
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved

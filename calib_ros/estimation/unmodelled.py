@@ -6,7 +6,7 @@ Play, gear harmonics, wobbling bearings and a rocking base act at the joints, so
 with the distance of the target from these; the noise of a device does not. That tells them apart
 even if the sigmas of the device are unknown.
 
-Axes that wobble, as in their bearings, tilt by waves (`considered.waved`) of the joint's value.
+Axes that wobble, as in their bearings, tilt by waves (`joint_errors.waved`) of the joint's value.
 Their size s is the most probable one, with the parameters integrated out: with the products W of
 their columns and p of these with the residuals, both beside the parameters, the log evidence is
 
@@ -37,9 +37,9 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.considered import Unmodelled, moved, moving, waved
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.identifiability import covariance
+from calib_ros.estimation.joint_errors import Unmodelled, moved, moving, waved
 from calib_ros.estimation.leastsquares import System, gram
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES

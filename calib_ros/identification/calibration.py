@@ -31,7 +31,7 @@ import calib_ros
 from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
 from calib_ros.errors import ConfigError, UnknownNameError
-from calib_ros.estimation.considered import NOTHING, Unmodelled
+from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations

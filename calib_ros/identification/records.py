@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib_ros.decision.region import damaged, parse_rows, unpacked
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.considered import NOTHING, Unmodelled
+from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.start import fit_to_arm, movable

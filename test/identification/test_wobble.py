@@ -11,7 +11,7 @@ from fits import NOISE, SIGMAS, UR10E
 from calib_ros import Calibration, Problem, difference, identify, load_chain, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.errors import ConfigError
-from calib_ros.estimation.considered import NOTHING, moved, moving, waved
+from calib_ros.estimation.joint_errors import NOTHING, moved, moving, waved
 from calib_ros.identification.calibration import parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.jacobian import ErrorModel

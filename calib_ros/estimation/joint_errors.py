@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What turns and tilts of the joints, beyond all parameters, do to poses (docs/model.md).
+
+`unmodelled.py` finds their sizes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from calib_ros.estimation.samples import BLOCK
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray
+
+
+class Unmodelled(NamedTuple):
+    """Errors of joints [rad] that no parameter explains.
+
+    At random each joint turns about its axis (slides along it [m], if prismatic), and the axis
+    tilts. The axis also wobbles by waves, which the parameters `names` (P,) follow by `followed`
+    (P, T) a unit.
+    """
+
+    turns: float = 0.0
+    tilts: float = 0.0
+    waves: float = 0.0
+    names: tuple[str, ...] = ()
+    followed: FloatArray = np.zeros((0, 1))
+
+    @property
+    def sizes(self) -> dict[str, float]:
+        """Return the sizes by name; without them nothing is lacking."""
+        return {'turns': self.turns, 'tilts': self.tilts, 'waves': self.waves}
+
+    @property
+    def square(self) -> FloatArray:
+        """Return the covariance (P, P) of the parameters by waves."""
+        return np.asarray(self.waves**2 * self.followed @ self.followed.T)
+
+    def among(self, names: Sequence[str]) -> Unmodelled:
+        """Return the same of other parameters, of which only its own follow."""
+        rows = dict(zip(self.names, self.followed, strict=True))
+        none = np.zeros(self.followed.shape[1])
+        followed = np.array([rows.get(name, none) for name in names])
+        return self._replace(names=tuple(names), followed=followed.reshape(-1, len(none)))
+
+    def columns(
+        self, chain: Chain, names: Sequence[str], joints: FloatArray, rows: FloatArray
+    ) -> FloatArray:
+        """Return the columns (K, c, N) at joint values (N, n), waves last; rows as in `moved`."""
+        turns, tilts = moved(chain, names, rows)
+        own = rows[[names.index(name) for name in self.names]]
+        left = waved(tilts, joints) - np.tensordot(self.followed, own, (0, 0))
+        return np.concatenate([self.turns * turns, self.tilts * tilts, self.waves * left])
+
+    def expected(
+        self,
+        chain: Chain,
+        names: Sequence[str],
+        square: FloatArray,
+        ends: tuple[str, str],
+        joints: FloatArray,
+    ) -> FloatArray:
+        """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
+
+        Between the `ends`, in world axes, with expected squares (P, P) of the parameters `names`.
+        """
+        some, joints = any(self.sizes.values()), chain.joint_values(joints)
+        every = tuple(dict.fromkeys((*names, *(moving(chain) if some else ()))))
+        model, squares = ErrorModel(chain, every, *ends), np.empty((len(joints), 6, 6))
+        for first in range(0, len(joints), BLOCK):
+            block = np.s_[first : first + BLOCK]
+            jacobian = model.jacobian(joints[block])
+            own = jacobian[..., : len(names)]
+            squares[block] = own @ square @ np.swapaxes(own, 1, 2)
+            if some:
+                rows = jacobian.transpose(2, 1, 0)
+                off = self.columns(chain, every, joints[block], rows)
+                squares[block] += off.T @ off.transpose(2, 0, 1)
+        return squares
+
+
+NOTHING = Unmodelled()
+
+
+def moving(chain: Chain) -> list[Parameter]:
+    """Return the parameters that turn joints about their axes, and those that tilt the axes.
+
+    The latter are those of rows, and turns of bases.
+    """
+    bases = [frame for frame in chain.frame_names if frame.startswith('base')]
+    turns = [name for frame in bases for name in parameters_of(frame)[3:]]
+    tilts = (Parameter(name, kind) for name in chain.joint_names for kind in ('alpha', 'beta'))
+    return [*turns, *tilts, *(joint.driven for joint in chain.joints)]
+
+
+def moved(chain: Chain, names: Sequence[str], rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the columns of turns (n, c, N) about the axes, and of two tilts (2 n, c, N) of each.
+
+    `rows` (P, c, N) are those of the names, with all that are `moving`. In the standard convention
+    the row before a joint tilts its axis, or the base does.
+    """
+    own = dict(zip(names, rows, strict=False))
+    tilts = [own[f'{name}.{kind}'] for name in chain.joint_names for kind in ('alpha', 'beta')]
+    if chain.convention == 'standard':
+        bases = [frame for frame in chain.frame_names if frame.startswith('base')]
+        turns = [[own[name] for name in parameters_of(frame)[3:]] for frame in bases]
+        axes = [chain.frame(frame).matrix[:3, :2] for frame in bases]
+        tilts = [*np.tensordot(axes, turns, ((0, 1), (0, 1))), *tilts[:-2]]
+    return np.array([own[joint.driven] for joint in chain.joints]), np.array(tilts)
+
+
+def waved(tilts: FloatArray, joints: FloatArray) -> FloatArray:
+    """Return the columns (8 n, c, N) of wobbling axes at joint values (N, n).
+
+    Each tilt (2 n, c, N) follows sine and cosine of the first and second harmonic of its joint.
+    """
+    angles = np.multiply.outer(joints.T, (1.0, 2.0))  # (n, N, 2)
+    waves = np.concatenate([np.cos(angles), np.sin(angles)], axis=2).repeat(2, axis=0)
+    found = tilts[:, np.newaxis] * waves.transpose(0, 2, 1)[:, :, np.newaxis]
+    return np.asarray(found.reshape(-1, *tilts.shape[1:]))
