@@ -14,7 +14,7 @@ ones, so that the noise is found from the residuals.
 `incomplete`: arms with an effect that the model lacks, 60 full poses, default sigmas; the coverage
 of parameters and of positions, and the median ratio of actual to stated RMS error of positions
 over the joint range. `claimed`: share of these arms of which `compare` claims a change after a
-second session at other poses.
+second session at other poses; `apart`: after two sessions within 0.6 rad of two postures.
 """
 
 import argparse
@@ -106,16 +106,18 @@ def lacking(kind, true, rng):
 
 
 def incomplete(nominal, kind, seed, poses=60):
-    """Return hits of parameters (P,) and positions (M,), whether a change is claimed, and errors.
+    """Return hits of parameters (P,) and positions (M,), whether changes are claimed, and errors.
 
-    These are RMS errors of positions [m], actual and stated.
+    Changes at other poses, and in two regions; RMS errors of positions [m], actual and stated.
     """
     rng = np.random.default_rng([seed, LACKING.index(kind)])
     true = faulty(nominal, Cell(), rng)
     moved = lacking(kind, true, rng)
 
-    def session():
+    def session(middle=None):
         q = nominal.random_joints(poses + 1, rng)
+        if middle is not None:
+            q = middle + rng.uniform(-0.6, 0.6, q.shape)
         seen = measure(true, q[1:], rng, SIGMA_POSITION, SIGMA_ORIENTATION)
         more = moved(q[1:], np.sign(np.diff(q, axis=0)))
         turned = se3.exp_rotation(more[:, 3:]) @ seen.rotations
@@ -130,7 +132,9 @@ def incomplete(nominal, kind, seed, poses=60):
     stated = np.trace(result.pose_covariance(unseen)[:, :3, :3], axis1=1, axis2=2).mean()
     actual = np.mean((error**2).sum(axis=1))
     hits = off(result, true)[1], within(result, unseen, error)
-    return *hits, claimed, np.sqrt(actual), np.sqrt(stated)
+    regions = [session(rng.uniform(-2.0, 2.0, len(true.joints))) for _ in range(2)]
+    apart = not difference(*map(Calibration.of, regions)).same
+    return *hits, claimed, apart, np.sqrt(actual), np.sqrt(stated)
 
 
 def within(result, q, error):
@@ -171,11 +175,12 @@ def main():
     found['incomplete'] = {}
     for kind in LACKING:
         rows = [incomplete(nominal, kind, seed) for seed in range(runs // 10)]
-        hits, places, claimed, actual, stated = map(np.array, zip(*rows, strict=True))
+        hits, places, claimed, apart, actual, stated = map(np.array, zip(*rows, strict=True))
         found['incomplete'][kind] = {
             'parameters': float(hits.mean()),
             'positions': float(places.mean()),
             'claimed': float(claimed.mean()),
+            'apart': float(apart.mean()),
             'ratio': float(np.median(actual / stated)),
         }
     if options.json:
