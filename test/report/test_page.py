@@ -47,6 +47,7 @@ def test_the_figures_are_those_of_the_result(solved):
     for name, partners in result.gauges.items():
         assert f'{name} {", ".join(partners)}' in page.text
     assert table_hash(result.chain) in page.text
+    assert ('None is above 0.9.' in page.text) == (not result.correlated())
     assert page.text.index('Accepted') < page.text.index('Accuracy before and after')
 
 
@@ -112,6 +113,8 @@ def test_the_page_says_whether_it_is_good_enough(solved):
     after = told['validation']['after']
     assert (after['rms_lower_mm'], after['rms_upper_mm']) == (lower, upper)
     assert 'rms_lower_mm' not in told['fitted']['after']
+    for k, row in enumerate(told['covariance']['lower']):
+        assert row == pytest.approx(result.covariance[k, : k + 1])
 
 
 def test_what_others_named_is_text(solved):
@@ -148,16 +151,21 @@ def test_a_page_loads_nothing(solved):
     assert len(text.encode()) < 8e6
 
 
-def test_every_figure_is_one_that_plotly_knows(solved):
+def test_every_figure_is_one_that_plotly_knows_and_is_drawn_on_paper(solved):
     arm = Calibration.of(solved[1])
     found = survey(arm, 500, np.random.default_rng(0))
-    reports = [report_of(*solved), workspace_report(arm, found, Origin())]
-    count = 0
-    for report in reports:
-        for figure in page_of(report).data['figures'].values():
-            graph_objects.Figure(figure)
-            count += 1
-    assert count >= 8
+    report = workspace_report(arm, found, Origin())
+    pages = [page_of(report_of(*solved)), page_of(report)]
+    figures = [figure for page in pages for figure in page.data['figures'].values()]
+    assert len(figures) >= 8
+    for figure in figures:
+        graph_objects.Figure(figure)
+    for each in report.sections:
+        assert (drawing(each.figure, each.height) is not None) == (each.figure is not None)
+    assert drawing({'data': [{'type': 'scatter3d'}], 'layout': {}}, 100) is None
+    for label, errors in found.parts.items():
+        sizes = (f'{1e3 * size:.3f}' for size in (np.sqrt(np.mean(errors**2)), errors.mean()))
+        assert ' '.join((label, *sizes)) in pages[1].text
 
 
 def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
@@ -171,19 +179,23 @@ def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
     assert '<span>c</span> <span>&lt;d&gt;</span>' in render(refused)
 
 
-@pytest.mark.parametrize(('share', 'count', 'state'), [(0.0, 60, 'info'), (0.5, 8, 'bad')])
-def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
-    """Few poses that do not show a gain do not show a good arm either."""
+@pytest.mark.parametrize(
+    ('share', 'count', 'sigma', 'state'),
+    [(0.0, 60, 3e-4, 'info'), (0.5, 8, 3e-4, 'bad'), (0.0, 60, 3e-5, 'bad')],
+)
+def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, sigma, state):
+    """Few poses that do not show a gain do not show a good arm either, nor does bad noise."""
     rng = np.random.default_rng(1)
     true = simulation.faulty(UR, simulation.Cell(), rng)
     names = [name for joint in UR.joints for name in joint.parameters]
     arm = UR.with_offsets({name: share * true.offset(name, UR) for name in names})
     rows = simulation.measure(arm, UR.random_joints(count, rng), rng, 3e-4, 6e-4)
-    problem = Problem(UR, rows, sigma_position=3e-4, sigma_orientation=6e-4)
+    problem = Problem(UR, rows, sigma_position=sigma, sigma_orientation=2.0 * sigma)
     result = identify(problem)
     assert {each.rule for each in result.refusals} == {Rule.GAIN}
     report = report_of(problem, result)
     assert report.verdict.state == state
+    assert 'Not accepted' in report.verdict.heading
     assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == (state == 'info')
 
 
@@ -199,6 +211,8 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
     report = report_of(problem, near)
     assert report.verdict.heading == 'Accepted near the measured poses'
     assert report.steps[-1].startswith('To use it beyond the measured poses')
+    region = {'whole': False, 'share': 0.1, 'limit_mm': 1.0}
+    assert as_document(near, {})['region'] == region
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
     verdict = report_of(problem, doubtful).verdict
     assert 'ur3' in verdict.text[1]
@@ -212,14 +226,6 @@ def test_no_pose_is_called_judged_where_none_was_left_out():
     poses = poses_of(problem, result)
     assert set(poses.role) == {'fitted'}
     assert poses.judged.any()
-
-
-def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
-    arm = Calibration.of(solved[1])
-    report = workspace_report(arm, survey(arm, 500, np.random.default_rng(0)), Origin())
-    for each in report.sections:
-        assert (drawing(each.figure, each.height) is not None) == (each.figure is not None)
-    assert drawing({'data': [{'type': 'scatter3d'}], 'layout': {}}, 100) is None
 
 
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
