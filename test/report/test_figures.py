@@ -121,7 +121,8 @@ def test_joints_without_limits_are_not_given_any(rng):
     free = replace(UR10E.joints[0], lower=None, upper=None)
     chain = replace(UR10E, joints=(free, *UR10E.joints[1:]))
     joints = chain.random_joints(50, rng)
-    _, rows = coverage(chain, joints)
+    figure, rows = coverage(chain, joints)
+    assert figure['data'][0]['x'] == pytest.approx(100.0 * np.arange(1, 72, 2) / 72, rel=1e-3)
     assert [row[1] for row in rows[:2]] == ['-180 to 180 ° (no limits)', '-360 to 360 °']
     joints[:, 0] += 2.0  # a turn from where it was measured, not what is between both ranges
     low = np.degrees(joints[:, 0].min())
@@ -153,5 +154,6 @@ def test_offsets_have_their_intervals_and_a_limit_that_is_near(solved, limit, ne
     assert dots['error_x']['array'] == pytest.approx(widths, rel=1e-3, abs=1e-4)
     shown = [each['x0'] for each in figure['layout']['shapes']]
     assert shown == [0.0, *([-1e3 * limit, 1e3 * limit] if near else [])]
+    assert figure['layout']['xaxis']['title']['text'] == 'offset [mm]'
     reach = figure['layout']['xaxis']['range'][1]
     assert max(map(abs, shown)) < reach < 10.0

@@ -22,11 +22,12 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import workspace_report
 from calib_ros.report.documents import as_document
-from calib_ros.report.explorer import SINGLE, WORST, explorer
+from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
 from calib_ros.report.page import Input, Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
+from calib_ros.report.sections import identity_of
 from calib_ros.report.verdicts import verification_report
 from calib_ros.report.words import limits_mm, summary
 
@@ -113,8 +114,6 @@ def test_the_page_says_whether_it_is_good_enough(solved):
     after = told['validation']['after']
     assert (after['rms_lower_mm'], after['rms_upper_mm']) == (lower, upper)
     assert 'rms_lower_mm' not in told['fitted']['after']
-    for k, row in enumerate(told['covariance']['lower']):
-        assert row == pytest.approx(result.covariance[k, : k + 1])
 
 
 def test_what_others_named_is_text(solved):
@@ -174,7 +173,10 @@ def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
         (Input('cell/a.mcap', 1, 'a'), Input('cell/metadata.yaml', 1, 'b')), command='c <d>'
     )
     report = replace(report_of(problem, result), origin=origin)
-    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('identify again',))
+    told = advice.advice([Reason(Rule.GAIN, 'h')])
+    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('again',), advice=told)
+    lines = markdown(refused, {}).splitlines()
+    assert lines.index('again') > max(lines.index(f'- {step}') for step in told[0].steps)
     assert report.of == 'cell'
     assert '<span>c</span> <span>&lt;d&gt;</span>' in render(refused)
 
@@ -239,11 +241,20 @@ def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     assert np.sqrt(squares.sum() / good.sum()) == pytest.approx(
         rms_of(poses.after[good]), rel=1e-3
     )
-    low, middle, high = shown['bins']['joint2']['length']['after']
-    known = [k for k, value in enumerate(middle) if value is not None]
-    assert known
-    assert all(low[k] <= middle[k] <= high[k] for k in known)
     assert shown['total'] == len(poses)
+    errors = 1e3 * np.linalg.norm(poses.after, axis=1)
+    largest = np.quantile(errors[poses.judged], 0.98)
+    assert shown['largest']['after'] == pytest.approx(largest)
+    few = poses.select(np.flatnonzero(good)[:: 1 + good.sum() // 30])
+    values, errors = np.degrees(few.joints[:, 2]), 1e3 * np.linalg.norm(few.after, axis=1)
+    bins = shown['bins']['joint2']['length']
+    edges = np.linspace(values.min(), values.max(), BANDS + 1)
+    assert bins['x'] == pytest.approx(0.5 * (edges[1:] + edges[:-1]), abs=1e-2)
+    inside = np.digitize(values, edges[1:-1])
+    for k, row in enumerate(zip(*bins['after'], strict=True)):
+        own = np.sort(errors[inside == k])
+        ranks = np.round((len(own) - 1) * np.array([0.05, 0.5, 0.95])).astype(int)
+        assert row == pytest.approx(own[ranks], rel=1e-3) if len(own) else not any(row)
 
 
 def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
@@ -339,6 +350,9 @@ def test_poses_and_measurements_are_two_counts(solved):
     assert [each for each in lines if each.startswith('- Poses')] == [f'- Poses: {TRAIN + TEST}']
     assert f'- poses fitted: {TRAIN}' in lines
     assert f'- measurements: {3 * TRAIN}' in lines
+    poses = replace(poses_of(*solved), stamps_ns=10**18 * np.array([1, 8]))
+    said = dict(identity_of(UR, Origin(), poses))['Measured, by the stamps']
+    assert said.startswith('2001-09-09 01:46 to 2223-07-06 14:13 UTC (in the future')
     assert not any('foreign' in each or 'not used' in each for each in lines[-20:])
 
 
