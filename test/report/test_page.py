@@ -52,25 +52,21 @@ def test_the_figures_are_those_of_the_result(solved):
     assert page.text.index('Accepted') < page.text.index('Accuracy before and after')
 
 
-def test_poses_are_those_judged_and_their_errors_make_the_figures(solved):
+@pytest.mark.parametrize('folded', [False, True])
+def test_poses_are_those_judged_and_their_errors_make_the_figures(solved, folded):
     problem, result = solved
+    if folded:
+        problem = replace(problem, held_out=None)
+        result = identify(problem)
     poses = poses_of(problem, result)
-    assert len(poses) == TRAIN + TEST
-    assert (poses.role == JUDGED).sum() == TEST
+    assert len(poses) == (TRAIN if folded else TRAIN + TEST)
+    assert (poses.role == JUDGED).sum() == (TRAIN if folded else TEST)
     for errors, figures in zip(
         (poses.before, poses.after), result.validation.figures, strict=True
     ):
         assert rms_of(errors[poses.judged]) == pytest.approx(figures.rms_mm, rel=1e-12)
     turned = rms_of(poses.turned_after[poses.judged])
     assert turned == pytest.approx(result.validation.figures[1].rms_mrad, rel=1e-12)
-
-
-def test_cross_validated_poses_have_the_errors_of_the_folds():
-    problem = replace(problem_of(), held_out=None)
-    result = identify(problem)
-    poses = poses_of(problem, result)
-    assert (poses.role == JUDGED).all()
-    assert rms_of(poses.after) == pytest.approx(result.validation.figures[1].rms_mm, rel=1e-12)
 
 
 def test_residuals_csv_holds_every_pose(solved):
