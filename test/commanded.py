@@ -75,10 +75,10 @@ def only_refusal(result):
     return refusal
 
 
-def at_limit(nominal, true, q, joint=2):
-    """Return commands with a limit that the correction would just exceed."""
+def at_limit(nominal, true, q, joint=2, share=0.5):
+    """Return commands with a limit that a share of the correction would reach."""
     correction = compensate(Compensator(nominal, true), q[None]).correction[0, joint]
-    end = {'upper' if correction > 0.0 else 'lower': q[joint] + 0.5 * correction}
+    end = {'upper' if correction > 0.0 else 'lower': q[joint] + share * correction}
     joints = list(nominal.joints)
     joints[joint] = replace(joints[joint], **end)
     return replace(nominal, joints=tuple(joints))

@@ -279,6 +279,6 @@ def predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
     Over the joint range, in the best frames.
     """
     joints = chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    frames = [*parameters_of('base'), *parameters_of('tool')[:3]]
+    frames = [*parameters_of('base'), *parameters_of('tool')]
     _, _, left = followed(chain, frames, names, joints, 0.0)
     return np.asarray(left.T @ left) / len(joints)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from designs import POSTURE, SIGMAS, arm, design_of, predicted_square, some
 
-from calib_ros import CalibrationSession, Problem, identify, load_chain
+from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import planning, simulation
 from calib_ros.apply.design import (
     ASSUMED_TOOL,
@@ -22,10 +22,7 @@ from calib_ros.apply.design import (
 from calib_ros.apply.planning import choose
 from calib_ros.errors import InputError
 from calib_ros.estimation.identifiability import observability
-from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.sampling.live import LiveEstimate
-from calib_ros.sampling.sample import Sample
 
 
 @pytest.mark.parametrize(
@@ -76,27 +73,6 @@ def by_parameters(result, task):
     """Return the RMS error [m] at a task by the uncertainty of the fitted parameters alone."""
     rows = ErrorModel(result.chain, result.names).jacobian(task)[:, :3]
     return np.sqrt(np.einsum('ncp,pr,ncr->', rows, result.covariance, rows) / len(task))
-
-
-def test_what_the_live_estimate_knows_is_known():
-    """The sigma that it predicts, before and after further poses."""
-    chain = arm()
-    rng = np.random.default_rng(4)
-    true = simulation.faulty(chain, simulation.Cell(), rng)
-    seen = simulation.measure(true, some(chain, 60), rng, *SIGMAS)
-    samples = [
-        Sample(int(stamp), joints, position=position, rotation=rotation)
-        for stamp, joints, position, rotation in zip(
-            seen.stamps_ns, seen.joints, seen.positions, seen.rotations, strict=True
-        )
-    ]
-    session = CalibrationSession(chain)
-    first, both = (LiveEstimate(session.problem_of).update(samples[:n]) for n in (30, 60))
-    design = Design.of(session.problem_of(samples[:30]), first)
-    look = first.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    assert predicted(design, look) == pytest.approx(first.sigma, rel=1e-3)
-    same_noise = both.sigma * first.noise / both.noise
-    assert predicted(design.after(seen.joints[30:]), look) == pytest.approx(same_noise, rel=0.03)
 
 
 def test_poses_to_come_have_the_noise_that_was_found():

@@ -81,6 +81,11 @@ def test_velocity_is_not_defined_where_a_joint_is_held_at_its_limit():
     corrected, result = compensate_program(compensator, program)
     assert 'held at its limit' in only_refusal(result).reason
     assert np.isnan(corrected.velocities).all()
+    just_within = Compensator(at_limit(nominal, true, q[0], share=1.0 + 1e-6), true)
+    corrected, result = compensate_program(just_within, program)
+    assert result.refusals == ()
+    free, _ = compensate_program(Compensator(nominal, true), program)
+    np.testing.assert_allclose(corrected.velocities, free.velocities, rtol=1e-12)
 
 
 def test_backlash_is_taken_up_by_the_sense_of_the_move():

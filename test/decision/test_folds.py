@@ -158,16 +158,20 @@ def test_a_joint_that_moves_in_outliers_only_is_named(rng):
     assert result.refusals[0].startswith('shoulder_lift_joint moves only in poses set aside')
 
 
-def test_outliers_that_go_with_a_joint_are_the_arms(rng):
+@pytest.mark.parametrize('count', [3, 30])
+def test_outliers_that_go_with_a_joint_are_the_arms(rng, count):
+    """Unless they are too few to tell."""
     true = arm(rng)
     q = UR10E.random_joints(120, rng)
+    q[:, 3] *= 0.1
+    far = np.isin(np.arange(120), rng.permutation(120)[:count])
+    q[far, 3] = 2.0 + q[far, 3]
     driven = q.copy()
-    far = np.cos(q[:, 3] - 1.0) > 0.85  # something jams there
-    driven[far, 4] += 0.01
+    driven[far, 4] += 0.01  # something jams there
     seen = replace(measure(true, driven, rng, *NOISE), joints=q)
     result = identify(Problem(UR10E, seen, **SIGMAS))
     assert {outlier.sample for outlier in result.outliers} == set(np.flatnonzero(far))
-    assert 'depend on wrist_1_joint' in ' '.join(result.refusals)
+    assert ('depend on wrist_1_joint' in ' '.join(result.refusals)) == (count > 3)
 
 
 @pytest.mark.parametrize('exchanged', [0, 6])

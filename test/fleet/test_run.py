@@ -267,6 +267,8 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     worst = standings(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
+    repaired = replace(plant[1], since=plants.when(2))
+    assert standings((repaired,), history, found, 100.0)[0].alarms == ()
 
 
 def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch):

@@ -11,7 +11,13 @@ from robots import DATA, needs_data
 
 from calib_ros import Calibration, Observations, Problem, difference, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.changes import gauged
+from calib_ros.decision.changes import (
+    Columns,
+    Information,
+    gauged,
+    reason_in_words,
+    reasons_of,
+)
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import parse_chain
 from calib_ros.kinematics.parameter import Parameter
@@ -137,6 +143,15 @@ def test_what_a_parameter_shares_with_others_is_a_share():
     np.testing.assert_allclose(taken[:, :3], [[1, 1, 0], [0, 0, 1]], atol=1e-9)
     np.testing.assert_allclose(left[:3], 0.0, atol=1e-9)
     assert 0.1 < left[3] < 1.0
+
+
+def test_reasons_of_one_effect_are_told_together():
+    names = (Parameter('elbow_joint.theta'), Parameter('wrist_1_joint.theta'))
+    matrix = np.full((2, 2), 1e10)
+    information = Information(names, matrix, matrix @ (1e-3, 0.0))
+    told = reason_in_words(reasons_of(information, Columns(UR, names), 100.0))
+    alike = [f'{name} by +1.000 ± 0.020 mrad (95 %)' for name in names]
+    assert told == f'changed: {", indistinguishable from ".join(alike)}'
 
 
 def test_what_moves_nothing_takes_no_share(nights):

@@ -13,6 +13,7 @@ from plotly import graph_objects
 from calib_ros import Observations, Settings, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
 from calib_ros.decision.comparison import compare
+from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.effects import Verdict
@@ -84,6 +85,16 @@ def test_noise_as_stated_is_on_the_line(rng, kind):
         assert np.polyfit(expected, found, 1)[0] == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize(('waves', 'across'), [(3e-4, '0.469'), (TYPICAL['drive'], '0.200')])
+def test_what_joints_do_beyond_the_model_is_told_in_all(solved, waves, across):
+    """Waves of the usual size are assumed, not seen."""
+    problem, result = solved
+    lacking = result.posterior.unmodelled._replace(turns=1e-4, tilts=2e-4, waves=waves)
+    found = replace(result, posterior=replace(result.posterior, unmodelled=lacking))
+    said = f'by 0.100 mrad about their axes and {across} mrad across them'
+    assert said in page_of(report_of(problem, found)).text
+
+
 def test_effects_are_compared_by_changes_in_their_order():
     verdicts = (
         Verdict('ratio', 0.3, 0.3003, pays=False),
@@ -110,7 +121,8 @@ def test_joints_without_limits_are_not_given_any(rng):
     free = replace(UR10E.joints[0], lower=None, upper=None)
     chain = replace(UR10E, joints=(free, *UR10E.joints[1:]))
     joints = chain.random_joints(50, rng)
-    _, rows = coverage(chain, joints)
+    figure, rows = coverage(chain, joints)
+    assert figure['data'][0]['x'] == pytest.approx(100.0 * np.arange(1, 72, 2) / 72, rel=1e-3)
     assert [row[1] for row in rows[:2]] == ['-180 to 180 ° (no limits)', '-360 to 360 °']
     joints[:, 0] += 2.0  # a turn from where it was measured, not what is between both ranges
     low = np.degrees(joints[:, 0].min())
@@ -142,5 +154,6 @@ def test_offsets_have_their_intervals_and_a_limit_that_is_near(solved, limit, ne
     assert dots['error_x']['array'] == pytest.approx(widths, rel=1e-3, abs=1e-4)
     shown = [each['x0'] for each in figure['layout']['shapes']]
     assert shown == [0.0, *([-1e3 * limit, 1e3 * limit] if near else [])]
+    assert figure['layout']['xaxis']['title']['text'] == 'offset [mm]'
     reach = figure['layout']['xaxis']['range'][1]
     assert max(map(abs, shown)) < reach < 10.0

@@ -22,11 +22,12 @@ from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import workspace_report
 from calib_ros.report.documents import as_document
-from calib_ros.report.explorer import SINGLE, WORST, explorer
+from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
 from calib_ros.report.page import Input, Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
+from calib_ros.report.sections import identity_of
 from calib_ros.report.verdicts import verification_report
 from calib_ros.report.words import limits_mm, summary
 
@@ -47,28 +48,25 @@ def test_the_figures_are_those_of_the_result(solved):
     for name, partners in result.gauges.items():
         assert f'{name} {", ".join(partners)}' in page.text
     assert table_hash(result.chain) in page.text
+    assert ('None is above 0.9.' in page.text) == (not result.correlated())
     assert page.text.index('Accepted') < page.text.index('Accuracy before and after')
 
 
-def test_poses_are_those_judged_and_their_errors_make_the_figures(solved):
+@pytest.mark.parametrize('folded', [False, True])
+def test_poses_are_those_judged_and_their_errors_make_the_figures(solved, folded):
     problem, result = solved
+    if folded:
+        problem = replace(problem, held_out=None)
+        result = identify(problem)
     poses = poses_of(problem, result)
-    assert len(poses) == TRAIN + TEST
-    assert (poses.role == JUDGED).sum() == TEST
+    assert len(poses) == (TRAIN if folded else TRAIN + TEST)
+    assert (poses.role == JUDGED).sum() == (TRAIN if folded else TEST)
     for errors, figures in zip(
         (poses.before, poses.after), result.validation.figures, strict=True
     ):
         assert rms_of(errors[poses.judged]) == pytest.approx(figures.rms_mm, rel=1e-12)
     turned = rms_of(poses.turned_after[poses.judged])
     assert turned == pytest.approx(result.validation.figures[1].rms_mrad, rel=1e-12)
-
-
-def test_cross_validated_poses_have_the_errors_of_the_folds():
-    problem = replace(problem_of(), held_out=None)
-    result = identify(problem)
-    poses = poses_of(problem, result)
-    assert (poses.role == JUDGED).all()
-    assert rms_of(poses.after) == pytest.approx(result.validation.figures[1].rms_mm, rel=1e-12)
 
 
 def test_residuals_csv_holds_every_pose(solved):
@@ -148,16 +146,21 @@ def test_a_page_loads_nothing(solved):
     assert len(text.encode()) < 8e6
 
 
-def test_every_figure_is_one_that_plotly_knows(solved):
+def test_every_figure_is_one_that_plotly_knows_and_is_drawn_on_paper(solved):
     arm = Calibration.of(solved[1])
     found = survey(arm, 500, np.random.default_rng(0))
-    reports = [report_of(*solved), workspace_report(arm, found, Origin())]
-    count = 0
-    for report in reports:
-        for figure in page_of(report).data['figures'].values():
-            graph_objects.Figure(figure)
-            count += 1
-    assert count >= 8
+    report = workspace_report(arm, found, Origin())
+    pages = [page_of(report_of(*solved)), page_of(report)]
+    figures = [figure for page in pages for figure in page.data['figures'].values()]
+    assert len(figures) >= 8
+    for figure in figures:
+        graph_objects.Figure(figure)
+    for each in report.sections:
+        assert (drawing(each.figure, each.height) is not None) == (each.figure is not None)
+    assert drawing({'data': [{'type': 'scatter3d'}], 'layout': {}}, 100) is None
+    for label, errors in found.parts.items():
+        sizes = (f'{1e3 * size:.3f}' for size in (np.sqrt(np.mean(errors**2)), errors.mean()))
+        assert ' '.join((label, *sizes)) in pages[1].text
 
 
 def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
@@ -166,24 +169,31 @@ def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
         (Input('cell/a.mcap', 1, 'a'), Input('cell/metadata.yaml', 1, 'b')), command='c <d>'
     )
     report = replace(report_of(problem, result), origin=origin)
-    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('identify again',))
+    told = advice.advice([Reason(Rule.GAIN, 'h')])
+    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('again',), advice=told)
+    lines = markdown(refused, {}).splitlines()
+    assert lines.index('again') > max(lines.index(f'- {step}') for step in told[0].steps)
     assert report.of == 'cell'
     assert '<span>c</span> <span>&lt;d&gt;</span>' in render(refused)
 
 
-@pytest.mark.parametrize(('share', 'count', 'state'), [(0.0, 60, 'info'), (0.5, 8, 'bad')])
-def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, state):
-    """Few poses that do not show a gain do not show a good arm either."""
+@pytest.mark.parametrize(
+    ('share', 'count', 'sigma', 'state'),
+    [(0.0, 60, 3e-4, 'info'), (0.5, 8, 3e-4, 'bad'), (0.0, 60, 3e-5, 'bad')],
+)
+def test_an_arm_without_an_error_to_see_is_no_bad_one(share, count, sigma, state):
+    """Few poses that do not show a gain do not show a good arm either, nor does bad noise."""
     rng = np.random.default_rng(1)
     true = simulation.faulty(UR, simulation.Cell(), rng)
     names = [name for joint in UR.joints for name in joint.parameters]
     arm = UR.with_offsets({name: share * true.offset(name, UR) for name in names})
     rows = simulation.measure(arm, UR.random_joints(count, rng), rng, 3e-4, 6e-4)
-    problem = Problem(UR, rows, sigma_position=3e-4, sigma_orientation=6e-4)
+    problem = Problem(UR, rows, sigma_position=sigma, sigma_orientation=2.0 * sigma)
     result = identify(problem)
     assert {each.rule for each in result.refusals} == {Rule.GAIN}
     report = report_of(problem, result)
     assert report.verdict.state == state
+    assert 'Not accepted' in report.verdict.heading
     assert (report.advice[0].meaning == advice.GOOD_ARM.meaning) == (state == 'info')
 
 
@@ -199,6 +209,8 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
     report = report_of(problem, near)
     assert report.verdict.heading == 'Accepted near the measured poses'
     assert report.steps[-1].startswith('To use it beyond the measured poses')
+    region = {'whole': False, 'share': 0.1, 'limit_mm': 1.0}
+    assert as_document(near, {})['region'] == region
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
     verdict = report_of(problem, doubtful).verdict
     assert 'ur3' in verdict.text[1]
@@ -214,14 +226,6 @@ def test_no_pose_is_called_judged_where_none_was_left_out():
     assert poses.judged.any()
 
 
-def test_figures_are_drawn_on_paper_but_for_those_in_space(solved):
-    arm = Calibration.of(solved[1])
-    report = workspace_report(arm, survey(arm, 500, np.random.default_rng(0)), Origin())
-    for each in report.sections:
-        assert (drawing(each.figure, each.height) is not None) == (each.figure is not None)
-    assert drawing({'data': [{'type': 'scatter3d'}], 'layout': {}}, 100) is None
-
-
 def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     problem, result = solved
     poses = poses_of(problem, result)
@@ -233,11 +237,20 @@ def test_many_poses_are_shown_in_bins_and_cells(solved, monkeypatch):
     assert np.sqrt(squares.sum() / good.sum()) == pytest.approx(
         rms_of(poses.after[good]), rel=1e-3
     )
-    low, middle, high = shown['bins']['joint2']['length']['after']
-    known = [k for k, value in enumerate(middle) if value is not None]
-    assert known
-    assert all(low[k] <= middle[k] <= high[k] for k in known)
     assert shown['total'] == len(poses)
+    errors = 1e3 * np.linalg.norm(poses.after, axis=1)
+    largest = np.quantile(errors[poses.judged], 0.98)
+    assert shown['largest']['after'] == pytest.approx(largest)
+    few = poses.select(np.flatnonzero(good)[:: 1 + good.sum() // 30])
+    values, errors = np.degrees(few.joints[:, 2]), 1e3 * np.linalg.norm(few.after, axis=1)
+    bins = shown['bins']['joint2']['length']
+    edges = np.linspace(values.min(), values.max(), BANDS + 1)
+    assert bins['x'] == pytest.approx(0.5 * (edges[1:] + edges[:-1]), abs=1e-2)
+    inside = np.digitize(values, edges[1:-1])
+    for k, row in enumerate(zip(*bins['after'], strict=True)):
+        own = np.sort(errors[inside == k])
+        ranks = np.round((len(own) - 1) * np.array([0.05, 0.5, 0.95])).astype(int)
+        assert row == pytest.approx(own[ranks], rel=1e-3) if len(own) else not any(row)
 
 
 def test_half_a_million_poses_make_a_page_of_eight_megabytes(solved):
@@ -333,6 +346,9 @@ def test_poses_and_measurements_are_two_counts(solved):
     assert [each for each in lines if each.startswith('- Poses')] == [f'- Poses: {TRAIN + TEST}']
     assert f'- poses fitted: {TRAIN}' in lines
     assert f'- measurements: {3 * TRAIN}' in lines
+    poses = replace(poses_of(*solved), stamps_ns=10**18 * np.array([1, 8]))
+    said = dict(identity_of(UR, Origin(), poses))['Measured, by the stamps']
+    assert said.startswith('2001-09-09 01:46 to 2223-07-06 14:13 UTC (in the future')
     assert not any('foreign' in each or 'not used' in each for each in lines[-20:])
 
 

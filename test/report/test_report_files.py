@@ -76,5 +76,8 @@ def test_the_other_commands_write_their_pages(solved, run, tmp_path):
     assert (tmp_path / 'verified' / 'residuals.csv').read_text().count('\n') == 13
     planned = ('plan', '--chain', 'ur5e', '--poses', 12, '--draw', 60, '--out', 'plan.csv')
     assert run(*planned)[0] == 0
-    assert 'Poses to measure' in Page((tmp_path / 'plan.report.html').read_text()).text
+    page = Page((tmp_path / 'plan.report.html').read_text())
+    assert 'Poses to measure 12 poses. Predicted' in ' '.join(page.text.split())
+    *_, last = page.data['figures']['promise']['data'][0]['y']
+    assert f'RMS position error: {last:.4f} mm' in page.text
     assert run(*planned)[0] == 1

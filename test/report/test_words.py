@@ -11,6 +11,7 @@ from verified import in_words
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.comparison import Comparison, Residuals
+from calib_ros.estimation.noise import Noise
 from calib_ros.files.rows import Filing, verified
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
@@ -91,6 +92,29 @@ def test_the_error_told_is_the_one_within_its_limits():
     report = verification_report(arm, found, poses, Origin())
     assert f'each counted once, is {1e3 * found.rms:.3f} mm' in report.verdict.text[0]
     assert any('refitted' in each for each in report.verdict.text)
+
+
+@pytest.mark.parametrize(
+    ('size', 'consistent', 'said'),
+    [
+        (1.02, True, 'is 1.02 times the stated device noise: consistent with pure noise'),
+        (0.5, False, 'is 0.50 times the stated device noise: the device is better than stated.'),
+        (1.7, False, 'the arm has errors that this model lacks. The intervals are widened'),
+    ],
+)
+def test_what_is_left_is_told_by_the_noise_stated(size, consistent, said):
+    assert said in words.scatter_in_words(Noise(size, None, consistent, 0.3, 0.2, ()))
+
+
+def test_drift_is_errors_shared_in_succession_only():
+    for shared in ((), ('near',), ('successive',), ('successive', 'near')):
+        noise = Noise(1.0, None, True, 0.3, 0.2, shared, widened=1.5)
+        assert bool(words.drift_in_words(noise)) == (shared == ('successive',))
+    said = words.neighbours_in_words(noise)
+    assert 'measured in succession (0.30) and near each other in joint space (0.20)' in said
+    assert 'standard deviations are 1.50 times' in said
+    for chance, share in ((0.053, '5.3 %'), (1e-4, 'less than 0.1 %')):
+        assert f'well in {share} of cases: above 5 %' in words.chance_in_words(chance)
 
 
 def test_no_figure_is_rounded_to_nothing():

@@ -158,7 +158,9 @@ def test_two_nodes_of_one_name_are_told(cell, tmp_path):
     other = cell.start(chain='ur10e', data_dir=str(tmp_path / 'other'))
     cell.spin_until(lambda: said in heard[-1].status[0].message)
     assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    cell.spin_until(lambda: sum(said in each.status[0].message for each in heard) > 6)
     cell.spin_until(lambda: any(said in each.msg for each in logged))
+    assert sum(said in each.msg for each in logged) <= 2  # once by each, not each second
     cell.executor.remove_node(other)
     cell.nodes.remove(other)
     assert other.close()

@@ -26,7 +26,7 @@ from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
 from calib_ros.files.cameras import cameras_of, grey, lens_in
 from calib_ros.files.recording import Recording
-from calib_ros.files.tables import read_journal
+from calib_ros.files.tables import read_journal, read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
@@ -191,6 +191,8 @@ def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
     (journal,) = tmp_path.glob('*.csv')
     kept, _ = read_journal(journal, 6)
     assert_same(wanted, live.problem_of(kept).observations)
+    (fitted,) = read_table(journal, 6).fitted
+    assert_same(wanted, fitted)
 
 
 def test_compressed_images_of_a_bag_and_of_messages(tmp_path, shift, board):
@@ -226,8 +228,8 @@ def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_not
     assert (
         session.account().dropped['measurements: image while others were processed'] > STOPS // 2
     )
-    camera.go_on.set()
-    session.finish()
+    threading.Timer(0.2, camera.go_on.set).start()
+    session.finish()  # waits for them
     assert session.account().dropped['measurements: image blurred'] >= pictures.MOST_WAITING
     assert 'the last image is not used: it is blurred' in session.status()
 

@@ -71,26 +71,6 @@ def test_the_status_is_short_and_its_first_words_are_those_that_matter(
     assert '...; the arm is moving' in words[-1].data
 
 
-def test_residual_markers_are_well_formed(cell, recording):
-    cell.play(topics(recording))
-    cell.done('identify')
-    heard = cell.listen(MarkerArray, 'calibration_node/residuals')
-    cell.spin_until(lambda: heard)
-    (lines,) = heard[0].markers
-    assert (lines.type, lines.action) == (Marker.LINE_LIST, Marker.ADD)
-    assert lines.header.frame_id == 'tracker'
-    assert lines.pose.orientation.w == 1.0
-    assert lines.scale.x > 0.0
-    assert len(lines.points) == len(lines.colors) == 2 * STOPS
-    assert all(color.a == 1.0 and 0.0 <= color.r <= 1.0 for color in lines.colors)
-    begins = np.array([[p.x, p.y, p.z] for p in lines.points[::2]])
-    ends = np.array([[p.x, p.y, p.z] for p in lines.points[1::2]])
-    measured = cell.node.session.problem().observations
-    np.testing.assert_allclose(begins, measured.positions, atol=1e-12)
-    predicted = cell.node.session.calibration.chain.forward(measured.joints)[:, :3, 3]
-    np.testing.assert_allclose(ends - begins, 200.0 * (predicted - measured.positions), atol=1e-9)
-
-
 def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, truth):
     there = replace(truth, base=random_frame(np.random.default_rng(8), 2.0))
     joints = recording.poses.joints
@@ -105,6 +85,17 @@ def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, tr
         heard = cell.listen(MarkerArray, 'calibration_node/residuals')
         cell.spin_until(lambda: heard)
         (lines,) = heard[0].markers
+        assert (lines.type, lines.action) == (Marker.LINE_LIST, Marker.ADD)
         assert lines.header.frame_id == 'tracker'
-        ends = np.array([[p.x, p.y, p.z] for p in lines.points[::2]]).reshape(2, STOPS, 3)
-        np.testing.assert_allclose(ends[1], ends[0], atol=5e-4)
+        assert lines.pose.orientation.w == 1.0
+        assert lines.scale.x > 0.0
+        assert len(lines.points) == len(lines.colors) == 4 * STOPS
+        assert all(color.a == 1.0 and 0.0 <= color.r <= 1.0 for color in lines.colors)
+        points = np.array([[p.x, p.y, p.z] for p in lines.points]).reshape(2, STOPS, 2, 3)
+        begins, ends = points[:, :, 0], points[:, :, 1]
+        measured = cell.node.session.problem().observations
+        np.testing.assert_allclose(begins[0], measured.positions, atol=1e-12)
+        predicted = cell.node.session.calibration.chain.forward(measured.joints)[:, :3, 3]
+        longer = 200.0 * (predicted - measured.positions)
+        np.testing.assert_allclose(ends[0] - begins[0], longer, atol=1e-9)
+        np.testing.assert_allclose(begins[1], begins[0], atol=5e-4)

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_transforms import TIMES, frame, link, tf
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.files.stored import LARGEST_MESSAGE
 from calib_ros.kinematics import se3
 from calib_ros.sampling.messages import JOINT_STATE, parse_source
 
@@ -159,7 +160,7 @@ def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
     'text',
     [
         'std_msgs/Header header\nnonsense',
-        'std_msgs/Header header\n' + 'uint32 x\n' * 10_000,
+        f'{TEXTS[MOCAP]}# {"x" * LARGEST_MESSAGE}',
         'std_msgs/Header header\nuint32 a=b',
     ],
 )

@@ -14,7 +14,10 @@ NOISE = 5e-5
 
 
 def samples(rotations, rng, spikes=(), stops=1):
-    """Return the samples of stops at which rotations (N, 3, 3) were measured, alike at each."""
+    """Return the samples of stops at which rotations (N, 3, 3) were measured, alike at each.
+
+    And how many are of the first restless stop or later.
+    """
     count = len(rotations)
     values = np.full((stops * count, ROW_WIDTH), np.nan)
     values[:, :3] = 0.5 + rng.normal(scale=NOISE, size=(stops * count, 3))
@@ -27,7 +30,7 @@ def samples(rotations, rng, spikes=(), stops=1):
     found = Found(POSE, numbers, stamps, values)
     begins = count * np.arange(stops)
     made.add(list(made.samples(found, Motion(still), begins, still[begins], 0.0, NOISE)))
-    return made.take()[0]
+    return made.take()
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 3.0, np.pi - 1e-6, np.pi]))
@@ -38,7 +41,9 @@ def test_rotations_are_averaged_as_rotations(seed, angle):
     true = se3.exp_rotation(angle * axis[np.newaxis] / np.linalg.norm(axis))[0]
     count, sigma = 100, 1e-3
     turned = se3.exp_rotation(rng.normal(scale=sigma, size=(count, 3))) @ true
-    found = samples(turned, rng)[0].rotation
+    (sample,), restless = samples(turned, rng)
+    assert restless == 0
+    found = sample.rotation
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(found) == pytest.approx(1.0)
     error = se3.log_rotation((found @ true.T)[np.newaxis])[0]
@@ -48,9 +53,10 @@ def test_rotations_are_averaged_as_rotations(seed, angle):
 def test_the_rotation_of_a_spike_does_not_count(rng):
     rotations = np.tile(np.eye(3), (20, 1, 1))
     rotations[7] = se3.exp_rotation(np.array([[0.5, 0.0, 0.0]]))[0]
-    first, second = samples(rotations, rng, (7, 27), stops=2)
-    assert first.count == second.count == 19
-    for sample in (first, second):
+    found, restless = samples(rotations, rng, (27, 47), stops=3)
+    assert [sample.count for sample in found] == [20, 19, 19]
+    assert restless == 2
+    for sample in found[1:]:
         np.testing.assert_allclose(sample.rotation, np.eye(3), atol=1e-12)
 
 

@@ -165,6 +165,7 @@ def test_the_status_is_never_an_error():
     (one,) = samples(1)
     same_place = session([replace(one, stamp_ns=k) for k in range(1, 20)])
     assert '; 19 poses' in same_place.status()
+    assert '19 poses, 1 of them different' in str(same_place.account())
     assert '; 0 poses' in CalibrationSession(UR5E).status()
     assert CalibrationSession(UR5E).status('identifying') == (
         'waiting for joint states; identifying; 0 poses'
