@@ -89,7 +89,10 @@ class Calibration(Shown):
         owners: Mapping[str, records.Owner] | None = None,
         fitted: Sequence[Observations] = (),
     ) -> Calibration:
-        """Return the calibration of an identification; `origin` describes the `fitted` samples."""
+        """Return the calibration of an identification; `origin` describes the measurements.
+
+        `verify` recognises the `fitted` ones, and cannot pass on them.
+        """
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # as in the file
