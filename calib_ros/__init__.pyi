@@ -3,6 +3,7 @@
 """The public interface: `__init__.py` reads where each name is, type checkers what it is."""
 
 from calib_ros.apply.compensation import Compensator as Compensator, compensate as compensate
+from calib_ros.apply.design import Design as Design
 from calib_ros.apply.planning import Plan as Plan, plan as plan
 from calib_ros.apply.program import Program as Program
 from calib_ros.apply.verification import Verification as Verification, verify as verify

@@ -38,6 +38,11 @@ def _setting(default: Any, text: str, lower: float | None = None) -> Any:
     return field(default=default, metadata={'text': text, 'lower': lower})
 
 
+def effects_of(model: str) -> tuple[str, ...]:
+    """Return the effects, or groups of them, that a model names."""
+    return () if model in ('geometric', 'auto') else tuple(model.split('+'))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Limits:
     """Limits of a correction of joint commands."""
@@ -157,9 +162,8 @@ class Settings:
         names = ['sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_scale']
         names += ['fixed', 'folds']
         names += ['largest_length', 'largest_angle', 'largest_error', 'loss']
-        named = () if self.model in ('geometric', 'auto') else tuple(self.model.split('+'))
         chosen = {name: getattr(self, name) for name in names}
-        return chosen | {'priors': priors, 'effects': named}
+        return chosen | {'priors': priors, 'effects': effects_of(self.model)}
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:

@@ -256,11 +256,14 @@ def plan(
     progress: Notify = quiet,
     chosen: Index | None = None,
 ) -> Plan:
-    """Plan a number of measurements, and compare them with random draws.
+    """Plan `count` measurements, and compare them with as many at random (`draws`).
 
-    `candidates` (N, n) and the `task` (M, n) are joint values, `velocities` (n,) the largest
-    rates. `chosen` (K,) are indices found by `fewest`; `choose` and `visit_order` describe the
-    other arguments.
+    `candidates` (N, n) and the `task` (M, n), where the arm must be accurate, are joint values
+    [rad or m]; `velocities` (n,) are the largest rates. `criterion` is d, task, or o2 to o5. Any
+    two poses differ by at least `apart` [rad or m] in the joint that moves most. `chosen` (count,)
+    are indices already found.
+
+    Raises ConfigError or InputError if the candidates do not suffice.
     """
     excited = design.determined_by(candidates)
     if chosen is None:

@@ -111,6 +111,8 @@ class Verification(Shown):
     """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     uncorrected: bool = False
     """Whether all measurements were taken at the joint values of the program as it was given."""
+    odd: int | None = None
+    """Configuration without which the others would be within the limit."""
 
     @property
     def configurations(self) -> int:
@@ -162,7 +164,7 @@ def verify(
     progress(2 / 3)
     group = configurations(np.concatenate([each.joints for each in sets]))
     moments = moments_of(comparison.after.position, group)
-    moments += 0.0 if moments.any() else SAME**2 * np.eye(3)  # simulated without noise
+    moments += SAME**2 * np.eye(3)  # simulated without noise
     in_base = 6 // 3  # freedoms; the turn of a tool does not move the target
     lost = new_base * in_base + new_tool
     rms, count = _rms(moments, lost), len(moments)
@@ -171,9 +173,10 @@ def verify(
     lower, upper = rms_limits(rms, freedom, confidence)
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
-    limit = tolerance or arm.limit
+    limit, odd = tolerance or arm.limit, None
     if limit is not None:
         verdict = _decided(limit, lower, upper, numbers)
+        odd = _odd(moments, lost, limit, confidence)
     if reused and verdict[0] != 'FAIL':
         verdict = ('no verdict', None)
     if tolerance is None:
@@ -181,7 +184,7 @@ def verify(
     if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, reused, uncorrected)
+    known = (commanded is not None, fitted, reused, uncorrected, odd)
     return Verification(comparison, tolerance, limit, confidence, group, *found, *known)
 
 
@@ -221,6 +224,18 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
             + f', {lost} of them for the refitted frames' * (lost > 0)
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
+
+
+def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> int | None:
+    """Return the worst configuration if the others alone are within a limit exceeded with it."""
+    worst = int(np.trace(moments, axis1=1, axis2=2).argmax())
+    uppers = []
+    for some in (moments, np.delete(moments, worst, axis=0)):
+        if (count := len(some) - lost) < NEEDED:
+            return None
+        freedom = freedom_of(some) * np.array([count])
+        uppers += rms_limits(_rms(some, lost), freedom, confidence)[1].tolist()
+    return worst if uppers[1] <= limit < uppers[0] else None
 
 
 def _decided(

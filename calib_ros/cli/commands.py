@@ -64,7 +64,7 @@ tables of other systems (docs/tables.md); anything not given is guessed
   --rotation-vector  rx ry rz are a rotation vector
   --inverse  poses are of the device in the target frame
   --shift ROWS=0  joint values are this many rows below their measurement
-  --joints FILE  separate log of joint values, matched row by row"""
+  --joints FILE  separate log of joint values, matched by a common column or row by row"""
 COLUMNS = 'q1=A1,x={Pos X},y=-#3 ...: columns or expressions; q*=A* for all joints'
 REPORT = """\
 for the report

@@ -35,10 +35,11 @@ SETTINGS = {
     ),
 }
 """Settings by the groups of the help."""
-OF_BAGS = (
-    *SETTINGS['how the device measures'],
-    *SETTINGS['bags: what is read'],
-    *SETTINGS['bags: how poses are taken'],
+OF_BAGS = tuple(
+    name
+    for title in ('how the device measures', 'bags: what is read', 'bags: how poses are taken')
+    for name in SETTINGS[title]
+    if name not in ('sigma_scale', 'wanted_accuracy')
 )
 """Settings that affect the poses of a bag."""
 LAYOUT = (

@@ -369,7 +369,8 @@ def result_files(
     if result.accepted:
         # the only device and target of a table may be any of a bag or node
         owners = loaded.owners if loaded.read or len(loaded.owners) > 2 else {}
-        kept = Calibration.of(result, owners=owners, fitted=loaded.problem.sets)
+        serial = {'robot_serial': found.origin.serial} if found.origin.serial else {}
+        kept = Calibration.of(result, serial, owners, loaded.problem.sets)
         contents['calibration.yaml'] = kept.dump()
         return contents
     return contents | _set_aside(out)

@@ -85,7 +85,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.typed = re.sub('://[^/@]*@', '://', typed)  # no password
         module, function = options.home.split('.')
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
-        status: int = run(options, Screen(options.quiet))
+        screen = Screen(options.quiet)
+        status: int = run(options, screen)
+        if options.quiet and status and screen.verdict:
+            screen.warn(screen.verdict, 'calib_ros')
         sys.stdout.flush()
     except BrokenPipeError:  # the reader has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -151,9 +154,15 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose errors end with an example."""
 
     example = ''
+    typed: Sequence[str] = ()
 
     def error(self, message: str) -> NoReturn:
         """Report what is required, what is wrong, and an example."""
+        rest = (word for word in self.typed if word.startswith('--') and len(word) > 2)
+        known = tuple(self._option_string_actions)
+        wrong = [w for w in rest if not any(k.startswith(w.partition('=')[0]) for k in known)]
+        if wrong and 'required: ' in message:
+            message = _unknown(wrong[0], self)
         for kind, what in (('int', 'a whole number'), ('float', 'a number such as 0.1')):
             message = message.replace(f'invalid {kind} value:', f'must be {what}, not')
         if message.endswith(': --chain'):
@@ -163,7 +172,7 @@ class _Parser(argparse.ArgumentParser):
         self.exit(2, f'{text}\nexample: {self.example.lstrip()}\n')
 
 
-def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
+def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; only the given one has its options."""
     from calib_ros.cli.commands import (  # not needed by the overview
         COMMANDS,
@@ -186,6 +195,7 @@ def _parser(given: Iterable[str]) -> argparse.ArgumentParser:
             formatter_class=_Help,
         )
         added.example = _example(examples_of(name)[0])
+        added.typed = given
         added.set_defaults(home=home, parser=added)
         add_options(added, options)
         add_more = added.add_argument_group('output').add_argument

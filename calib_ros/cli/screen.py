@@ -31,6 +31,7 @@ class Screen:
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
+        self.verdict = ''
         self._bar: Any = None  # the console of a bar: what else is printed there goes above it
 
     def data(self, text: str) -> None:
@@ -47,6 +48,7 @@ class Screen:
 
     def title(self, text: str, good: bool | None = None) -> None:
         """Print a verdict; the colour never says more than the words."""
+        self.verdict = text
         console = None if self.quiet else _console(sys.stdout)
         if console is None:
             self.say(text)

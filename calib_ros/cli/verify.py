@@ -43,6 +43,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     filed = given.history_of(options)
     nominal = load_chain(options.chain)
     arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
+    serial = arm.serial_of(str(options.calibration), options.serial or '')
     sets, warnings, by_line = _sets(options, nominal, arm, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
     tolerance = None if options.tolerance is None else 1e-3 * options.tolerance
@@ -65,7 +66,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report') as work:
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
-        origin = given.origin_of(options, read)
+        origin = replace(given.origin_of(options, read), serial=serial)
         report = verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['report.md'] = markdown(report, {})

@@ -268,8 +268,7 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     if whole or like:
         others = {name: found[name] for name in found if name not in of_joints}
         found = {**(like or {'q*': 'NAME*'}), **others}
-    plain = {name: re.fullmatch(r'[\w.*]+', each) for name, each in found.items()}
-    given = (f'{name}={each if plain[name] else f"{{{each}}}"}' for name, each in found.items())
+    given = (f'{name}={as_typed(each)}' for name, each in found.items())
     named = ' '.join(found.values())
     units = ('length', 'mm'), ('length', 'cm'), ('angle', 'deg'), ('angle', '°')
     for option, unit in reversed(units):
@@ -277,6 +276,11 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
             more = f' --{option} {unit.replace("°", "deg")}{more}'
     options = f'Columns of other names: --columns "{",".join(given)}"{more}'
     return f'Is it another arm (--chain)? {options}' if fewer else options
+
+
+def as_typed(name: str) -> str:
+    """Return the name of a column as --columns takes it."""
+    return name if re.fullmatch(r'[#\w.*]+', name) else f'{{{name}}}'
 
 
 def _only_numbers(header: Sequence[str]) -> bool:

@@ -5,13 +5,20 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.columns import MadeColumns, like_joints, lines_in_words, named_by_option
+from calib_ros.files.columns import (
+    MadeColumns,
+    as_typed,
+    like_joints,
+    lines_in_words,
+    named_by_option,
+)
 from calib_ros.files.layouts import (
     ANGLES,
     COVARIANCE,
@@ -31,11 +38,12 @@ from calib_ros.files.layouts import (
 )
 from calib_ros.files.sheets import Sheet, read_sheet
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
 MEASURED = (*POSITION, 'distance')
+UNIT = re.compile(r'.*[\[(] *(\w+) *[\])]')
 UNITS = {'millimeters': 'mm', 'centimeters': 'cm', 'meters': 'm', 'micrometers': 'um'}
 UNITS |= {'inches': 'in'} | {unit: unit for unit in LENGTHS}
 
@@ -62,18 +70,20 @@ class Foreign:
             joints = log.values()
             if 'q1' not in joints:
                 joined = 0 if self.chain is None else len(self.chain.joints)
-                like = like_joints(log.header, joined).get('q*', 'NAME*')
+                like = as_typed(like_joints(log.header, joined).get('q*', 'NAME*'))
                 raise InputError(
                     f'{self.log} has no column q1; {log.has}: give --columns "q*={like}" or '
                     '--joints-preset'
                 )
-            values = joints | values
-            if len(log.lines) != len(lines):
+            name, partners = _partners(table, log)
+            if len(partners) != len(lines):
                 raise InputError(
-                    f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: each '
-                    'measurement needs the row of its joint values'
+                    f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: give both a '
+                    'column of the same name that names the poses, or a row for each measurement'
                 )
-            notes += [*log.notes, f'row by row, {self.log} holds the joint values of {path}']
+            how = f'by the column "{name}"' if name else 'row by row'
+            notes += [*log.notes, f'{how}, {self.log} holds the joint values of {path}']
+            values = {ours: each[partners] for ours, each in joints.items()} | values
         made = MadeColumns(path, lines, values, table.words(), table.header)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
@@ -185,19 +195,18 @@ class _Table:
         return tuple(filter(None, self._sheet.header))
 
     def words(self) -> dict[str, list[str]]:
-        found = {}
-        for ours in WORDS:
-            if ours in self._ours:
-                number = self._sheet.number(_bare(self._ours[ours])) or ''
-                cells, known = self._sheet.columns.codes(number)
-                found[ours] = [known[cell] for cell in cells.tolist()]
-        return found
+        return {o: self.cells(_bare(self._ours[o])) for o in WORDS if o in self._ours}
+
+    def cells(self, name: str) -> list[str]:
+        """Return the texts of a column."""
+        cells, known = self._sheet.columns.codes(self._sheet.number(name) or '')
+        return [known[cell] for cell in cells.tolist()]
 
     def values(self) -> dict[str, FloatArray]:
         """Return our columns in m and rad."""
         names = list(dict.fromkeys(n for each in self._expressions.values() for n in each.names))
         numbers = [self._sheet.number(name) or '' for name in names]
-        called = [self._sheet.header[int(number[1:]) - 1] or number for number in numbers]
+        called = [self._called(name) or name for name in names]
         read = self._sheet.columns.numbers(numbers, called)
         columns = dict(zip(names, read.T, strict=True))
         units = self._units()
@@ -210,6 +219,10 @@ class _Table:
             found[ours] = value
         return found
 
+    def _called(self, name: str) -> str:
+        """Return the text above the column of a name or `#k`."""
+        return self._sheet.header[int((self._sheet.number(name) or '')[1:]) - 1]
+
     def _units(self) -> tuple[float, float, float]:
         layout = self._layout
         length, angle = layout.length, layout.angle
@@ -219,18 +232,27 @@ class _Table:
                 if unit and unit != length:
                     self.notes.append(f'lengths are in {unit}, as its head says')
                 length = unit or length
+        length = length or self._said(LENGTHS, (*POSITION, 'distance'))
+        angle = angle or self._said(ANGLES, (*TURNS, *IN_TURN))
+        joint = layout.joint_angle or angle or self._said(ANGLES, joint_columns(MOST_NAMES))
         names = set(self._expressions)
         assumed = []
         if not length and names & {*POSITION, 'distance'}:
             assumed.append('lengths in m (--length)')
         if not angle and names & {*TURNS, *IN_TURN}:
             assumed.append('angles in rad (--angle)')
-        joint = layout.joint_angle or angle
         if not joint and 'q1' in names:
             assumed.append('joint values in rad (--joint-angle)')
         if assumed:
             self.notes.append(f'no units are given: taking {", ".join(assumed)}')
         return LENGTHS[length or 'm'], ANGLES[angle or 'rad'], ANGLES[joint or 'rad']
+
+    def _said(self, units: Mapping[str, float], ours: Sequence[str]) -> str:
+        """Return the unit that the names of some of our columns end with: `X [mm]`, or empty."""
+        expressions = [each for name, each in self._expressions.items() if name in ours]
+        named = {name for each in expressions for name in each.names}
+        found = {UNIT.sub(r'\1', self._called(name).replace('°', 'deg')) for name in named}
+        return found.pop() if len(found) == 1 and found <= {*units} else ''
 
     def _factor(self, ours: str, units: tuple[float, float, float]) -> float:
         length, angle, joint = units
@@ -243,6 +265,17 @@ class _Table:
             prismatic = chain is not None and chain.joints[int(ours[1:]) - 1].type == 'prismatic'
             return length if prismatic else joint
         return 1.0
+
+
+def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
+    """Return a column that names the poses of both, if any, and the row in the log of each."""
+    for name in table.header:
+        if name in log.header:
+            named, logged = table.cells(name), log.cells(name)
+            rows = {cell: row for row, cell in enumerate(logged)}
+            if len(rows) == len(logged) and len({*named}) == len(named) and {*named} <= {*rows}:
+                return name, np.array([rows[cell] for cell in named])
+    return '', np.arange(len(log.lines))
 
 
 def _bare(name: str) -> str:

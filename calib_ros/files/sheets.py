@@ -225,7 +225,9 @@ def _header(
     """Return the row index of the header, and its names; -1 if there is none."""
     wanted = {name for name in names if not name.startswith('#')}
     low = {name.lower() for name in known}
-    best: tuple[int, set[str]] = (0, wanted)
+    words = [sum(not _is_number(c, ',') for c in cells if c) for _, cells in rows[:HEAD_LINES]]
+    likely = words.index(max(words))  # title and data have fewer
+    best: tuple[int, set[str]] = (likely, wanted)
     for k, (_, cells) in enumerate(rows[:HEAD_LINES]):
         missing = wanted - set(cells)
         if wanted and not missing:
@@ -235,7 +237,7 @@ def _header(
         if len(missing) < len(best[1]):
             best = (k, missing)
     if not wanted:
-        return (-1, ()) if names else (0, tuple(rows[0][1]))
+        return (-1, ()) if names else (likely, tuple(rows[likely][1]))
     found = ', '.join(f'"{cell}"' for cell in rows[best[0]][1] if cell)
     raise InputError(
         f'{path} has no column {", ".join(sorted(best[1]))}; line {rows[best[0]][0]} has {found}'

@@ -24,6 +24,7 @@ from calib_ros.fleet.run import Run, page_path, results, too_late, verifications
 from calib_ros.fleet.watch import Change, Watched, watch
 from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MISSING, State, filled, plotly_script
+from calib_ros.shown import some
 
 STATES: Mapping[str, tuple[State, str]] = {
     'changed': ('bad', 'the arm differs from earlier nights'),
@@ -109,10 +110,10 @@ class Standing:
         """Return reasons to look at the robot or its calibration."""
         found = list(self.alarms)
         if self.last is not None and not self.last.accepted:
-            found.append(f'not accepted: {"; ".join(self.last.reasons)}')
+            found.append(f'not accepted: {"; ".join(some(self.last.reasons, 1))}')
         if self.last is not None and self.share > 1.0:
             wanted = self.robot.tolerance
-            found.append(f'beyond tolerance: {self.last.rms_mm:.3f} mm, {wanted:g} mm are wanted')
+            found.append(f'beyond tolerance: {self.last.rms_mm:.3f} mm, wanted {wanted:g} mm')
         return tuple(found)
 
     @property

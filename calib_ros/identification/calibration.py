@@ -30,7 +30,7 @@ import numpy as np
 import calib_ros
 from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
-from calib_ros.errors import ConfigError, UnknownNameError
+from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
@@ -89,7 +89,10 @@ class Calibration(Shown):
         owners: Mapping[str, records.Owner] | None = None,
         fitted: Sequence[Observations] = (),
     ) -> Calibration:
-        """Return the calibration of an identification; `origin` describes the `fitted` samples."""
+        """Return the calibration of an identification; `origin` describes the measurements.
+
+        `verify` recognises the `fitted` ones, and cannot pass on them.
+        """
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # as in the file
@@ -141,6 +144,19 @@ class Calibration(Shown):
         if self.rows is not None:
             record['rows'] = self.rows.document()
         return HEAD + dump_chain(self.chain, record)
+
+    def serial_of(self, where: str, serial: str = '') -> str:
+        """Return the serial number of the robot, empty if unknown.
+
+        Raises InputError if another `serial` is given; `where` names the calibration.
+        """
+        own = str(self.record.get('robot_serial') or '')
+        if own and serial and serial != own:
+            raise InputError(
+                f'{where} is the calibration of the robot with serial "{own}"; this one is '
+                f'"{serial}"'
+            )
+        return serial or own
 
     def removed(self, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the correction at joint values (N, n): distance (N,) [m] and angle (N,) [rad]."""

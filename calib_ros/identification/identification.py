@@ -42,7 +42,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import Notify, quiet, share_of
-from calib_ros.settings import EXCEPTION
+from calib_ros.settings import EXCEPTION, effects_of
 
 
 @np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a diverging fit
@@ -208,11 +208,11 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
 
     If the chosen model cannot be fitted, or is refused although the geometric one is not, the
     geometric result is returned with the verdicts and a remark. An exception from `progress` ends
-    the work.
+    the work. Raises UnknownNameError for another model.
     """
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
-        return identify(problem, progress=progress)
+        return identify(replace(problem, effects=effects_of(model)), progress=progress)
     poses = max(1, sum(map(len, problem.sets)))
     columns = 2 * len(HARMONICS) * len(problem.chain.joints)
     fit, tried = len(problem.free) * poses, columns * min(poses, COMPARED)

@@ -24,7 +24,7 @@ from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
-TYPED = re.compile(r'(?<![\w-])--[a-z][a-z0-9-]*|calib_ros [a-z0-9]+(?![\w])')
+TYPED = re.compile(r'(?<![\w-])--[a-z][a-z0-9-]*( auto)?|calib_ros [a-z0-9]+(?![\w])')
 """An option or a command."""
 MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '

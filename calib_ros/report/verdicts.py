@@ -133,16 +133,23 @@ def hints(found: Verification) -> list[str]:
         )
     if found.verdict == 'does not hold':
         lines.append('the error has grown since the calibration was made')
-    if found.common < NEARER:
+    rms = 1e-3 * found.comparison.figures[1].rms_mm
+    if found.odd is not None and found.each:
+        lines.append(
+            f'pose {found.odd + 1} alone is {rounded(found.each[found.odd].after)} mm off; the '
+            'others are within the limit: measure it again'
+        )
+    elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
+        lines.append(
+            'no arm is so far off: check units and columns of the measurements (--length, '
+            '--joint-angle, --columns), their rows, the robot, whether the device (--new-base) or '
+            'the target (--new-tool) was moved'
+        )
+    elif found.common < NEARER:
         lines.append(
             'without one common shift and turn of all positions, only '
             f'{100.0 * found.common:.2g} % of the error would remain: was the measuring device '
             'moved? If on purpose, --new-base fits its frame, and --new-tool that of a new target'
-        )
-    elif 1e-3 * found.comparison.figures[1].rms_mm > Settings.largest_error:
-        lines.append(
-            'no arm is so far off: check units and columns of the measurements (--length, '
-            '--joint-angle, --columns), their rows, the robot, and the target (--new-tool)'
         )
     return lines
 
@@ -159,12 +166,13 @@ def verification_report(
     if found.fitted:
         text.append('The interval allows for the refitted frames.')
     if found.limit is not None:
-        names = ('Tolerance', 'PASS', 'FAIL')
+        names = ('Tolerance', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
         if found.tolerance is None:
-            names = (f'{ALIKE:g} times the former error', 'it holds', 'it no longer holds')
-        what, good, bad = names
+            size = rounded(1e3 * found.limit)
+            names = (f'{ALIKE:g} times the former error', size, 'it holds', 'it no longer holds')
+        what, size, good, bad = names
         text.append(
-            f'{what}: {rounded(1e3 * found.limit)} mm. If the whole interval is within it: '
+            f'{what}: {size} mm. If the whole interval is within it: '
             f'{good}; beyond it: {bad}; else UNDECIDED.'
         )
     text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))

@@ -176,12 +176,7 @@ class Keeper:
             )
         text = _calibration_text(path)
         calibration = parse_calibration(text, str(path), session.chain, session.settings)
-        serial, ours = calibration.record.get('robot_serial'), self._given.serial
-        if serial and ours and serial != ours:
-            raise InputError(
-                f'{path} is the calibration of the robot with serial "{serial}"; this one is '
-                f'"{ours}"'
-            )
+        calibration.serial_of(str(path), self._given.serial)
         self.adopt(calibration, Published(text, ''))
         return path
 

@@ -218,6 +218,25 @@ def test_what_no_arm_can_be_off_is_of_other_units(cell, arm, program, scale, tol
     assert ('check units and columns of the measurements (--length' in text) is told
 
 
+def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm):
+    far = with_errors(arm, 30.0 + np.random.default_rng(0).normal(scale=0.1, size=(9, 3)))
+    text = in_words(found := verify(arm, [far], 1e-3))
+    assert found.common < 0.1
+    assert 'no arm is so far off' in text
+    assert 'was the measuring device moved' not in text
+
+
+def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):
+    errors = np.random.default_rng(0).normal(scale=1e-5, size=(9, 3))
+    errors[4] += [0.0, 0.01, 0.0]
+    text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
+    assert (found.verdict, found.odd) == ('FAIL', 4)
+    assert 'pose 5 alone is 9.99' in text
+    for fine in (errors[:4], errors * 0.0):
+        assert verify(arm, [with_errors(arm, np.tile(fine, (2, 1)))], 1e-4).odd is None
+    assert verify(arm, [with_errors(arm, errors[2:7])], 1e-4).odd is None  # too few others
+
+
 def test_repeats_do_not_count_as_more_configurations(arm):
     errors = np.random.default_rng(0).normal(scale=1e-4, size=(6, 3))
     once = with_errors(arm, errors)

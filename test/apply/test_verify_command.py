@@ -2,12 +2,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """From test poses to the verdict on the command line."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from designs import design_of
 from measured import rows_of, write_csv
 from verified import UR, in_words, measured
 
+from calib_ros import load_calibration
 from calib_ros.apply.candidates import Visibility
 from calib_ros.apply.verification import verify
 from calib_ros.cli.common import Status
@@ -92,3 +95,17 @@ def test_measurements_that_were_fitted_prove_nothing(cell, arm, folder, run):
             assert ('to which the calibration was fitted' in ' '.join(text.split())) is warned
             assert ('PASS: the calibration' in text) is not warned
         assert '| mean + 3 sigma' in files[1].read_text()
+
+
+def test_the_serial_number_comes_with_the_calibration(cell, folder, run):
+    """The page did not say which robot was verified, and another's calibration was used."""
+    seen = measured(cell[0], UR.random_joints(6, np.random.default_rng(3)))
+    write_csv(folder / 'measured.csv', rows_of(seen, 0))
+    arm = load_calibration(folder / 'result')
+    named = replace(arm, record={**arm.record, 'robot_serial': '0007'})
+    (folder / 'result' / 'calibration.yaml').write_text(named.dump())
+    status, _, err = run(*VERIFY, 'result', '--serial', '0008')
+    assert status == 1
+    assert 'result is the calibration of the robot with serial "0007"; this one is "0008"' in err
+    run(*VERIFY, 'result', '--out', 'verified')
+    assert '- Serial number: 0007\n' in (folder / 'verified' / 'report.md').read_text()

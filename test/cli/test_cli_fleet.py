@@ -190,7 +190,7 @@ def test_a_fleet_with_a_bumped_and_a_damaged_robot(folder, capsys):
     assert said.count('- B, ') == 2
     for serial in ('A', 'B', '<C>'):
         assert f'- {serial}, beyond tolerance: 0.' in said
-    assert said.endswith(' mm, 0.01 mm are wanted\n')
+    assert said.endswith(' mm, wanted 0.01 mm\n')
 
     assert main([*quiet, '--metrics', 'none/calib.prom']) == 1  # but alarms are told
     told = capsys.readouterr()

@@ -129,6 +129,7 @@ def test_the_help_of_a_command(shown, name):
     ('given', 'wrong'),
     [
         (('plan', '--chain', 'ur5e', '--pose', '9', '--otu', 'x'), 'option "--otu": did you mean'),
+        (('identify', 'x.csv', '--chian', 'ur5e'), 'option "--chian": did you mean "--chain"?'),
         (('bag2csv', 'bag', 't.csv', '--chain', 'ur5e', '--xyz'), 'unknown option "--xyz"\n'),
         (('robots', 'ur5e'), 'unexpected argument "ur5e"'),
         (('chain',), 'required: ROBOT'),
@@ -266,7 +267,9 @@ def test_a_result_on_a_terminal(shown, monkeypatch, name):
 def test_quiet_says_nothing_but_what_is_asked_for(shown):
     assert shown('identify', 'measured.csv', *UR5E, '--quiet') == (0, '')
     assert shown('identify', 'measured.csv', *UR5E, '--quiet', '--json')[1].startswith('{')
-    assert shown('identify', 'good_arm.csv', *UR5E, '--quiet') == (3, '')
+    status, text = shown('identify', 'good_arm.csv', *UR5E, '--quiet')
+    assert (status, text.count('\n')) == (3, 1)
+    assert text.startswith('calib_ros: NOT accepted, ')
 
 
 def test_names_of_others_bring_no_escape_codes(shown):

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from test_foreign import JOINTS, PLACES, text_of
 
-from calib_ros import Chain, Settings
+from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files import loading
-from calib_ros.files.layouts import Expression, layout_of, load_layout, presets
+from calib_ros.files.foreign import Foreign
+from calib_ros.files.layouts import Expression, Layout, layout_of, load_layout, presets
 from calib_ros.kinematics.chain import Joint
 
 
@@ -109,3 +110,29 @@ def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, name
     with pytest.raises(InputError) as told:
         loading.table(path, Chain('arm', 'standard', joints), Settings())
     assert str(told.value).endswith(proposed)
+
+
+def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_header(tmp_path):
+    """Of a tracker and a controller: other orders, a pose not measured, decimal commas."""
+    log = 'Robot 7\n24.11.2026;noon\nPoint;Date;J1 [°];J2 [°]\n'
+    log += ''.join(f'P{k};24.11.2026;{10 * k},0;{k},5\n' for k in range(1, 5))
+    points = 'Points\n\nPoint;X [mm];Y [mm];Z [mm]\n'
+    points += ''.join(f'P{k};{100 * k},5;0,0;1,0\n' for k in (4, 1, 3))
+    (tmp_path / 'log.csv').write_text(log)
+    (tmp_path / 'points.csv').write_text(points)
+    unnamed = Foreign(
+        Layout(), Chain('arm', 'standard', (Joint('a'), Joint('b'))), tmp_path / 'log.csv'
+    )
+    with pytest.raises(InputError, match=r'"q\*=\{J\* \[°\]\}"'):
+        unnamed.convert(tmp_path / 'points.csv')
+    columns = {'q1': '{J1 [°]}', 'q2': '{J2 [°]}', 'x': '{X [mm]}', 'y': '{Y [mm]}'}
+    layout = Layout(columns={**columns, 'z': '{Z [mm]}'})
+    given = Foreign(layout, None, tmp_path / 'log.csv', layout)
+    (found,) = (table := read_table(tmp_path / 'points.csv', 2, foreign=given)).fitted
+    np.testing.assert_allclose(np.rad2deg(found.joints), [[40, 4.5], [10, 1.5], [30, 3.5]])
+    np.testing.assert_allclose(found.positions[:, 0], [0.4005, 0.1005, 0.3005])
+    assert 'by the column "Point"' in ' '.join(table.warnings)
+    assert 'no units' not in ' '.join(table.warnings)
+    (tmp_path / 'log.csv').write_text(log.replace('P4', 'P3'))
+    with pytest.raises(InputError, match=r'has 4 rows, .* has 3: give both a column of the same'):
+        read_table(tmp_path / 'points.csv', 2, foreign=given)

@@ -167,13 +167,14 @@ def test_a_model_is_named_in_the_settings(rng):
     unseen = UR10E.random_joints(300, rng)
     errors = {}
     for model in ('geometric', 'ratio', 'ratio+eccentricity'):
-        options = Settings(model=model).for_problem()
-        result = identify_model(Problem(UR10E, seen, **options), model)
+        result = identify_model(Problem(UR10E, seen), model)
         assert chosen(result) == (set() if model == 'geometric' else set(model.split('+')))
         assert result.verdicts == ()
         errors[model] = rms(result.chain, true, unseen)
     assert errors['ratio+eccentricity'] < 0.5 * errors['ratio']
     assert errors['ratio'] < errors['geometric']
+    with pytest.raises(UnknownNameError, match='unknown model "foo"'):
+        identify_model(Problem(UR10E, seen), 'foo')
     with pytest.raises(UnknownNameError, match='ratio') as caught:
         Problem(UR10E, seen, **Settings(model='ratio+excentricity').for_problem())
     assert caught.value.name == 'excentricity'
