@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
+from calib_ros.apply.verification import Verdict
 from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason, Rule
@@ -73,13 +74,12 @@ class Filer:
         self,
         session: CalibrationSession,
         figures: tuple[ErrorFigures, ErrorFigures],
-        holds: bool | None,
+        verdict: Verdict,
     ) -> str:
         """File the validation of a session's calibration, as `identified`."""
         calibration = session.calibration
         assert calibration is not None  # required for the figures
         chain = calibration.chain
-        verdict = {True: 'holds', False: 'does not hold', None: 'UNDECIDED'}[holds]
 
         def row() -> Row:
             about = self._about(session.problem(), session.settings, table_hash(chain))

@@ -293,8 +293,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         found = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # required to judge
-        holds, text = words.verdict(calibration, found, self.session.reused())
-        return bool(holds), text + self._filer.validated(self.session, found.figures, holds)
+        verdict, text = words.verdict(calibration, found, self.session.reused())
+        filed = self._filer.validated(self.session, found.figures, verdict)
+        return verdict == 'holds', text + filed
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found

@@ -217,7 +217,8 @@ def test_samples_that_were_fitted_are_known_again():
     made.identify()
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
-    words = verdict(made.calibration, made.validate(), made.reused())[1]
+    found, words = verdict(made.calibration, made.validate(), made.reused())
+    assert found == 'no verdict'
     assert 'these are measurements to which the calibration was fitted' in words
 
 
