@@ -23,6 +23,7 @@ from calib_ros.errors import (
     LONGEST,
     CalibrationError,
     ConfigError,
+    InputError,
     TooFewObservationsError,
     shortened,
 )
@@ -47,6 +48,7 @@ from calib_ros.report import words
 from calib_ros.report.reports import reasons_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
+from calib_ros.ros.inputs import Inputs
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.hints import too_much_lost
 from calib_ros.sampling.sample import Sample, named
@@ -156,14 +158,18 @@ class Identifying:
         self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused
 
-    def snapshot(self, topics: Sequence[str]) -> Snapshot:
+    def snapshot(self, inputs: Inputs) -> Snapshot:
         """Return the current problem and its context."""
         session, self._advice, self._report = self._session, '', None
-        problem = session.problem()
+        try:
+            problem = session.problem()
+        except InputError as err:
+            why = [] if session.samples else inputs.failures
+            raise InputError('; '.join((*why, str(err)))) from err
         samples = tuple(session.usable)
         origin = {
             'robot_serial': self._filer.serial,
-            'topics': topics,
+            'topics': inputs.topics,
             'first_stamp_ns': min(sample.stamp_ns for sample in samples),
             'last_stamp_ns': max(sample.stamp_ns for sample in samples),
             'samples': len(samples),

@@ -190,8 +190,8 @@ def test_capture_takes_one_sample_when_it_is_asked_to(tmp_path, recording):
         (path,) = tmp_path.glob('*Z.csv')
         assert path.read_text().splitlines()[-1].endswith(',plate A,1,')
         cell.done('remove_last')
-        cell.node.set_parameters([Parameter('socket', value='A')])
-        assert 'socket must be LOCATION/SOCKET' in cell.call('capture').message
+        (refused,) = cell.node.set_parameters([Parameter('socket', value='A')])
+        assert 'socket must be LOCATION/SOCKET' in refused.reason
         cell.node.set_parameters([Parameter('socket', value='')])
         cell.play({'joint_states': joints[28:40], 'measured_pose': poses[4:5]})
         assert 'the arm has not been still for 0.2 s yet' in cell.refused('capture').message
