@@ -91,7 +91,7 @@ def chain_from_urdf(
     x, y, z = (_clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
     led = [(joint.name, joint.follows) for joint in moving if joint.follows]
-    couplings = {f'{name}.coupling_{leader}': ratio for name, (leader, ratio) in led}
+    couplings = {f'{name}.coupling_{leader}': ratio for name, (leader, ratio, _) in led}
     chain = chain.with_effect_values(couplings)
     ends = _ends(chain)
     return replace(

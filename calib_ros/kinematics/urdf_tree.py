@@ -12,7 +12,7 @@ import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from xml.parsers import expat
 
 import numpy as np
@@ -38,7 +38,7 @@ _DOCTYPE = re.compile(r'<!DOCTYPE|<!ENTITY', re.IGNORECASE)
 class DescribedJoint:
     """A joint of a URDF; `axis` is a unit vector in its frame, zero if fixed.
 
-    It `follows` another joint, times a multiplier, if it mimics one. Its limits then are equal.
+    It `follows` another joint, times a multiplier and plus an offset, if it mimics one.
     """
 
     name: str
@@ -49,7 +49,7 @@ class DescribedJoint:
     axis: FloatArray
     lower: float | None
     upper: float | None
-    follows: tuple[str, float] | None
+    follows: tuple[str, float, float] | None
 
     @property
     def moves(self) -> bool:
@@ -68,6 +68,9 @@ class Description:
 
     def path(self, base: str | None, tip: str | None) -> tuple[DescribedJoint, ...]:
         """Return the joints from one link to another: by default from the root to the arm's end.
+
+        Of joints that mimic one that is not among them, the first one leads the others. A joint
+        that follows has equal limits.
 
         Raises ConfigError if no serial chain of joints connects them.
         """
@@ -89,17 +92,36 @@ class Description:
         path.reverse()
         if not any(joint.moves for joint in path):
             raise ConfigError(f'no joint moves between link "{base}" and link "{tip}"')
-        driven = [joint.name for joint in path if joint.moves and not joint.follows]
         for joint in path:
-            lost = joint.follows is not None and joint.follows[0] not in driven
-            does = 'mimics another' if lost else f'is {joint.type}'
-            if lost or joint.type in ('floating', 'planar'):
+            if joint.type in ('floating', 'planar'):
                 raise ConfigError(
-                    f'joint "{joint.name}" {does}: a serial chain has revolute, continuous, '
-                    'prismatic and fixed joints only, driven by themselves or another of them; '
-                    'choose base_link and tip_link on one side of it'
+                    f'joint "{joint.name}" is {joint.type}: a serial chain has revolute, '
+                    'continuous, prismatic and fixed joints only; choose base_link and tip_link '
+                    'on one side of it'
                 )
-        return tuple(path)
+        leaders = {each.name: (each.name, 1.0, 0.0) for each in path if not each.follows}
+        return tuple(self._led(joint, leaders) if joint.follows else joint for joint in path)
+
+    def _led(
+        self, joint: DescribedJoint, leaders: dict[str, tuple[str, float, float]]
+    ) -> DescribedJoint:
+        """Return a joint as it follows one of the `leaders`, or as the leader of its master."""
+        known = {each.name: each for each in self.joints}
+        master, ratio, offset = joint, 1.0, 0.0
+        passed = []
+        while master.follows:
+            passed.append(master.name)
+            name, times, more = master.follows
+            if name not in known:
+                raise UnknownNameError(f'joint that "{master.name}" mimics', name, known)
+            if name in passed or not times:
+                raise ConfigError(f'joint "{joint.name}" mimics itself, or another times zero')
+            master, ratio, offset = known[name], ratio * times, offset + ratio * more
+        leader, one, before = leaders.setdefault(master.name, (joint.name, ratio, offset))
+        if leader == joint.name:
+            return replace(joint, follows=None)
+        offset -= ratio / one * before
+        return replace(joint, lower=offset, upper=offset, follows=(leader, ratio / one, offset))
 
     def _usual_tip(self, base: str) -> str:
         behind, moved = {base}, set()
@@ -231,11 +253,11 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     follows, mimic = None, element.find('mimic')
     if mimic is not None and kind in MOVING:
         of = f'mimic of {where}'
-        ratio, lower = (
+        ratio, offset = (
             float(_numbers(mimic, key, of, default, 1)[0])
             for key, default in (('multiplier', '1'), ('offset', '0'))
         )
-        follows, upper = (mimic.get('joint', ''), ratio), lower
+        follows = mimic.get('joint', ''), ratio, offset
     origin = _origin(element, where)
     return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, follows)
 

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib_ros.apply.confidence import interval_of
+from calib_ros.apply.verification import Verdict
 from calib_ros.decision.changes import FALSE, changes_in_words
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.misfits import Outlier
@@ -167,25 +168,27 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
 
 def verdict(
     calibration: Calibration, found: Comparison, reused: float = 0.0
-) -> tuple[bool | None, str]:
+) -> tuple[Verdict, str]:
     """Return whether a calibration holds on samples, of which a share is `reused`, and why.
 
-    None if the interval of the error contains the limit, as for `verify`.
+    By the rule of `verify`: undecided if the interval of the error contains the limit.
     """
     nominal, now = found.figures
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
-    if warning := reused_in_words(reused):
-        text += f'; {warning}'
     if calibration.residual is None:
-        return True, text
+        text = f'no verdict, the calibration has no former error: {text}'
+        return 'no verdict', f'{text}; judge with calib_ros verify --tolerance'
     least, most = _least_and_most(found, 1)
     if not calibration.holds(least):
-        return False, _lost(calibration, text)
+        return 'does not hold', _lost(calibration, text)
     text += f'; it had {1e3 * calibration.residual:.3f} mm'
+    if warning := reused_in_words(reused):
+        return 'no verdict', f'no verdict: {warning}; RMS {now.rms_mm:.3f} mm'
     if not calibration.holds(most):
-        return None, f'too few poses to tell whether the calibration holds: {text}; measure more'
-    return True, f'the calibration holds: {text}'
+        text = f'too few poses to tell whether the calibration holds: {text}; measure more'
+        return 'UNDECIDED', text
+    return 'holds', f'the calibration holds: {text}'
 
 
 def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:

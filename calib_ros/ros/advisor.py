@@ -7,7 +7,7 @@
     ~/joint_trajectory   -> ~/compensated_joint_trajectory
 
 All is computed on one separate thread, in pieces, while messages are taken. On one core the next
-pose takes about 15 ms, the cloud 60 ms, 10,000 points of a trajectory 0.1 s, and 0.3 s with
+pose takes about 15 ms, the cloud 0.3 s, 10,000 points of a trajectory 0.1 s, and 0.3 s with
 velocities.
 """
 
@@ -49,7 +49,7 @@ from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 
-CLOUD = 10 * MOST_ENTRIES  # points of the error cloud (60 ms)
+CLOUD = 10 * MOST_ENTRIES  # points of the error cloud (0.3 s)
 MOST_POINTS = Settings.pose_buffer  # points of a trajectory; longer ones are refused
 MOST_SIZE = 400 * MOST_POINTS
 """Bytes of a serialised trajectory: ten joints with all rates take 352 a point."""

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
+from calib_ros.apply.verification import Verdict
 from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason, Rule
@@ -22,6 +23,7 @@ from calib_ros.errors import (
     LONGEST,
     CalibrationError,
     ConfigError,
+    InputError,
     TooFewObservationsError,
     shortened,
 )
@@ -46,6 +48,7 @@ from calib_ros.report import words
 from calib_ros.report.reports import reasons_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
+from calib_ros.ros.inputs import Inputs
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.hints import too_much_lost
 from calib_ros.sampling.sample import Sample, named
@@ -73,13 +76,12 @@ class Filer:
         self,
         session: CalibrationSession,
         figures: tuple[ErrorFigures, ErrorFigures],
-        holds: bool | None,
+        verdict: Verdict,
     ) -> str:
         """File the validation of a session's calibration, as `identified`."""
         calibration = session.calibration
         assert calibration is not None  # required for the figures
         chain = calibration.chain
-        verdict = {True: 'holds', False: 'does not hold', None: 'UNDECIDED'}[holds]
 
         def row() -> Row:
             about = self._about(session.problem(), session.settings, table_hash(chain))
@@ -156,14 +158,18 @@ class Identifying:
         self._advice = ''  # of the last identification, most serious first
         self._report: Path | None = None  # of the last identification, if it was refused
 
-    def snapshot(self, topics: Sequence[str]) -> Snapshot:
+    def snapshot(self, inputs: Inputs) -> Snapshot:
         """Return the current problem and its context."""
         session, self._advice, self._report = self._session, '', None
-        problem = session.problem()
+        try:
+            problem = session.problem()
+        except InputError as err:
+            why = [] if session.samples else inputs.failures
+            raise InputError('; '.join((*why, str(err)))) from err
         samples = tuple(session.usable)
         origin = {
             'robot_serial': self._filer.serial,
-            'topics': topics,
+            'topics': inputs.topics,
             'first_stamp_ns': min(sample.stamp_ns for sample in samples),
             'last_stamp_ns': max(sample.stamp_ns for sample in samples),
             'samples': len(samples),

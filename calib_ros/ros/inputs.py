@@ -102,6 +102,8 @@ class Inputs:
         self._node, self._guarded = node, guarded
         self._topics: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
+        self.failures: list[str] = []
+        """Why topics give nothing, as text, at the last look."""
         self._inputs = dict(self._subscribe(stream) for stream in streams)
         self._events = dict.fromkeys((e for each in self._inputs for e in each.event_handlers), 0)
 
@@ -126,7 +128,7 @@ class Inputs:
         return [topic for topic, hearing in self._topics.items() if hearing.count]
 
     def look(self) -> None:
-        """Note losses, silence and rates since the last look."""
+        """Note losses, silence, rates and failures since the last look."""
         for event, known in self._events.items():
             event.add_to_wait_set(_Due())
             event.is_ready(_Due())
@@ -138,27 +140,23 @@ class Inputs:
         span, self._looked_at = now - self._looked_at, now
         for hearing in self._topics.values():
             hearing.look(now, span)
-
-    @property
-    def silent(self) -> list[str]:
-        """Return which topics have become silent, as text."""
-        silent = [topic for topic, hearing in self._topics.items() if hearing.silent]
-        return [f'no more messages on {topic}' for topic in silent]
+        topics = self._topics.items()
+        self.failures = [f'no more messages on {topic}' for topic, each in topics if each.silent]
+        self.failures += [
+            f'{topic} is published {each.deaf} is asked for'
+            for topic, each in topics
+            if each.deaf and not each.count
+        ]
+        self.failures += self._of_other_types()
+        streams = [stream for stream, _ in self._inputs.values()]
+        self.failures += [words for links in links_of(streams) for words in links.problems()]
 
     def troubles(self) -> list[str]:
         """Return problems of topics as text."""
-        wrong = self.silent + [
-            f'{topic} is published {hearing.deaf} is asked for'
-            for topic, hearing in self._topics.items()
-            if hearing.deaf and not hearing.count
-        ]
-        wrong += self._of_other_types()
-        streams = [stream for stream, _ in self._inputs.values()]
-        wrong += [words for links in links_of(streams) for words in links.problems()]
         losing = [topic for topic, hearing in self._topics.items() if hearing.losing]
-        if losing:
-            wrong.append(f'messages are lost on {", ".join(losing)}')
-        return wrong
+        if not losing:
+            return self.failures
+        return [*self.failures, f'messages are lost on {", ".join(losing)}']
 
     def figures(self) -> dict[str, Any]:
         """Return the diagnostics of each topic."""

@@ -47,7 +47,7 @@ from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.gathered import check_settings
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
-from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sample import Sample, socket_place
 from calib_ros.sampling.session import CalibrationSession
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
@@ -131,7 +131,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             self.create_service(kind, name, self._answering(name, callback))
         identify = self._identifying
         slow: tuple[tuple[str, Callable[[], Any], Callable[[Any], Answer]], ...] = (
-            ('~/identify', lambda: identify.snapshot(self._inputs.topics), identify.run),
+            ('~/identify', lambda: identify.snapshot(self._inputs), identify.run),
             ('~/export', self._keeper.exportable, self._keeper.export),
             ('~/save', self._keeper.to_save, self._on_save),
             ('~/check', self.session.recent, self._on_check),
@@ -169,11 +169,13 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return documents.configuration_yaml(given.chain, self.session.settings, **more)
 
     def _check_parameters(self, changes: Sequence[Any]) -> SetParametersResult:
-        """Refuse settings that no identification could use, and forbidden files."""
+        """Refuse settings that no identification could use, forbidden files, and sockets."""
         try:
             for each in changes:
                 if each.name in FILENAMES:
                     self._keeper.file_of(each.name, each.value)
+                if each.name == 'socket' and each.value:
+                    socket_place(each.value)
             check_settings(self.session.chain, changed(self.session.settings, changes))
         except CalibrationError as err:
             return SetParametersResult(successful=False, reason=str(err))
@@ -293,8 +295,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         found = self.session.validate()
         calibration = self.session.calibration
         assert calibration is not None  # required to judge
-        holds, text = words.verdict(calibration, found, self.session.reused())
-        return bool(holds), text + self._filer.validated(self.session, found.figures, holds)
+        verdict, text = words.verdict(calibration, found, self.session.reused())
+        filed = self._filer.validated(self.session, found.figures, verdict)
+        return verdict == 'holds', text + filed
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
@@ -341,7 +344,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         words = self.session.status(str(self._identifying.progress))
         trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
         state, _, rest = words.partition('; ')
-        text = '; '.join((f'{trouble} {state}', *self._inputs.silent, rest))
+        text = '; '.join((f'{trouble} {state}', *self._inputs.failures, rest))
         text = textwrap.shorten(text, STATUS_LENGTH, placeholder=' ...')
         if text != self._status_text:
             self._status_text = text

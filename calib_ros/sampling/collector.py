@@ -58,6 +58,7 @@ class Collector:
         self._settled_ns = 0  # measurements before this are settled
         self._sampled_ns = 0  # a stop at this moment has been sampled
         self.rests = Rests(settings.pose_buffer)
+        self.unmeasured = 0  # stops without a measurement since the last one with any
         self._backwards = 0
         self.delay_ns = round(settings.delay * 1e9)
         """Delay of measurement stamps after joint stamps."""
@@ -314,6 +315,7 @@ class Collector:
         ends, calm = np.array(plan.ends), np.array(plan.begins) + settle
         wanted = np.array([not why for why in plan.why], dtype=bool)
         found: list[Numbered] = []
+        measured: set[int] = set()
         for key, rows in sorted(self.waiting.items()):
             stamps = rows.stamps - self.delay_ns
             due = int(np.searchsorted(stamps, plan.done_ns, 'right')) if plan.ends else 0
@@ -335,13 +337,16 @@ class Collector:
                 if key.images and more:
                     self.unused['measurements: another image of a stop that has one'] += more
                 motion = self.track.at(stamps[good], standing=not moving)
-                measured = Found(key, numbers[good], rows.stamps[good], rows.values[good])
-                begins = np.flatnonzero(np.diff(measured.numbers, prepend=-1))
+                measured.update(numbers[good].tolist())
+                seen = Found(key, numbers[good], rows.stamps[good], rows.values[good])
+                begins = np.flatnonzero(np.diff(seen.numbers, prepend=-1))
                 begins = np.arange(len(good)) if moving else begins
                 approach = self.track.approach(stamps[good[begins]], motion.joints[begins])
                 delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
-                found += self.maker.samples(measured, motion, begins, approach, delay, sigma)
+                found += self.maker.samples(seen, motion, begins, approach, delay, sigma)
             rows.release(due)
+        for stop in () if moving else plan.stops:
+            self.unmeasured = 0 if stop in measured else self.unmeasured + 1
         self.maker.add(found)
 
     def forget(self, sample: Sample) -> None:

@@ -65,18 +65,32 @@ class JointNames:
 
 
 class FrameNames:
-    """Frames in which each device has measured; each should have one."""
+    """Frames in which each device has measured; each should have one: the `wanted` one if any."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: str = '') -> None:
+        self.wanted = wanted
         self._known: dict[str, Counter[str]] = {}
         self.usual: dict[str, str] = {}
         """The usual frames of devices with more than a few measurements."""
 
-    def fault(self, device: str, frame_id: str, wanted: str, count: int) -> str:
+    def required(self, device: str) -> str:
+        """Return the frame wanted of a device; none if only others have measured in it."""
+        known = self._known.get(device, ())
+        elsewhere = self.wanted not in known and any(
+            self.wanted in others for others in self._known.values()
+        )
+        return '' if elsewhere else self.wanted
+
+    def decides(self, device: str, frame_id: str) -> bool:
+        """Tell whether measurements are the first ones of a device in the wanted frame."""
+        return frame_id == self.wanted != '' and frame_id not in self._known.get(device, ())
+
+    def fault(self, device: str, frame_id: str, count: int) -> str:
         """Note the frame of some measurements; return why it cannot be used, or empty text.
 
-        Only the frame `wanted` can, or else the usual one.
+        Only the required frame can, or else the usual one.
         """
+        wanted = self.required(device)
         if wanted and frame_id != wanted:
             return f'in frame "{frame_id}", not in frame_id "{wanted}"'
         if not frame_id.isprintable():  # it is written to tables
@@ -97,9 +111,10 @@ class FrameNames:
         return True
 
     def main(self, device: str) -> str | None:
-        """Return the usual frame of a device, or the most frequent one so far."""
+        """Return the required or usual frame of a device, or the most frequent one so far."""
         known = self._known.get(device)
-        return self.usual.get(device) or (max(known, key=known.__getitem__) if known else None)
+        found = self.required(device) or self.usual.get(device)
+        return found or (max(known, key=known.__getitem__) if known else None)
 
     @property
     def several(self) -> bool:
@@ -109,8 +124,9 @@ class FrameNames:
     @property
     def different(self) -> tuple[str, ...]:
         """Return the different frames of one device, but for a few measurements; empty if none."""
-        for known in self._known.values():
-            if known.total() - max(known.values()) > EXCEPTION * known.total():
+        for device, known in self._known.items():
+            few = known.total() - max(known.values()) <= EXCEPTION * known.total()
+            if not few and not self.required(device):
                 return tuple(sorted(known))
         return ()
 
@@ -139,11 +155,11 @@ class Entry:
         self.refused: dict[str, str] = {}  # why the last messages of a kind cannot be used
         self.latest: tuple[int, Sequence[float]] | None = None
 
-    def pieces(self, parts: Sequence[Part], recording: bool, wanted: str) -> list[Piece]:
-        """Return the messages to keep, measurements only in the frame `wanted` if given."""
+    def pieces(self, parts: Sequence[Part], recording: bool) -> list[Piece]:
+        """Return the messages to keep."""
         joints = [each for each in parts if each.source is None]
         measured = [each for each in parts if each.source is not None]
-        return [*self._joints(joints, recording), *self._measured(measured, recording, wanted)]
+        return [*self._joints(joints, recording), *self._measured(measured, recording)]
 
     def miss(self, kind: str, count: int, cause: str) -> None:
         """Count received messages that cannot be used."""
@@ -185,7 +201,7 @@ class Entry:
             else:
                 self.unused['joints: not recording'] += len(stamps)
 
-    def _measured(self, parts: Sequence[Part], recording: bool, wanted: str) -> Iterator[Piece]:
+    def _measured(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
         for places, source, readings in self._by_frame(parts):
             assert source is not None
             count, frame_id = len(places), readings.strings[0]
@@ -193,8 +209,9 @@ class Entry:
             self.refused.pop(POSES, None)
             if not recording:
                 self.unused['measurements: not recording'] += count
-            elif fault := self._frames.fault(source.device, frame_id, wanted, count):
+            elif fault := self._frames.fault(source.device, frame_id, count):
                 self.dropped[f'{POSES}: {fault}'] += count
+                self.refused[POSES] = fault
             else:
                 width = readings.numbers.shape[1]
                 if width > 7:  # a covariance of zeros means none
@@ -212,13 +229,16 @@ class Entry:
                 yield Piece(key, places, readings.stamps_ns, readings.numbers)
 
     def _by_frame(self, parts: Sequence[Part]) -> list[Part]:
-        """Return measurements one by one until the usual one of several frames is decided."""
+        """Return measurements one by one until the one of several frames is decided."""
         frames: dict[str, set[str]] = {}
+        deciding = False
         for each in parts:
             assert each.source is not None
-            if each.source.device not in self._frames.usual:
-                frames.setdefault(each.source.device, set()).add(each.readings.strings[0])
-        if any(len(some) > 1 for some in frames.values()):
+            device, frame_id = each.source.device, each.readings.strings[0]
+            deciding = deciding or self._frames.decides(device, frame_id)
+            if device not in self._frames.usual:
+                frames.setdefault(device, set()).add(frame_id)
+        if deciding or any(len(some) > 1 for some in frames.values()):
             parts = [
                 Part(part.places[k : k + 1], part.source, part.readings.rows(slice(k, k + 1)))
                 for part in parts
@@ -228,30 +248,22 @@ class Entry:
 
 
 class Kept:
-    """Samples in order, only in the frame `wanted` if given.
-
-    `removed` is called with each sample that is taken back.
-    """
+    """Samples in order; `removed` is called with each one that is taken back."""
 
     def __init__(
-        self,
-        frames: FrameNames,
-        wanted: str,
-        dropped: Counter[str],
-        removed: Callable[[Sample], None],
+        self, frames: FrameNames, dropped: Counter[str], removed: Callable[[Sample], None]
     ) -> None:
-        self.wanted = wanted
         self._frames, self._dropped, self._removed = frames, dropped, removed
         self.samples: list[Sample] = []
 
     def usable(self) -> list[Sample]:
-        """Return the samples in the frame of their device, `frame_id` or the usual one.
+        """Return the samples in the frame of their device.
 
         Targets measured once are left out if others were measured more often: they do not
         constrain the arm, and hundreds of them would take minutes.
         """
         found = self.samples
-        if self.wanted or self._frames.several:
+        if self._frames.wanted or self._frames.several:
             found = [each for each in found if self._frame_of(each) == each.frame_id]
         counts = Counter((each.device, each.target) for each in found if not each.validation)
         once = {key for key, count in counts.items() if count == 1}
@@ -260,8 +272,7 @@ class Kept:
         return [each for each in found if (each.device, each.target) not in once]
 
     def _frame_of(self, sample: Sample) -> str:
-        should = self.wanted or self._frames.main(sample.device)
-        return (sample.frame_id and should) or sample.frame_id
+        return (sample.frame_id and self._frames.main(sample.device)) or sample.frame_id
 
     def leave_out_strange(self) -> None:
         """Take back samples in strange frames, if there are only a few."""
@@ -272,7 +283,8 @@ class Kept:
 
     def is_strange(self, sample: Sample) -> bool:
         """Tell whether a sample is one of a few in a frame of their own; count it if so."""
-        if self.wanted or not self._frames.several or self._frames.different:
+        frames = self._frames
+        if frames.required(sample.device) or not frames.several or frames.different:
             return False
         frame_id = self._frame_of(sample)
         strays = sample.frame_id != frame_id
@@ -283,6 +295,5 @@ class Kept:
     @property
     def different(self) -> str:
         """Return that one device measured in different frames, if it matters."""
-        if self.wanted or not self._frames.different:
-            return ''
-        return f'poses came in different frames ({", ".join(self._frames.different)})'
+        frames = ', '.join(self._frames.different)
+        return frames and f'poses came in different frames ({frames})'

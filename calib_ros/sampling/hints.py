@@ -13,7 +13,7 @@ import numpy as np
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import SCATTER, configurations, distinct
-from calib_ros.estimation.levels import NEARER
+from calib_ros.estimation.levels import FEW, NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.live import START, Estimate, barely_moved
@@ -144,6 +144,14 @@ def unsettled(refused: int, stops: int) -> list[Hint]:
         'off, and check that the target is firm and the arm does not creep'
     )
     return [Hint(f'{refused} of {stops} stops still move where measured: set settle', words)]
+
+
+def unmeasured(stops: int) -> list[Hint]:
+    """Report stops in a row without a measurement."""
+    if stops < FEW:
+        return []
+    words = f'no measurements at the last {stops} stops: does the device see the target'
+    return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
 
 def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]:

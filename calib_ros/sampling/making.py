@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.interpolation import unwrapped
@@ -38,11 +39,14 @@ class Found(NamedTuple):
 
 
 class Maker:
-    """Makes samples, up to a capacity, and no two of one stream with the same stamp."""
+    """Makes samples, up to a capacity, and no two of one stream with the same stamp.
+
+    A second one elsewhere, after a simulation began again, gets the next free nanosecond.
+    """
 
     def __init__(self, revolute: Flags, capacity: int) -> None:
         self._revolute, self._capacity = revolute, capacity
-        self._taken: dict[StreamKey, set[int]] = {}
+        self._taken: dict[StreamKey, dict[int, FloatArray]] = {}  # joints (n,) by stamp
         self.fresh: list[Sample] = []  # samples not taken yet
         self._calm: int | None = None  # fresh samples before the first stop not at rest
         self._shaken = math.inf  # the number of that stop
@@ -158,22 +162,26 @@ class Maker:
         stamp_ns: int,
         rows: FloatArray,
         position: FloatArray,
+        joints: FloatArray,
         **more: Any,
     ) -> Iterator[Numbered]:
         """Yield a sample of measurements (N, ROW_WIDTH), unless one exists or memory is full."""
-        known = self._taken.setdefault(key, set())
-        if stamp_ns in known:
-            self.dropped['measurements: a pose with this stamp already exists'] += len(rows)
-            return
+        known = self._taken.setdefault(key, {})
+        while stamp_ns in known:
+            if np.abs(unwrapped(joints - known[stamp_ns], self._revolute)).max() <= STILL:
+                self.dropped['measurements: a pose with this stamp already exists'] += len(rows)
+                return
+            stamp_ns += 1
         if len(known) >= self._capacity:
             self.dropped['measurements: the memory for poses is full'] += len(rows)
             return
-        known.add(stamp_ns)
+        known[stamp_ns] = joints
         covariance = None
         if not np.isnan(rows[:, COVARIANCE]).any():
             covariance = rows[:, COVARIANCE].mean(axis=0).reshape(6, 6)
         sample = Sample(
             stamp_ns=stamp_ns,
+            joints=joints,
             position=None if key.distance else position,
             distance=float(position[0]) if key.distance else None,
             covariance=covariance,
@@ -214,11 +222,11 @@ class Maker:
     def remember(self, samples: Sequence[Sample]) -> None:
         """Make no other samples with the stamps of these."""
         for sample in samples:
-            self._taken.setdefault(_key(sample), set()).add(sample.stamp_ns)
+            self._taken.setdefault(_key(sample), {})[sample.stamp_ns] = sample.joints
 
     def forget(self, sample: Sample) -> None:
         """Allow another sample with the stamp of this one."""
-        self._taken.get(_key(sample), set()).discard(sample.stamp_ns)
+        self._taken.get(_key(sample), {}).pop(sample.stamp_ns, None)
 
 
 def _sigmas(values: FloatArray, begins: Index, sigma: float) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import Clocks
-from calib_ros.sampling.hints import Hint, unsettled
+from calib_ros.sampling.hints import Hint, unmeasured, unsettled
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice
 from calib_ros.settings import Settings
@@ -182,7 +182,8 @@ class Pipeline:
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""
         maker = self.collector.maker
-        return unsettled(maker.restless, maker.restless + maker.rested)
+        found = unsettled(maker.restless, maker.restless + maker.rested)
+        return found + (unmeasured(self.collector.unmeasured) if maker.rested else [])
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

@@ -76,16 +76,13 @@ class CalibrationSession:
         self.made = 0  # samples, without restored ones
         self._pipeline = Pipeline(self.chain, settings, self._take)
         self._collector, self._clocks = self._pipeline.collector, self._pipeline.clocks
-        self._frames = FrameNames()
+        self._frames = FrameNames(settings.frame_id)
         self._names = JointNames(self.joint_names, self.chain.held)
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
         self.pictures.clear()
         self._kept = Kept(
-            self._frames,
-            settings.frame_id,
-            self._entry.dropped,
-            lambda sample: self.on_removed(sample),
+            self._frames, self._entry.dropped, lambda sample: self.on_removed(sample)
         )
 
     def change(self, settings: Settings) -> None:
@@ -96,13 +93,13 @@ class CalibrationSession:
         check_settings(self.chain, settings)
         self.settings = settings
         self._collector.settings = self._clocks.settings = settings
-        self._kept.wanted = settings.frame_id
+        self._frames.wanted = settings.frame_id
         self._live.restart()
 
     def take(self, parts: Sequence[Part]) -> None:
         """Take messages in the order of their places."""
         settled = len(self._frames.usual)
-        pieces = self._entry.pieces(parts, self.recording, self.settings.frame_id)
+        pieces = self._entry.pieces(parts, self.recording)
         if len(self._frames.usual) != settled:
             self._kept.leave_out_strange()
         try:

@@ -78,6 +78,33 @@ def test_what_the_coupled_joints_show_is_identified_and_the_rest_named_a_gauge(o
     assert rms(result.chain, true, fresh) < 0.05 * rms(result.before, true, fresh)
 
 
+@pytest.mark.parametrize('second', ['motor" multiplier="-1" offset="0.2', 'outer" multiplier="-2'])
+def test_the_first_joint_of_a_column_leads_the_others_of_a_motor_elsewhere(second, rng):
+    """Two lifts mimic one that is not between the links, or one of them the other."""
+    mimics = 'motor" multiplier="0.5" offset="0.1', second
+    lifts = [f'{limits(-0.5, 0.5)}<mimic joint="{each}"/>' for each in mimics]
+    column = written(
+        'column',
+        ('motor', 'prismatic', 'base', 'belt', ZERO, ZERO, Z),
+        ('outer', 'prismatic', 'base', 'tube', (0, 0, 0.3), ZERO, Z, lifts[0]),
+        ('inner', 'prismatic', 'tube', 'plate', (0, 0, 0.1), (0, 0.2, 0), Z, lifts[1]),
+        ('turn', 'revolute', 'plate', 'tool0', (0.5, 0, 0), ZERO, Y, limits(-2, 2)),
+    )
+    chain = chain_from_urdf(column)
+    assert (chain.joints[0].lower, chain.joints[0].upper) == (-0.5, 0.5)
+    (held,) = chain.held
+    assert chain.joint_names[held] == 'inner'
+    for outer, _, turn in (q := chain.random_joints(5, rng)):
+        motor = (outer - 0.1) / 0.5
+        inner = 0.2 - motor if 'motor' in second else -2.0 * outer
+        values = {'motor': motor, 'outer': outer, 'inner': inner, 'turn': turn}
+        expected = reference_forward(column, values, 'base', 'tool0')
+        found = chain.forward(np.array([[outer, 0.0, turn]]))[0]
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
+    assert chain_from_urdf(corrected_urdf(column, chain)).effects == chain.effects
+    assert len(q) == 5
+
+
 def test_without_couplings_in_the_chain_they_are_named(rng):
     alone = replace(
         CHAIN,

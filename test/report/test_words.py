@@ -26,9 +26,10 @@ from calib_ros.shown import rounded
 
 
 @pytest.mark.parametrize(
-    ('rms_mm', 'holds'), [(0.1, True), (0.14, None), (0.16, None), (0.3, False)]
+    ('rms_mm', 'says'),
+    [(0.1, 'holds'), (0.14, 'UNDECIDED'), (0.16, 'UNDECIDED'), (0.3, 'does not hold')],
 )
-def test_a_calibration_holds_by_one_rule(rms_mm, holds):
+def test_a_calibration_holds_by_one_rule(rms_mm, says):
     """By ~/validate, and by ~/check where no change shows besides: by the interval."""
     arm = load_chain('ur10e')
     previous = Calibration(arm, arm, residual=1e-4)
@@ -40,12 +41,20 @@ def test_a_calibration_holds_by_one_rule(rms_mm, holds):
         for ratio in (0.9, 1.1)  # new frames make held-out errors larger by that
     ]
     told = verdict(previous, both)
-    assert told[0] is holds
-    assert told[1].startswith('too few poses to tell') == (holds is None)
+    assert told[0] == says
+    assert told[1].startswith('too few poses to tell') == (says == 'UNDECIDED')
     same = checked(previous, updates[0])
-    assert same[0] == (holds is not False)
+    assert same[0] == (says != 'does not hold')
     for text in (told[1], same[1]):
-        assert ('no longer holds: RMS 0.300 mm' in text) == (holds is False)
+        assert ('no longer holds: RMS 0.300 mm' in text) == (says == 'does not hold')
+    for of, share, why in (
+        (replace(previous, residual=None), 0.0, 'no former error'),
+        (previous, 0.3, '30 % of these are measurements'),
+    ):  # as in `verify`
+        proves_nothing = 'does not hold' if says == 'does not hold' and share else 'no verdict'
+        found, text = verdict(of, both, share)
+        assert found == proves_nothing
+        assert (why in text) == (found == 'no verdict')
     assert [each.accepted for each in updates] == [rms_mm < 0.15, True]
 
 

@@ -12,6 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_cell import Cell, Child, joint_messages, topics, values_of
 from sensor_msgs.msg import JointState
+from std_msgs.msg import String
 
 from calib_ros.errors import ConfigError
 from calib_ros.ros import inputs as inputs_module
@@ -52,8 +53,11 @@ def test_a_topic_of_another_type_is_told(cell):
     other = Node('other', context=context)
     other.create_publisher(PointStamped, 'measured_pose', 10)
     said = '/measured_pose is published as geometry_msgs/msg/PointStamped, not as'
+    status = cell.listen(String, 'calibration_node/status')
     cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
     assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    cell.spin_until(lambda: status and said in status[-1].data)  # the operator reads no other
+    assert said in cell.in_full(cell.refused('identify'))
     other.destroy_node()
     cell.spin_until(lambda: said not in heard[-1].status[0].message)
     context.try_shutdown()

@@ -121,6 +121,52 @@ def test_frame_id_helps_at_once_when_frames_differ():
         begun.problem()
 
 
+@pytest.mark.parametrize('late', [False, True])
+def test_frame_id_chooses_among_the_frames_of_a_device_that_has_it(late):
+    """Another device may have a frame of its own."""
+    first = samples(20, device='left', frame_id='a')
+    second = samples(20, seed=6, start=100, device='right', frame_id='b')
+    moved = samples(20, seed=7, start=200, device='right', frame_id='c')
+    made = session(*((second, moved, first) if late else (first, second, moved)), frame_id='b')
+    assert [sample.frame_id for sample in made.usable].count('a') == 20
+    assert [sample.frame_id for sample in made.usable].count('b') == 20
+    assert len(made.usable) == 40
+    made.change(replace(made.settings, frame_id=''))
+    with pytest.raises(InputError, match=r'different frames \(b, c\)'):
+        made.problem()
+
+
+def test_measurements_of_a_frame_that_is_not_wanted_are_told_at_once():
+    made = session(frame_id='nowhere')
+    drive(made, 4, [tracker()])
+    assert 'refused, in frame "tracker", not in frame_id "nowhere"' in made.status()
+
+
+def test_a_stop_elsewhere_at_the_stamps_of_another_is_a_sample_too():
+    """A simulation began again, and its clock with it."""
+    made, twice = session(), UR5E.random_joints(10, np.random.default_rng(7))
+    for configurations in (*np.split(twice, 2), twice[:5], twice[5:]):
+        drive(made, configurations, [tracker()])
+    made.finish()
+    assert len(made.samples) == len({sample.stamp_ns for sample in made.samples}) == 10
+    later = session(made.samples)
+    drive(later, twice[5:], [tracker()])
+    later.finish()
+    assert len(later.samples) == 10
+
+
+def test_stops_at_which_nothing_is_measured_are_told():
+    """As of a target that is lost, or of a frame with another name from now on."""
+    made = session()
+    words = 'no measurements at the last 5 stops: does the device see the target?'
+    start = 0.0
+    for count, seen in ((3, True), (6, False), (3, True)):
+        start += drive(made, count, [tracker()] if seen else [], start=start)
+        assert (words in made.status()) is not seen
+    made.finish()
+    assert len(made.samples) == 6
+
+
 def test_targets_that_were_measured_once_are_left_out():
     """Each would bring six parameters and tell nothing about the arm."""
     good = samples(20, target='ball')
@@ -217,7 +263,8 @@ def test_samples_that_were_fitted_are_known_again():
     made.identify()
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
-    words = verdict(made.calibration, made.validate(), made.reused())[1]
+    found, words = verdict(made.calibration, made.validate(), made.reused())
+    assert found == 'no verdict'
     assert 'these are measurements to which the calibration was fitted' in words
 
 
