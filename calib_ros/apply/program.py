@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +18,8 @@ from calib_ros.apply.compensation import (
     too_fast,
 )
 from calib_ros.errors import InputError, UnknownNameError
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.shown import Shown
 
@@ -33,7 +33,7 @@ class Program(Shown):
     """A robot's program as joint values by name."""
 
     names: tuple[str, ...]
-    """Columns of the arrays; they may include joints outside the arm."""
+    """Columns of the arrays; they may include joints outside the arm, and lack held ones."""
     positions: FloatArray
     """(N, m) joint values [rad or m], in their order of execution."""
     velocities: FloatArray | None = None
@@ -51,20 +51,19 @@ def compensate_program(
     Velocities and accelerations follow the corrected path; times and other joints do not change.
     Refused points are NaN; `progress` receives the share done.
 
-    Raises InputError or UnknownNameError for a missing joint of the arm, and arrays that do not
-    match the names.
+    Raises InputError or UnknownNameError as `joint_values`.
     """
-    columns = _columns(compensator.nominal.joint_names, program)
-    positions = program.positions[:, columns]
+    positions, columns = joint_values(compensator.nominal, program)
     approach = approaches(positions) if program.approach is None else program.approach
     result = compensate(compensator, positions, approach, progress)
     if program.velocities is None:
         return replace(program, positions=_put(program.positions, columns, result.joints)), result
     given = program.accelerations
     curve = np.zeros_like(program.velocities) if given is None else given
-    speeds = program.velocities[:, columns]
-    rates = (speeds, curve[:, columns])
-    velocities, accelerations = _derivatives(compensator, result, *rates, approach)
+    speeds, bends = (
+        np.where(columns < 0, 0.0, each[:, columns]) for each in (program.velocities, curve)
+    )
+    velocities, accelerations = _derivatives(compensator, result, speeds, bends, approach)
     held = result.limited.any(axis=1) & ~np.isnan(result.joints).any(axis=1)
     reason = 'a joint is held at its limit, where its velocity is not defined'
     result = refused(result, [Refusal(k, reason) for k in np.flatnonzero(held).tolist()])
@@ -120,7 +119,21 @@ def _derivatives(
     )
 
 
-def _columns(names: Sequence[str], program: Program) -> list[int]:
+def joint_values(chain: Chain, program: Program) -> tuple[FloatArray, Index]:
+    """Return the joint values (N, n) [rad or m] of a program for an arm, and their columns (n,).
+
+    Held joints may be missing: the column is then -1, the value their limit.
+
+    Raises InputError or UnknownNameError for a missing joint that can move, and arrays that do not
+    match the names.
+    """
+    columns = np.array(_columns(chain, program))
+    ends = [chain.held.get(k, 0.0) for k in range(len(columns))]
+    return np.where(columns < 0, ends, program.positions[:, columns]), columns
+
+
+def _columns(chain: Chain, program: Program) -> list[int]:
+    names = chain.joint_names
     shape = program.positions.shape
     if len(shape) != 2 or shape[1] != len(program.names):
         raise InputError(f'{len(program.names)} joint names do not fit positions of shape {shape}')
@@ -134,17 +147,18 @@ def _columns(names: Sequence[str], program: Program) -> list[int]:
     for name in names:
         if program.names.count(name) > 1:
             raise InputError(f'joint "{name}" comes twice in the program')
-    missing = [name for name in names if name not in program.names]
+    moving = [name for k, name in enumerate(names) if k not in chain.held]
+    missing = [name for name in moving if name not in program.names]
     others = [name for name in program.names if name not in names]
     if missing and others:
         (strange,) = difflib.get_close_matches(missing[0], others, n=1, cutoff=0.0)
         raise UnknownNameError('joint in the program', strange, names)
     if missing:
         raise InputError(f'the program has no values of {", ".join(missing)}')
-    return [program.names.index(name) for name in names]
+    return [program.names.index(name) if name in program.names else -1 for name in names]
 
 
-def _put(values: FloatArray, columns: Sequence[int], new: FloatArray) -> FloatArray:
+def _put(values: FloatArray, columns: Index, new: FloatArray) -> FloatArray:
     replaced = values.copy()
-    replaced[:, columns] = new
+    replaced[:, columns[columns >= 0]] = new[:, columns >= 0]
     return replaced

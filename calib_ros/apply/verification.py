@@ -42,6 +42,7 @@ from calib_ros.estimation.samples import Samples
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.parameter import parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
@@ -333,7 +334,8 @@ def _meant(
     correction, corrected ones are nearer to other points than to their own. Measurements further
     from the program than any correction raise an InputError.
     """
-    far, _ = cKDTree(commanded).query(joints, p=np.inf)
+    own = [k for k in range(joints.shape[1]) if k not in coupled(nominal)]
+    far, _ = cKDTree(commanded[:, own]).query(joints[:, own], p=np.inf)
     lost = np.flatnonzero(far > Compensator.largest_turn)
     if lost.size:
         raise InputError(
@@ -342,6 +344,6 @@ def _meant(
         )
     change = Compensator(nominal, calibrated).follower.solve(commanded).change
     both = np.concatenate([commanded, commanded + change])
-    _, nearest = cKDTree(both).query(joints, p=np.inf)
+    _, nearest = cKDTree(both[:, own]).query(joints[:, own], p=np.inf)
     corrected, point = np.divmod(nearest, len(commanded))
     return commanded[point], corrected

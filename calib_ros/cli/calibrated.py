@@ -16,7 +16,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
 from calib_ros.settings import Limits
-from calib_ros.shown import NAMED
+from calib_ros.shown import NAMED, some
 from calib_ros.texts import dump_json
 
 
@@ -96,6 +96,12 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'
         beyond = f' with what its first line says, {each.beyond}' if each.beyond else ''
         screen.say(f'{options.out / each.name}: {exact}{beyond}')
+    known = dict(nominal.effects)
+    if lost := [name for name, value in chain.effects if value != known.get(name, 0.0)]:
+        screen.warn(
+            f'tables cannot hold the fitted effects {", ".join(some(lost))}; for the best table '
+            'without them, identify with --model geometric --fixed "*.coupling_*"'
+        )
     if calibration.region is not None and not calibration.region.whole:
         screen.warn(f'the calibration is {calibration.region.in_words()}')
     return 0

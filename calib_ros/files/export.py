@@ -83,25 +83,30 @@ def exports(
     range. `origin` is recorded. Raises ExportError if a file read back differs from the chain.
     """
     q = anywhere(chain)
-    known = [each for each in nominal.effects if Parameter(each[0]).effect[0] == 'coupling']
-    arm = replace(chain, effects=tuple(known))
+    arm, of_file = (replace(chain, effects=_couplings(each)) for each in (nominal, chain))
+    others = [each for each in nominal.effects if each not in arm.effects]
     wanted = arm.forward(q)
-    lost = distance(chain, replace(chain, effects=nominal.effects), q)
-    counting = ', with the effects of the nominal chain' * bool(nominal.effects)
+    lost, of_file_lost = (
+        distance(chain, replace(each, effects=(*each.effects, *others)), q)
+        for each in (arm, of_file)
+    )
+    counting = ', with the effects of the nominal chain'
+    of_table, of_file_too = counting * bool(nominal.effects), counting * bool(others)
     digest = table_hash(chain)
     found = []
     for convention in get_args(Convention):
         form = converted(arm, convention)
-        what = f'{convention} Denavit-Hartenberg table{counting}'
+        what = f'{convention} Denavit-Hartenberg table'
         beyond = cut_off(arm, convention)
-        text = _csv(form, f'{what}{beyond and f" ({beyond})"}', lost, digest)
+        text = _csv(form, f'{what}{of_table}{beyond and f" ({beyond})"}', lost, digest)
         again = _read_csv(text, form)
-        of_table = checked(f'dh_{convention}.csv', text, again.forward(q), wanted, lost)
-        found.append(replace(of_table, beyond=beyond))
-        text = head(form, what, lost, digest) + dump_chain(form, origin)
+        table = checked(f'dh_{convention}.csv', text, again.forward(q), wanted, lost)
+        found.append(replace(table, beyond=beyond))
+        name, form = f'dh_{convention}.yaml', converted(of_file, convention)
+        text = head(form, what + of_file_too, of_file_lost, digest) + dump_chain(form, origin)
         again = parse_chain(text)
-        found.append(checked(f'dh_{convention}.yaml', text, again.forward(q), wanted, lost))
-    text = f'# calibrated table {digest}\n' + kinematics_yaml(arm, origin)
+        found.append(checked(name, text, again.forward(q), of_file.forward(q), of_file_lost))
+    text = head(arm, f'kinematics{of_table}', lost, digest) + kinematics_yaml(arm, origin)
     found.append(checked('kinematics.yaml', text, forward_of(text, arm, q), wanted, lost))
     region = q if joints is None else np.asarray(joints, dtype=np.float64)
     for name, kinds, what in (
@@ -110,9 +115,14 @@ def exports(
     ):
         best = _approximated(chain, nominal, kinds, region)
         error = distance(best, chain, region)
-        text = _csv(best, f'{nominal.convention} {what}{counting}', error, digest)
+        text = _csv(best, f'{nominal.convention} {what}{of_table}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
+
+
+def _couplings(chain: Chain) -> tuple[tuple[str, float], ...]:
+    """Return the effects that a chain file holds."""
+    return tuple(e for e in chain.effects if Parameter(e[0]).effect[0] == 'coupling')
 
 
 def anywhere(chain: Chain) -> FloatArray:

@@ -11,13 +11,13 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib_ros.apply.program import Program
+from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
 from calib_ros.files.columns import Columns, check_quaternions, with_rows
 from calib_ros.files.csv_columns import columns_of, read_columns
@@ -36,10 +36,14 @@ RATES = ('positions', 'velocities', 'accelerations')
 
 
 def read_joints(path: Path, chain: Chain) -> FloatArray:
-    """Read joint values (N, n) [rad or m] from a CSV; refuse any 1e-3 beyond its limits."""
+    """Read joint values (N, n) [rad or m] from a CSV; refuse any 1e-3 beyond its limits.
+
+    Columns of held joints may be missing.
+    """
     found = read_columns(path, ())
-    names = _header_of(found, chain.joint_names)
-    values = found.block(names)
+    names = _header_of(found, chain)
+    program = _program(found, chain, names)
+    values, _ = joint_values(chain, program)
     check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ')
     return values
 
@@ -73,16 +77,34 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
         )
 
 
-def _header_of(found: Columns, joints: Sequence[str]) -> tuple[str, ...]:
+def _header_of(found: Columns, chain: Chain) -> tuple[str, ...]:
+    """Return the columns of all joints; those of held ones may be missing."""
+    joints = chain.joint_names
     *names, more = joint_columns(len(joints) + 1)
+
+    def needed(names: Sequence[str]) -> list[str]:
+        return [name for k, name in enumerate(names) if k not in chain.held]
+
     for others in (list(joints), [name.upper() for name in names]):
-        if set(others) <= set(found.header) and not set(names) <= set(found.header):
+        if set(needed(others)) <= set(found.header) and not set(needed(names)) <= set(
+            found.header
+        ):
             names = others
-    if {more, more.upper()} & {*with_rows(found, names).header}:
+    if {more, more.upper()} & {*with_rows(found, needed(names)).header}:
         raise InputError(
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
     return tuple(names)
+
+
+def _program(found: Columns, chain: Chain, names: Sequence[str]) -> Program:
+    """Return the joint values of columns, by the joints' names."""
+    given = {
+        name: column
+        for name, column in zip(chain.joint_names, names, strict=True)
+        if column in found.header
+    }
+    return Program(tuple(given), found.block(list(given.values())))
 
 
 def read_poses(path: Path) -> FloatArray:
@@ -115,17 +137,14 @@ class ProgramFile:
 
 def program_of(path: Path, chain: Chain) -> ProgramFile:
     """Read a program for an arm (`read_program`); refuse joint values that may be degrees."""
-    found = read_program(path, chain.joint_names)
-    known = found.program.names
-    columns = [known.index(name) for name in chain.joint_names if name in known]
-    if len(columns) == len(chain.joints):  # otherwise refused later
-        values = found.program.positions[:, columns]
-        check_turns(values, chain, lambda k, _: f'{path}, {found.places[k]}: ')
+    found = read_program(path, chain)
+    values, _ = joint_values(chain, found.program)
+    check_turns(values, chain, lambda k, _: f'{path}, {found.places[k]}: ')
     return found
 
 
-def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
-    """Read a program for an arm with the named joints: CSV, or YAML by the file's suffix.
+def read_program(path: Path, chain: Chain) -> ProgramFile:
+    """Read a program for an arm: CSV, or YAML by the file's suffix.
 
     CSV: joint values in q1 ... qn, or in columns with the joints' names; optional s1 ... sn are
     the signs of the joints' last moves. YAML: a trajectory_msgs/JointTrajectory as printed by
@@ -133,27 +152,31 @@ def read_program(path: Path, joints: Sequence[str]) -> ProgramFile:
     """
     suffix = path.suffix.lower()
     if suffix == '.csv':
-        return _read_csv(read_text(path, LARGEST_TABLE, InputError), path, joints)
+        return _read_csv(read_text(path, LARGEST_TABLE, InputError), path, chain)
     if suffix in ('.yaml', '.yml'):
         return _read_yaml(read_text(path, LARGEST_TEXT, InputError), str(path))
     raise InputError(f'{path} must be a table (.csv with q1 ... qn) or a JointTrajectory (.yaml)')
 
 
-def _read_csv(text: str, path: Path, joints: Sequence[str]) -> ProgramFile:
+def _read_csv(text: str, path: Path, chain: Chain) -> ProgramFile:
     found = columns_of(path, text.encode())
-    names = _header_of(found, joints)
-    signs = joint_columns(len(joints), 's')
-    approach = np.sign(found.block(signs)) if set(signs) <= set(found.header) else None
+    names = _header_of(found, chain)
+    program = _program(found, chain, names)
+    signs = joint_columns(len(names), 's')
+    known = [k for k, sign in enumerate(signs) if sign in found.header]
+    if len({*known, *chain.held}) == len(signs):
+        approach = np.zeros((len(found.lines), len(signs)))
+        approach[:, known] = np.sign(found.block([signs[k] for k in known]))
+        program = replace(program, approach=approach)
 
     def text_with(corrected: Program) -> str:
         header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
-        at = [found.header.index(name) for name in names]
+        at = [found.header.index(name) for name in names if name in found.header]
         for row, values in zip(rows, corrected.positions.tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value)
         return csv_text([header, *rows])
 
-    program = Program(tuple(joints), found.block(names), approach=approach)
     return ProgramFile(program, tuple(f'line {line}' for line in found.lines), text_with)
 
 

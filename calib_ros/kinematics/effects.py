@@ -111,6 +111,12 @@ def couplings(joints: Sequence[str]) -> list[Parameter]:
     return [Parameter(name, f'coupling_{o}') for i, name in enumerate(joints) for o in joints[:i]]
 
 
+def coupled(chain: _Arm) -> frozenset[int]:
+    """Return the numbers of the held joints that couplings move."""
+    led = {name.partition('.coupling_')[0] for name, _ in chain.effects if '.coupling_' in name}
+    return frozenset(k for k in chain.held if chain.joint_names[k] in led)
+
+
 WAVES = ('sin', 'cos')
 PLAY = ('backlash', 'play')  # of a revolute and of a linear joint
 

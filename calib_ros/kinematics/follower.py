@@ -32,7 +32,7 @@ import numpy as np
 
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import Aim, limits
-from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.jacobian import orientation_error
 from calib_ros.kinematics.newton import Minimum, Normal, minimise
 from calib_ros.kinematics.se3 import (
     HALF_THE_DIGITS,
@@ -78,8 +78,8 @@ class Solution(Shown):
 
 def mobility(chain: Chain) -> tuple[int, int, int]:
     """Return the number of freedoms of pose, position and orientation that an arm controls."""
-    model = ErrorModel(chain, [joint.driven for joint in chain.joints])
-    jacobian = model.jacobian(chain.random_joints(10, np.random.default_rng(0)))
+    q = chain.random_joints(10, np.random.default_rng(0)).T
+    jacobian = _columns(chain, q).transpose(2, 1, 0)
     for part in (jacobian[:, :3], jacobian[:, 3:]):
         part /= max(float(np.linalg.norm(part, 2, (1, 2)).max()), SAME)
     ranks = [
@@ -87,6 +87,12 @@ def mobility(chain: Chain) -> tuple[int, int, int]:
         for part in (jacobian, jacobian[:, :3], jacobian[:, 3:])
     ]
     return ranks[0], ranks[1], ranks[2]
+
+
+def _columns(chain: Chain, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
+    """Return the derivative of the pose by the joints (n, 6, B) at joint values (n, B)."""
+    axes, origin = chain.trace(chain.effective(q, approach))
+    return Aim(chain).linearise(q, approach, origin, axes, LEVER)[1]
 
 
 class Follower:
@@ -116,9 +122,10 @@ class Follower:
         self._weight = weight or (LEVER if self.complete else LEVER_IN_PART)
         self._first_weight = LEVER if self.complete else self._weight
         # redundant joints make J^T J singular: D must exceed its rounding
-        ridge = ROUNDING if len(unit) > freedoms else HALF_THE_DIGITS**2
+        redundant = len(unit) - len(leader.held) > freedoms
+        ridge = ROUNDING if redundant else HALF_THE_DIGITS**2
         self._ridge = ridge * np.eye(len(unit))[:, :, np.newaxis]
-        if len(unit) <= freedoms:
+        if not redundant:
             self._ranks[1] = 3  # no redundant joint: any orientation counts
 
     def solve(
@@ -144,9 +151,10 @@ class Follower:
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
         """Solve for commands (n, B); hold joints beyond a limit there and solve the rest again."""
         axes, origin = self._leader.trace(self._leader.effective(q, approach))
-        zeros = np.zeros_like(q)
-        ways = self._ways(q, approach, origin, axes)
-        task = _Task(q, approach, axes, origin, ways, zeros.astype(bool), zeros)
+        never = np.zeros(q.shape, dtype=bool)
+        never[list(self._leader.held)] = True
+        ways = self._ways(q, approach)
+        task = _Task(q, approach, axes, origin, ways, never, np.zeros_like(q))
         before = self._errors(task, task.start)
         x, errors, converged, damped, iterations = self._attempt(task)
         lower, upper = (((end - q.T).T / self._unit) for end in (self.lower, self.upper))
@@ -164,7 +172,7 @@ class Follower:
         return Solution(
             (self._unit * x).T,
             *(errors[:, 0], errors[:, 1], errors[:, 2], before[:, 0], before[:, 1]),
-            *(iterations, converged, task.held.T, damped),
+            *(iterations, converged, (task.held & ~never).T, damped),
         )
 
     def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags, int]:
@@ -217,13 +225,11 @@ class Follower:
             columns = np.einsum('jkb,ikb->ijb', task.ways, columns)
         return error, columns
 
-    def _ways(
-        self, q: FloatArray, approach: FloatArray | None, origin: FloatArray, axes: FloatArray
-    ) -> FloatArray | None:
+    def _ways(self, q: FloatArray, approach: FloatArray | None) -> FloatArray | None:
         """Return projections (6, 6, B) of errors onto the motion of the leader; None for all."""
         if self._ranks == [3, 3]:
             return None
-        columns = Aim(self._leader).linearise(q, approach, origin, axes, LEVER)[1]
+        columns = _columns(self._leader, q, approach)
         found = np.zeros((6, 6, len(q[0])))
         for rank, part in zip(self._ranks, (slice(0, 3), slice(3, 6)), strict=True):
             moved = np.linalg.svd(columns[:, part].transpose(2, 1, 0))[0][:, :, :rank]

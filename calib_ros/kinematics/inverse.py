@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.kinematics.newton import Normal, minimise
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, Flags, FloatArray, Index
@@ -114,7 +115,7 @@ class Aim:
         columns = np.zeros((len(q), 6, q.shape[1]))
         columns[:, :3] = self._signs * shift[model.order]
         columns[turning, 3:] = lever * self._signs[turning] * turn[model.order[turning]]
-        if self._chain.effects:
+        if self._chain.effects or self._chain.held:
             columns = np.einsum('jib,jkb->ikb', self._effects_slope(q, approach), columns)
         turned = lever * orientation_error(axes, found) if lever else np.zeros_like(origin)
         return np.concatenate([positions - origin, turned]), columns
@@ -130,8 +131,13 @@ class Aim:
 
 
 def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper limits (n,) of the joints [rad or m], infinite if none."""
+    """Return the lower and upper limits (n,) of the joints [rad or m], infinite if none.
+
+    Values of joints that only couplings move count for nothing, so these have none.
+    """
     ends = [(joint.lower, joint.upper) for joint in chain.joints]
+    free = coupled(chain)
+    ends = [(None, None) if k in free else end for k, end in enumerate(ends)]
     return (
         np.array([-np.inf if lower is None else lower for lower, _ in ends]),
         np.array([np.inf if upper is None else upper for _, upper in ends]),

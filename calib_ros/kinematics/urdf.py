@@ -38,7 +38,7 @@ from calib_ros.kinematics.chain import (
     refuse_other_joints,
 )
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, parse_urdf, with_origins
+from calib_ros.kinematics.urdf_tree import DescribedJoint, Description, edited, parse_urdf
 from calib_ros.settings import Settings
 from calib_ros.values import MOST_NAMES, SAME
 
@@ -90,8 +90,7 @@ def chain_from_urdf(
         rows = [replace(row, a=bend.a, alpha=bend.alpha, beta=bend.beta) for row, bend in pairs]
     x, y, z = (_clean(Chain.gravity[2] * part) for part in first[2, :3].tolist())
     chain = Chain(robot.name, convention, tuple(rows), base=Frame(first), gravity=(x, y, z))
-    led = [(joint.name, joint.follows) for joint in moving if joint.follows]
-    couplings = {f'{name}.coupling_{leader}': ratio for name, (leader, ratio, _) in led}
+    couplings = {_coupling(joint): joint.follows[1] for joint in moving if joint.follows}
     chain = chain.with_effect_values(couplings)
     ends = _ends(chain)
     return replace(
@@ -106,16 +105,16 @@ def corrected_urdf(
 ) -> str:
     """Return a URDF with the forward kinematics of a corrected arm between two links.
 
-    Only `<origin>` of joints on the path changes. Base and tool of the chain lead to the measuring
-    device and its target, which are not parts of the robot, so the URDF's own transforms before
-    the first axis and behind the last frame are kept. Errors of theta and d go into the origin of
-    their joint; everything behind it follows.
+    Only `<origin>` of joints on the path changes, and the `multiplier` of those that mimic others.
+    Base and tool of the chain lead to the measuring device and its target, which are not parts of
+    the robot, so the URDF's own transforms before the first axis and behind the last frame are
+    kept. Errors of theta and d go into the origin of their joint; everything behind it follows.
 
     The chain is the corrected one, identified from this nominal URDF and these links (as for
     `chain_from_urdf`) or from an equal chain.
 
-    Raises ConfigError if the chain is not of this arm, or has effects, which a URDF cannot
-    represent.
+    Raises ConfigError if the chain is not of this arm, or has effects beyond these couplings,
+    which a URDF cannot represent.
     """
     nominal = chain_from_urdf(text, base_link, tip_link, chain.convention)
     arm = replace(chain, base=nominal.base, tool=nominal.tool, frames=())
@@ -138,25 +137,47 @@ def corrected_urdf(
             pose = parent @ joint.origin
         corrected[joint.child] = pose
         origins[joint.name] = se3.invert(parent) @ pose
-    edited = with_origins(text, origins)
-    found = chain_from_urdf(edited, base_link, tip_link, arm.convention)
+    text = edited(text, origins, _multipliers(robot, path, nominal, arm))
+    found = chain_from_urdf(text, base_link, tip_link, arm.convention)
+    if any(abs(found.held[k] - value) > SAME for k, value in arm.held.items()):
+        raise ConfigError(
+            'a joint mimics one that has an offset itself, so the URDF cannot hold the fitted '
+            'couplings: identify with --fixed "*.coupling_*"'
+        )
     q = arm.random_joints(1000, np.random.default_rng(0))
     if np.abs(found.forward(q) - arm.forward(q)).max() > SAME:
         raise ConfigError(
             f'a, alpha or beta of joint "{last}" changed, and no fixed joint behind it can '
             'absorb that: let the tool frame be fitted instead, or add a fixed joint and a link'
         )
-    return edited
+    return text
+
+
+def _multipliers(
+    robot: Description, path: Sequence[DescribedJoint], nominal: Chain, arm: Chain
+) -> dict[str, float]:
+    """Return the multipliers of joints whose fitted couplings are not nominal.
+
+    A coupling to the leader is the product of the multipliers on the way to it.
+    """
+    known, values = dict(nominal.effects), dict(arm.effects)
+    couplings = {joint.name: _coupling(joint) for joint in path if joint.follows}
+    changes = {name: values.get(each, 0.0) / known[each] for name, each in couplings.items()}
+    found = {}
+    for joint in robot.joints:
+        if joint.follows and changes.get(joint.name, 1.0) != 1.0:
+            master, multiplier, _ = joint.follows
+            found[joint.name] = multiplier * changes[joint.name] / changes.get(master, 1.0)
+    return found
 
 
 def _refuse_others(arm: Chain, nominal: Chain) -> None:
     refuse_other_joints('the chain', arm, 'the URDF, between these links,', nominal)
     known = dict(nominal.effects)
-    if effects := [name for name, value in arm.effects if value != known.get(name, 0.0)]:
+    if effects := [name for name, value in arm.effects if value and name not in known]:
         raise ConfigError(
             f'a URDF cannot represent the effects {", ".join(effects)}, and the chain is not '
-            'accurate without them: identify with the model "geometric" (and --fixed '
-            '"*.coupling_*" if joints mimic others)'
+            'accurate without them: identify with the model "geometric"'
         )
     q = nominal.random_joints(50, np.random.default_rng(0))
     found, expected = arm.forward(q), nominal.forward(q)
@@ -168,6 +189,12 @@ def _refuse_others(arm: Chain, nominal: Chain) -> None:
             f'the chain is not the arm of this URDF between these links: the poses differ by '
             f'{shift:.3g} m and {turn:.3g} rad on average; identify again with the URDF as chain'
         )
+
+
+def _coupling(joint: DescribedJoint) -> str:
+    """Return the name of the effect that couples a joint to the one that it mimics."""
+    leader = joint.follows[0] if joint.follows else ''
+    return f'{joint.name}.coupling_{leader}'
 
 
 def _row(joint: DescribedJoint) -> Joint:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot description (URDF) as a tree of links and joints, and origins back into its text.
 
-Only the origins are edited in the text; all other bytes stay.
+Only origins and ratios are edited in the text; all other bytes stay.
 """
 
 from __future__ import annotations
@@ -311,18 +311,24 @@ def _numbers(
 
 # ---- back into the text
 
+_NAME = re.compile(r'<[^\s/>]+')
 _TAG = re.compile(r"""<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*/?>""")
 
 
-def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
-    """Return a URDF with other joint origins (4, 4), added first in joints without one."""
+def edited(text: str, origins: Mapping[str, FloatArray], ratios: Mapping[str, float]) -> str:
+    """Return a URDF with other joint origins (4, 4), added first in joints without one.
+
+    And with other `ratios` of joints that mimic others.
+    """
     data = text.encode()
-    for start, tag, name in sorted(_places(text, origins), reverse=True):
+    for start, tag, name in sorted(_places(text, origins, ratios), reverse=True):
         before, rest = data[:start].decode(), data[start:].decode()
         match = _TAG.match(rest)
         assert match is not None  # without entities, expat's index is exact
         head, tail = rest[: match.end()], rest[match.end() :]
-        if tag == 'origin':
+        if tag == 'mimic':
+            head = _with_attribute(head, 'multiplier', np.array([ratios[name]]))
+        elif tag == 'origin':
             head = _with_origin(head, origins[name])
         elif (added := _with_origin('<origin/>', origins[name])) != '<origin/>':
             head += tail[: len(tail) - len(tail.lstrip())] + added
@@ -330,11 +336,19 @@ def with_origins(text: str, origins: Mapping[str, FloatArray]) -> str:
     return data.decode()
 
 
-def _places(text: str, joints: Mapping[str, object]) -> list[tuple[int, str, str]]:
-    """Return the start of each joint's origin, or else of the joint: byte, tag, joint."""
-    described = [joint for joint in _parsed(text).findall('joint') if joint.get('name') in joints]
-    places = [(joint if (o := joint.find('origin')) is None else o, joint) for joint in described]
-    return [(int(at.get(_AT, '')), at.tag, joint.get('name', '')) for at, joint in places]
+def _places(
+    text: str, origins: Mapping[str, object], ratios: Mapping[str, object]
+) -> list[tuple[int, str, str]]:
+    """Return the start of each origin, or else of the joint, and mimic tag: byte, tag, joint."""
+    described = [(joint, joint.get('name', '')) for joint in _parsed(text).findall('joint')]
+    places = [(_child_or_self(j, 'origin'), name) for j, name in described if name in origins]
+    places += [(_child_or_self(j, 'mimic'), name) for j, name in described if name in ratios]
+    return [(int(at.get(_AT, '')), at.tag, name) for at, name in places]
+
+
+def _child_or_self(element: ET.Element, tag: str) -> ET.Element:
+    found = element.find(tag)
+    return element if found is None else found
 
 
 def _with_origin(tag: str, origin: FloatArray) -> str:
@@ -353,7 +367,7 @@ def _with_attribute(tag: str, key: str, values: FloatArray) -> str:
     text = ' '.join(repr(round(value, 15) + 0.0) for value in values.tolist())
     found = re.search(rf"""\s{key}\s*=\s*(["'])(.*?)\1""", tag, re.DOTALL)
     if found is None:
-        return tag.replace('<origin', f'<origin {key}="{text}"', 1)
+        return _NAME.sub(rf'\g<0> {key}="{text}"', tag, count=1)
     return tag[: found.start(2)] + text + tag[found.end(2) :]
 
 

@@ -159,7 +159,7 @@ def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
         given = '\n'.join(['q1,q2,note, q3,q4,q5,q6', *rows]) + '\n'
     path, again = tmp_path / f'program{suffix}', tmp_path / f'again{suffix}'
     path.write_text(given, encoding='utf-8')
-    source = read_program(path, UR.joint_names)
+    source = read_program(path, UR)
     np.testing.assert_array_equal(source.program.positions, q)
     assert len(source.places) == 50
     text = source.text_with(source.program)
@@ -168,13 +168,14 @@ def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
     else:
         assert yaml.safe_load(text) == yaml.safe_load(given.removesuffix('---\n'))
     again.write_text(text, encoding='utf-8')
-    assert read_program(again, UR.joint_names).text_with(source.program) == text
+    assert read_program(again, UR).text_with(source.program) == text
 
 
 def test_signs_in_a_table_are_the_approach(tmp_path):
     path = tmp_path / 'program.csv'
     path.write_text('q1,q2,s1,s2\n1,2,-0.5,0\n3,4,1,7\n')
-    program = read_program(path, ['a', 'b']).program
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    program = read_program(path, arm).program
     np.testing.assert_array_equal(program.approach, [[-1.0, 0.0], [1.0, 1.0]])
 
 

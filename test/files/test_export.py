@@ -215,8 +215,24 @@ def test_tables_count_on_effects_that_the_controller_knows():
     files = [parse_chain(each.content) for each in exact if each.name.endswith('d.yaml')]
     assert [each.effects for each in files] == [coupled, coupled]
     assert max(without_beta.error, offsets.error) < 0.02
-    for table in (*exact[:4], without_beta, offsets):
+    for table in (exact[0], exact[2], without_beta, offsets):
         assert 'with the effects of the nominal chain' in table.content.splitlines()[0]
+
+
+def test_chain_files_hold_fitted_couplings():
+    nominal, chain = corrected('kuka_youbot')
+    name = 'arm_joint_4.coupling_arm_joint_3'
+    nominal = replace(nominal, effects=((name, -1.0),))
+    chain = replace(chain, effects=((name, -1.002),))
+    q = chain.random_joints(20, np.random.default_rng(1))
+    for each in exports(chain, nominal):
+        in_file = each.name in ('dh_standard.yaml', 'dh_modified.yaml')
+        assert (each.error == 0.0) == in_file
+        assert ('; exact; ' in each.content.splitlines()[0]) == in_file
+        if in_file:
+            again = parse_chain(each.content)
+            assert again.effects == chain.effects
+            np.testing.assert_allclose(again.forward(q), chain.forward(q), rtol=0.0, atol=1e-9)
 
 
 def test_a_file_that_differs_is_refused(monkeypatch):
@@ -258,3 +274,11 @@ def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
     assert error(near) < 0.5 * error(files())
     rows = csv.DictReader(near['dh_without_beta.csv'].splitlines()[1:])
     assert all(float(row['beta']) == 0.0 for row in rows)
+
+
+def test_the_command_line_tells_what_tables_cannot_hold(run, tmp_path):
+    _, chain = corrected('ur10e')
+    chain = replace(chain, effects=(('elbow_joint.ratio', 1e-3),))
+    (tmp_path / 'calibration.yaml').write_text(dump_chain(chain, {'source': 'simulation'}))
+    _, _, said = run('export', 'calibration.yaml', '--chain', 'ur10e', '--out', 'out')
+    assert 'tables cannot hold the fitted effects elbow_joint.ratio; for the best' in said

@@ -184,7 +184,7 @@ def program_yaml(path):
 def _program(path):
     from calib_ros.files.programs import read_program
 
-    read = read_program(path, ARM.joint_names)
+    read = read_program(path, ARM)
     read.text_with(read.program)
 
 

@@ -52,16 +52,25 @@ def test_mimicking_joints_follow_whatever_is_reported_of_them(rng):
     np.testing.assert_allclose(CHAIN.forward(reported), expected, rtol=0.0, atol=1e-9)
 
 
-def test_a_corrected_urdf_keeps_them(rng):
-    true = faulty(CHAIN, Cell(), rng)
-    true = replace(true, effects=CHAIN.effects)
-    text = corrected_urdf(PALLETISER, true)
-    again = chain_from_urdf(text)
-    q = CHAIN.random_joints(20, rng)
-    arm = replace(true, base=again.base, tool=again.tool)
-    away = again.forward(q) @ np.linalg.inv(arm.forward(q))
-    assert np.ptp(away, axis=0).max() < 1e-9
-    assert again.effects == CHAIN.effects
+@pytest.mark.parametrize('changes', [(0.0, 0.0), (-2e-3, 0.0), (1e-3, -1e-3)])
+@pytest.mark.parametrize('ratio', [' multiplier="-1"', ''])
+def test_a_corrected_urdf_has_the_fitted_couplings(changes, ratio, rng):
+    """Also where a multiplier is missing, which then is 1."""
+    urdf = PALLETISER.replace(' multiplier="-1"', ratio, 1)
+    nominal = chain_from_urdf(urdf)
+    effects = zip(nominal.effects, changes, strict=True)
+    fitted = tuple((name, value + change) for (name, value), change in effects)
+    true = replace(faulty(nominal, Cell(), rng), effects=fitted)
+    text = corrected_urdf(urdf, true)
+    assert chain_from_urdf(text).effects == fitted
+    q = nominal.random_joints(20, rng)
+    q[:, 3:5] = q[:, 1:3] * [value for _, value in fitted] + [0.0, 0.1]
+    rows = [dict(zip(NAMES, row.tolist(), strict=True)) for row in q]
+    found = [reference_forward(text, row, 'base', 'tool0') for row in rows]
+    arm = replace(true, base=nominal.base, tool=nominal.tool)
+    np.testing.assert_allclose(found, arm.forward(q), rtol=0.0, atol=1e-9)
+    kept = bool(ratio) and not changes[0], not changes[1]
+    assert text.count('multiplier="-1"') == sum(kept)
 
 
 @pytest.mark.parametrize('oriented', [True, False])
@@ -101,8 +110,16 @@ def test_the_first_joint_of_a_column_leads_the_others_of_a_motor_elsewhere(secon
         expected = reference_forward(column, values, 'base', 'tool0')
         found = chain.forward(np.array([[outer, 0.0, turn]]))[0]
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
-    assert chain_from_urdf(corrected_urdf(column, chain)).effects == chain.effects
     assert len(q) == 5
+    ((name, value),) = chain.effects
+    effects = ((name, 1.01 * value),)
+    if 'motor' in second:
+        with pytest.raises(ConfigError, match='one that has an offset itself'):
+            corrected_urdf(column, replace(chain, effects=effects))
+        column = column.replace(' offset="0.1"', '')
+    fitted = replace(chain_from_urdf(column), effects=effects)
+    found = dict(chain_from_urdf(corrected_urdf(column, fitted)).effects)
+    assert found == {name: pytest.approx(1.01 * value, rel=1e-12)}
 
 
 def test_without_couplings_in_the_chain_they_are_named(rng):

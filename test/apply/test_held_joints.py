@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Uses of a calibration for arms with a joint that never moves, or that only couplings move."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commanded import CELL, missed, regular
+
+from calib_ros.apply.compensation import Compensator, compensate
+from calib_ros.apply.program import Program, compensate_program
+from calib_ros.apply.simulation import faulty
+from calib_ros.apply.verification import _meant
+from calib_ros.errors import InputError
+from calib_ros.files.programs import program_of, read_joints
+from calib_ros.kinematics.chain import Chain, Joint
+from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.follower import mobility
+from calib_ros.kinematics.inverse import solve
+
+IIWA = load_chain('kuka_iiwa14')
+LOCKED = replace(
+    IIWA,
+    joints=tuple(
+        replace(j, lower=0.3, upper=0.3) if k == 2 else j for k, j in enumerate(IIWA.joints)
+    ),
+)
+HAND = 3
+PALLETISER = Chain(
+    'palletiser',
+    'standard',
+    (
+        Joint('turn', a=0.3, alpha=-np.pi / 2, d=0.8, lower=-3.0, upper=3.0),
+        Joint('lower', a=1.1, theta=-np.pi / 2, lower=-0.8, upper=1.5),
+        Joint('upper', a=1.2, theta=np.pi / 2, lower=-1.2, upper=1.0),
+        Joint('level', a=0.2, alpha=-np.pi / 2, lower=0.0, upper=0.0),
+        Joint('wrist', d=0.2, lower=-6.0, upper=6.0),
+    ),
+    effects=(('level.coupling_lower', -1.0), ('level.coupling_upper', -1.0)),
+)
+MOVING = [0, 1, 2, 4]
+
+
+@pytest.fixture
+def compensator():
+    return Compensator(PALLETISER, faulty(PALLETISER, CELL, np.random.default_rng(3)))
+
+
+@pytest.fixture
+def path():
+    """A smooth program of the palletiser, and its velocities."""
+    t = np.linspace(0.0, 1.0, 30)
+    q = np.column_stack([t, 0.5 * t - 0.3, 0.2 - 0.4 * t, 0.0 * t, 2.0 * t])
+    return q, np.gradient(q, t, axis=0)
+
+
+def test_a_locked_joint_does_not_count_as_moving(rng):
+    assert mobility(LOCKED)[0] == 6
+    assert mobility(PALLETISER) == (4, 3, 1)
+    q = LOCKED.random_joints(100, rng)
+    found = solve(LOCKED, LOCKED.forward(q), q + rng.normal(scale=0.03, size=q.shape))
+    assert found.converged.mean() > 0.97
+    np.testing.assert_array_equal(found.joints[:, 2], 0.3)
+
+
+def test_an_arm_with_a_locked_joint_is_corrected_with_its_velocities(rng):
+    true = faulty(LOCKED, CELL, rng)
+    compensator = Compensator(LOCKED, true)
+    q = regular(replace(LOCKED, joints=IIWA.joints), 100)
+    q[:, 2] = 0.3
+    program = Program(LOCKED.joint_names, q, velocities=0.1 * np.ones_like(q))
+    _, result = compensate_program(compensator, program)
+    kept = ~np.isnan(result.joints).any(axis=1)
+    assert kept.mean() > 0.9
+    assert missed(compensator, q[kept], result.joints[kept]).max() < 1e-6
+    np.testing.assert_array_equal(result.joints[kept, 2], 0.3)
+
+
+def test_what_is_commanded_of_a_coupled_joint_does_not_count(compensator, path):
+    q, velocities = path
+    expected = compensate(compensator, q).joints
+    assert missed(compensator, q, expected)[0].max() < 1e-6
+    told = q.copy()
+    told[:, HAND] = -q[:, 1] - q[:, 2]
+    for names, columns in ((PALLETISER.joint_names, slice(None)), (MOVING, MOVING)):
+        names = [PALLETISER.joint_names[k] if isinstance(k, int) else k for k in names]
+        program = Program(tuple(names), told[:, columns], velocities[:, columns])
+        corrected, result = compensate_program(compensator, program)
+        assert not result.refusals
+        moved = corrected.positions[:, [names.index(PALLETISER.joint_names[k]) for k in MOVING]]
+        np.testing.assert_allclose(moved, expected[:, MOVING], rtol=0.0, atol=1e-12)
+        assert corrected.velocities.shape == program.velocities.shape
+        if len(names) == 5:
+            np.testing.assert_array_equal(corrected.positions[:, HAND], told[:, HAND])
+
+
+def test_measurements_find_their_command_whatever_is_reported_of_it(compensator, path):
+    q, _ = path
+    measured = compensate(compensator, q).joints
+    measured[:, HAND] = -q[:, 1] - q[:, 2]
+    commanded, corrected = _meant(PALLETISER, compensator.calibrated, measured, q)
+    np.testing.assert_array_equal(commanded, q)
+    assert corrected.all()
+
+
+def test_tables_need_not_have_held_joints(tmp_path, path):
+    file = tmp_path / 'program.csv'
+    file.write_text('q1,q2,q3,q5,s1,s2,s3,s5,label\n0.1,0.2,0.3,0.4,1,-1,0,1,pick\n')
+    np.testing.assert_array_equal(read_joints(file, PALLETISER), [[0.1, 0.2, 0.3, 0.0, 0.4]])
+    source = program_of(file, PALLETISER)
+    assert source.program.names == ('turn', 'lower', 'upper', 'wrist')
+    np.testing.assert_array_equal(source.program.approach, [[1.0, -1.0, 0.0, 0.0, 1.0]])
+    moved = replace(source.program, positions=source.program.positions + 1.0)
+    assert source.text_with(moved).splitlines()[1] == '1.1,1.2,1.3,1.4,1,-1,0,1,pick'
+    file.write_text('q1,q2,q5\n0.1,0.2,0.4\n')
+    with pytest.raises(InputError, match='q3'):
+        read_joints(file, PALLETISER)
+
+
+def test_a_command_that_moves_a_locked_joint_is_refused(rng):
+    q = LOCKED.random_joints(1, rng)
+    q[0, 2] = 0.31
+    (refusal,) = compensate(Compensator(LOCKED, LOCKED), q).refusals
+    assert 'the command 0.31 of' in refusal.reason
