@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.columns import MadeColumns, like_joints, lines_in_words, named_by_option
+from calib_ros.files.columns import Columns, like_joints, lines_in_words, named_by_option
 from calib_ros.files.layouts import (
     ANGLES,
     COVARIANCE,
@@ -53,7 +53,7 @@ class Foreign:
     log: Path | None = None  # separate table of the joint values
     log_layout: Layout = field(default_factory=Layout)
 
-    def convert(self, path: Path) -> tuple[MadeColumns, tuple[str, ...]]:
+    def convert(self, path: Path) -> tuple[Columns, tuple[str, ...]]:
         """Return our columns of a table, and notes about guesses and omissions."""
         table = _Table(path, self.layout, self.chain, self.log is None)
         values, notes, lines = table.values(), table.notes, table.lines
@@ -74,7 +74,7 @@ class Foreign:
                     'measurement needs the row of its joint values'
                 )
             notes += [*log.notes, f'row by row, {self.log} holds the joint values of {path}']
-        made = MadeColumns(path, lines, values, table.words(), table.header)
+        made = Columns(path, lines, table.words(), values, table.header)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         measured = [made.values[name] for name in MEASURED if name in made.values]
@@ -86,7 +86,7 @@ class Foreign:
         return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 
 
-def as_csv(columns: MadeColumns) -> str:
+def as_csv(columns: Columns) -> str:
     """Return the text of a table; numbers are exact."""
     names = sorted(columns.header, key=_place)
     return csv_text([names, *zip(*map(columns.texts, names), strict=True)])
@@ -184,13 +184,12 @@ class _Table:
     def header(self) -> tuple[str, ...]:
         return tuple(filter(None, self._sheet.header))
 
-    def words(self) -> dict[str, list[str]]:
+    def words(self) -> dict[str, str]:
         found = {}
         for ours in WORDS:
             if ours in self._ours:
                 number = self._sheet.number(_bare(self._ours[ours])) or ''
-                cells, known = self._sheet.columns.codes(number)
-                found[ours] = [known[cell] for cell in cells.tolist()]
+                found[ours] = self._sheet.columns.words[number]
         return found
 
     def values(self) -> dict[str, FloatArray]:
@@ -261,7 +260,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
     return found
 
 
-def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
+def _shifted(made: Columns, shift: int) -> Columns:
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')

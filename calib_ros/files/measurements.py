@@ -18,7 +18,6 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
-    MadeColumns,
     check_quaternions,
     distinct,
     lines_in_words,
@@ -282,7 +281,7 @@ def _check_header(columns: Columns, joints: int) -> None:
     missing = [name for name in dict.fromkeys(needed) if name not in header]
     if missing:
         refuse_separator(columns.path, columns.header)
-        found = (isinstance(columns, MadeColumns) and columns.theirs) or columns.header
+        found = columns.theirs or columns.header
         expected = ', '.join([*needed[:joints], *POSITION])
         raise ColumnsError(
             f'{columns.path} has no column {", ".join(missing)}; expected {expected} '

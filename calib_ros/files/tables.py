@@ -25,12 +25,11 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
-    MadeColumns,
+    columns_of,
     distinct,
     joints_left_out,
     lines_in_words,
 )
-from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
 from calib_ros.files.measurements import (
@@ -143,7 +142,7 @@ def _table(
     return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)
 
 
-def check_table(made: MadeColumns) -> None:
+def check_table(made: Columns) -> None:
     """Refuse columns that no table may have: any sessions, with as many joints as there are."""
     joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.header)
     if not joints:
@@ -151,7 +150,8 @@ def check_table(made: MadeColumns) -> None:
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
-    _table(_chosen(made, joints, tuple(dict.fromkeys(made.words.get('session', ())))))
+    sessions = made.texts('session') if 'session' in made.words else ()
+    _table(_chosen(made, joints, tuple(dict.fromkeys(sessions))))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
