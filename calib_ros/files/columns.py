@@ -82,14 +82,10 @@ class Columns:
         self,
         names: Sequence[str],
         largest: float = LARGEST,
-        values: FloatArray | None = None,
         needed: Flags | bool = True,
     ) -> FloatArray:
-        """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none.
-
-        `values` are the numbers if already read.
-        """
-        found = self.numbers(names) if values is None else values
+        """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none."""
+        found = self.numbers(names)
         highest = max(found.max(initial=0.0), -found.min(initial=0.0))
         if np.isnan(highest):
             blank = np.isnan(found)
@@ -165,6 +161,13 @@ def of_rows(path: Path, rows: Iterable[Row], header: Sequence[str] = ()) -> Colu
         parts = zip(blocks, blank, strict=True)
         words[name] = BETWEEN.join(part[k] if k < len(part) else no for part, no in parts)
     return Columns(path, np.array(lines, dtype=np.intp), words)
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Return the rows of successive parts of one file."""
+    some = [each for each in parts if len(each.lines)]
+    words = {name: BETWEEN.join([each.words[name] for each in some]) for name in parts[0].words}
+    return replace(parts[0], lines=np.concatenate([each.lines for each in parts]), words=words)
 
 
 def read_columns(path: Path, needed: Sequence[str]) -> Columns:
