@@ -89,6 +89,7 @@ def csv_lines(text: str, where: str) -> io.TextIOBase:
             f'{where} has a line of {longest} characters, more than {most}: is it a table?'
         )
     lines.seek(0)
+    csv.field_size_limit(most)  # of the whole process
     return lines
 
 
