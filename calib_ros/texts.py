@@ -31,8 +31,7 @@ from calib_ros.errors import (
 LARGEST_TEXT = 10 * MOST_ENTRIES**2
 """Bytes of a chain file, calibration, URDF or YAML program."""
 LARGEST_TABLE = 10 * LARGEST_TEXT  # bytes of a table
-MOST_ROWS = LARGEST_TABLE // 500
-"""Rows of a table with quotes, which takes more memory; a journal row has 500 bytes."""
+MOST_ROWS = LARGEST_TABLE // 100  # rows of a table
 DEEPEST = MOST_ENTRIES // 50  # levels of nested YAML
 NESTED = (Mapping, list, tuple)
 MOST_NODES = LARGEST_TEXT // 20
@@ -81,14 +80,17 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
         ) from err
 
 
-def csv_lines(text: str, where: str) -> io.StringIO:
+def csv_lines(text: str, where: str) -> io.TextIOBase:
     """Return the lines of a table for csv, which reads lines of any length."""
-    longest, most = max(map(len, io.StringIO(text)), default=0), MOST_ENTRIES**2
+    lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding='utf-8', newline='')
+    longest, most = max(map(len, lines), default=0), MOST_ENTRIES**2
     if longest > most:
         raise InputError(
             f'{where} has a line of {longest} characters, more than {most}: is it a table?'
         )
-    return io.StringIO(text, newline='')
+    lines.seek(0)
+    csv.field_size_limit(most)  # of the whole process
+    return lines
 
 
 def dump_json(value: Any, indent: str = '') -> str:

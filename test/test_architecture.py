@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from calib_ros.cli.main import TEXTS
+from calib_ros.cli.commands import COMMANDS
 
 PACKAGE = Path(__file__).parents[1] / 'calib_ros'
 ORDER = (
@@ -141,8 +141,8 @@ def test_no_help_loads_anything_slow():
     heavy += [f'calib_ros.{folder}' for folder in LEVEL if folder != 'cli']
     lines = ['import sys', *(f'sys.modules[{name!r}] = None' for name in heavy)]
     lines += ['from contextlib import suppress', 'from calib_ros.cli.main import main']
-    for arguments in (['--help'], *([name, '--help'] for name in TEXTS)):
+    for arguments in (['--help'], *([name, '--help'] for name in COMMANDS)):
         lines.append(f'with suppress(SystemExit): main({arguments})')
     ran = subprocess.run([sys.executable, '-c', '\n'.join(lines)], capture_output=True, text=True)
     assert (ran.returncode, ran.stderr) == (0, '')
-    assert ran.stdout.count('usage: calib_ros') == len(TEXTS)
+    assert ran.stdout.count('usage: calib_ros') == len(COMMANDS)

@@ -190,7 +190,7 @@ def test_a_covariance_that_is_none_is_refused_everywhere(tmp_path, bad):
 
 
 def test_more_rows_than_any_table_has_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr('calib_ros.files.csv_columns.MOST_ROWS', 100)
+    monkeypatch.setattr('calib_ros.files.columns.MOST_ROWS', 100)
     path = tmp_path / 'table.csv'
     path.write_text('q1,q2,x,y,z\n' + '0,0,1,2,3,\n' * 101)
     for read in (read_table, read_journal):

@@ -1,21 +1,22 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The options of all commands; importing them loads nothing else.
+"""All commands with their options; importing them loads nothing else.
 
-They are written as their help shows them: groups, with a line for each option. The name is
-followed by `!` if required and, unless it is a flag, by a placeholder, which gives the type, or by
-choices `a|b`; then `*3`, `+` or `?` for several values, and `=` with the default. A line starting
-with `@` adds shared options.
+A command is written in lines: `# NAME MODULE.FUNCTION  DESCRIPTION`, `$ EXAMPLE`, then its
+options as the help shows them: groups, with a line for each option. The name is followed by `!` if
+required and, unless it is a flag, by a placeholder, which gives the type, or by choices `a|b`;
+then `*3`, `+` or `?` for several values, and `=` with the default. A line starting with `@` adds
+shared options. `## GROUP` is a heading of the overview.
 """
 
 from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from calib_ros.cli.common import OF_BAGS, Group, add_fields, add_settings, complete_robots
 from calib_ros.settings import AIMS, CRITERIA, EXCEPTION, GROWTH, MODELS, STORAGES, Limits
@@ -72,45 +73,38 @@ for the report
   --serial NAME=  serial number of the robot
   --device NAME=  measuring device and its serial number"""
 PDF = '  --pdf  also write report.pdf, starting with a certificate'
-OPTIONS = f"""
-# robots robots._robots
-# chain robots._chain
+WRITTEN = f"""
+## First steps
+# demo simulate._demo  simulate an arm, identify it, and compare the result with the truth
+$ demo
+$ demo --chain franka_panda --out demo_panda/
+what to simulate
+  --chain ROBOT=ur10e  {CHAIN}
+  --out FOLDER=demo  output folder
+  --force  {FORCE}
+{SIMULATION}
+# robots robots._robots  list the arms that come with calib_ros
+$ robots
+# chain robots._chain  print the chain file of a robot, to read or edit
+$ chain ur10e
+$ chain robot.urdf --tip-link tool0 --out robot.yaml
 which arm
   robot ROBOT  URDF, chain file, or a robot by its name (ur10e, ...)
   --base-link LINK  first link of the arm in a URDF; default: its root
   --tip-link LINK  last link of the arm in a URDF, such as tool0
   --convention NAME  DH convention for a URDF: standard or modified
   --out FILE  write this file instead of printing
-# demo simulate._demo
-what to simulate
-  --chain ROBOT=ur10e  {CHAIN}
-  --out FOLDER=demo  output folder
-  --force  {FORCE}
-{SIMULATION}
-# simulate simulate._run
+# simulate simulate._run  write the bag of a simulated robot cell, with the true chain
+$ simulate cell_bag --chain kuka_iiwa14 --poses 60
 what to simulate
   bag BAG  bag folder to write
   --chain! ROBOT  {CHAIN}
 {SIMULATION}
-# board camera._board
-the board
-  type charuco|markers  chessboard with markers, or markers alone
-  --columns! N  squares or markers across
-  --rows! N  squares or markers down
-  --square! M  side of a square, or marker spacing
-  --marker! M  side of a marker
-  --dictionary NAME=DICT_5X5_250  marker dictionary of OpenCV
-  --out! FILE  PDF to write, with its YAML beside it
-  --force  {FORCE}
-# images camera._images
-what to look at
-  images IMAGES  folder of images, or a bag
-  --board! FILE  YAML of the board
-  --topic NAME=  image topic, if a bag has several
-  --fewest N=6  fewest corners an image must show
-  --out! FILE  table to write: image, corner, u, v
-  --force  {FORCE}
-# plan plan._run
+## Calibrate
+# plan plan._run  choose the poses to measure, and predict the accuracy
+$ plan --chain ur10e --accuracy 0.1 --out plan.csv
+$ plan --chain ur10e --poses 40 --tracker 3 0 1 --cone 45 --out plan.csv
+$ plan --chain ur10e --iso9283 --out tests.csv
 what is wanted
   --chain! ROBOT  {CHAIN}
   --poses N  number of poses; default: 25, or as --accuracy needs
@@ -136,23 +130,11 @@ what the device sees
   --world  box and tracker are in the world frame, not the base frame
 @settings sigma_position sigma_orientation priors model fixed
 {REPORT}
-# fleet fleet._run_fleet
-which robots
-  plant PLANT  plant.yaml: list of robots (docs/fleet.md)
-  --history! DIR  folder or URL for the results
-  --out FOLDER  report: index.html, and a page per robot
-  --metrics FILE  file for the Prometheus textfile collector
-who does the work
-  --scheduler ADDRESS=  scheduler of a dask cluster: tcp://host:8786
-  --workers N=0  local processes; 0: one per core
-  --memory SIZE=2GiB  memory limit of each process
-alarms
-  --years N=100.0  years between false alarms of a robot measured every night
-# history fleet._run_history
-what to list
-  history DIR  folder or URL of a history
-  --robot SERIAL  only this robot
-# identify identify._run
+# identify identify._run  identify the errors of an arm from a bag or a table of measured poses
+$ identify measured.csv --chain ur10e --out result/
+$ identify recording/ --chain robot.urdf --out result/ --model auto
+$ identify export.csv --chain ur10e --length mm --angle deg --euler ZYX
+$ identify measured.csv --chain ur10e --session monday --json
 what to read
   measured MEASURED?  a table of measured poses (-: standard input), or a bag: folder, .mcap \
 or .db3
@@ -184,7 +166,39 @@ an earlier calibration (docs/history.md)
   --previous CALIBRATION  update this calibration with a few poses, and report what changed
   --growth MM={1e3 * GROWTH}  expected drift of lengths in a year; angles: twice as many mrad
 {MOVED}
-# verify verify._run
+## Use the calibration
+# export calibrated._export  write a calibration for controllers, drivers and URDF users
+$ export result/calibration.yaml --chain ur10e --out export/
+$ export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/
+what to export
+  calibration CALIBRATION  calibration.yaml from identify --out
+  --chain! ROBOT  {CHAIN}
+  --out! FOLDER  folder to write
+  --force  {FORCE}
+  --measured FILE  table with q1 ... qn where inexact forms must fit best; default: the whole \
+joint range
+for URDF and drivers
+  --urdf FILE  nominal URDF of the robot, to be corrected too
+  --base-link LINK  first link of the arm in the URDF
+  --tip-link LINK  last link of the arm in the URDF
+  --ur-hash calib_...=  checksum that the Universal Robots driver prints at its start, for \
+ur_kinematics.yaml
+# compensate calibrated._compensate  correct the joint values of a program
+$ compensate program.csv --chain ur10e --calibration result/ --out corrected.csv
+$ compensate path.yaml --chain ur10e --calibration result/ --out corrected.yaml
+what to correct
+  program PROGRAM  .csv with q1 ... qn, or .yaml with a JointTrajectory
+  --chain! ROBOT  {CHAIN}
+  --calibration! RESULT  {CALIBRATION}
+  --out! FILE  corrected program to write
+  --force  {FORCE}
+limits
+  --tool X,Y,Z=0,0,0  tool point in the flange frame [m]
+  @limits
+# verify verify._run  judge a calibrated arm on new measurements: its errors, PASS or FAIL
+$ verify new.csv --chain ur10e --calibration result/
+$ verify recording/ --chain ur10e --calibration result/ --tolerance 0.3
+$ verify new.csv --chain ur10e --calibration result/ --commanded tests.csv
 what to judge
   measured MEASURED  new measurements: a bag, or a table with reported q1..qn, x y z ...
   --chain! ROBOT  {CHAIN}
@@ -203,36 +217,9 @@ how to judge
 {LAYOUT}
 {REPORT}
 {PDF}
-# compare calibrated._compare
-what to compare
-  first FIRST  earlier {EARLIER}
-  second SECOND  later {EARLIER}
-  --json  print the difference as JSON
-# compensate calibrated._compensate
-what to correct
-  program PROGRAM  .csv with q1 ... qn, or .yaml with a JointTrajectory
-  --chain! ROBOT  {CHAIN}
-  --calibration! RESULT  {CALIBRATION}
-  --out! FILE  corrected program to write
-  --force  {FORCE}
-limits
-  --tool X,Y,Z=0,0,0  tool point in the flange frame [m]
-  @limits
-# export calibrated._export
-what to export
-  calibration CALIBRATION  calibration.yaml from identify --out
-  --chain! ROBOT  {CHAIN}
-  --out! FOLDER  folder to write
-  --force  {FORCE}
-  --measured FILE  table with q1 ... qn where inexact forms must fit best; default: the whole \
-joint range
-for URDF and drivers
-  --urdf FILE  nominal URDF of the robot, to be corrected too
-  --base-link LINK  first link of the arm in the URDF
-  --tip-link LINK  last link of the arm in the URDF
-  --ur-hash calib_...=  checksum that the Universal Robots driver prints at its start, for \
-ur_kinematics.yaml
-# workspace workspace._run
+# workspace workspace._run  map errors over the workspace, and place a task where they are smallest
+$ workspace result/ --chain ur10e --out map/
+$ workspace result/ --chain ur10e --task task.csv --out map/ --aim worst
 what to map
   result RESULT  folder from identify --out, or a calibrated chain file
   --chain! ROBOT  {CHAIN}
@@ -249,73 +236,117 @@ a task to place
   --cells N=9  placements along each axis
   --turns N=1  turns about the vertical to try
 {REPORT}
-# bag2csv convert._bag2csv
-what to convert
-  bag BAG  rosbag2 folder, .mcap or .db3 file
-  csv FILE  CSV to write
+## Over time
+# compare calibrated._compare  test what changed between two calibrations of one robot
+$ compare monday/ tuesday/
+$ compare before.yaml after.yaml --json
+what to compare
+  first FIRST  earlier {EARLIER}
+  second SECOND  later {EARLIER}
+  --json  print the difference as JSON
+# fleet fleet._run_fleet  identify all new recordings of a plant, and report which robots changed
+$ fleet plant.yaml --history history/ --out report/
+$ fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786
+which robots
+  plant PLANT  plant.yaml: list of robots (docs/fleet.md)
+  --history! DIR  folder or URL for the results
+  --out FOLDER  report: index.html, and a page per robot
+  --metrics FILE  file for the Prometheus textfile collector
+who does the work
+  --scheduler ADDRESS=  scheduler of a dask cluster: tcp://host:8786
+  --workers N=0  local processes; 0: one per core
+  --memory SIZE=2GiB  memory limit of each process
+alarms
+  --years N=100.0  years between false alarms of a robot measured every night
+# history fleet._run_history  list results over time
+$ history history/ --robot 0042
+what to list
+  history DIR  folder or URL of a history
+  --robot SERIAL  only this robot
+## Cameras and files
+# board camera._board  make a board for cameras, as a PDF in true size
+$ board charuco --columns 9 --rows 7 --square 0.03 --marker 0.022 --out board.pdf
+the board
+  type charuco|markers  chessboard with markers, or markers alone
+  --columns! N  squares or markers across
+  --rows! N  squares or markers down
+  --square! M  side of a square, or marker spacing
+  --marker! M  side of a marker
+  --dictionary NAME=DICT_5X5_250  marker dictionary of OpenCV
+  --out! FILE  PDF to write, with its YAML beside it
   --force  {FORCE}
-  --chain! ROBOT  {CHAIN}
-@settings {' '.join(OF_BAGS)}
-# csv2bag convert._csv2bag
-what to convert
-  csv TABLE  table of measured poses
-  bag BAG  bag folder to write
-  --chain! ROBOT  {CHAIN}
-  --session NAME  only rows with this name in the column session
-  --storage {'|'.join(STORAGES)}=mcap  storage format of the bag
-# import convert._convert
+# images camera._images  find the corners of a board in photographs
+$ images photographs/ --board board.yaml --out corners.csv
+what to look at
+  images IMAGES  folder of images, or a bag
+  --board! FILE  YAML of the board
+  --topic NAME=  image topic, if a bag has several
+  --fewest N=6  fewest corners an image must show
+  --out! FILE  table to write: image, corner, u, v
+  --force  {FORCE}
+# import convert._convert  convert a table from another system
+$ import export.csv --length mm --angle deg --euler ZYX --out measured.csv
+$ import export.csv --preset optitrack --joints log.csv --joints-preset kuka --out measured.csv
 what to convert
   table TABLE  CSV, text in columns, or .xlsx
   --chain ROBOT  {CHAIN}
   --out! FILE  CSV to write
   --force  {FORCE}
 {LAYOUT}
+# bag2csv convert._bag2csv  write the poses of a bag as a table
+$ bag2csv recording/ measured.csv --chain ur10e
+what to convert
+  bag BAG  rosbag2 folder, .mcap or .db3 file
+  csv FILE  CSV to write
+  --force  {FORCE}
+  --chain! ROBOT  {CHAIN}
+@settings {' '.join(OF_BAGS)}
+# csv2bag convert._csv2bag  write a table of measured poses as a bag
+$ csv2bag measured.csv measured_bag --chain ur10e --session monday
+what to convert
+  csv TABLE  table of measured poses
+  bag BAG  bag folder to write
+  --chain! ROBOT  {CHAIN}
+  --session NAME  only rows with this name in the column session
+  --storage {'|'.join(STORAGES)}=mcap  storage format of the bag
 """
-"""By command name, after MODULE.FUNCTION, which is imported when it runs."""
-COMMANDS = dict(part.split(' ', 1) for part in OPTIONS.split('\n# ')[1:])
-"""By name: MODULE.FUNCTION and, in the lines below, the options."""
-EXAMPLES = """
-robots
-chain ur10e
-chain robot.urdf --tip-link tool0 --out robot.yaml
-demo
-demo --chain franka_panda --out demo_panda/
-simulate cell_bag --chain kuka_iiwa14 --poses 60
-board charuco --columns 9 --rows 7 --square 0.03 --marker 0.022 --out board.pdf
-images photographs/ --board board.yaml --out corners.csv
-plan --chain ur10e --accuracy 0.1 --out plan.csv
-plan --chain ur10e --poses 40 --tracker 3 0 1 --cone 45 --out plan.csv
-plan --chain ur10e --iso9283 --out tests.csv
-fleet plant.yaml --history history/ --out report/
-fleet plant.yaml --history history/ --out report/ --scheduler tcp://head:8786
-history history/ --robot 0042
-identify measured.csv --chain ur10e --out result/
-identify recording/ --chain robot.urdf --out result/ --model auto
-identify export.csv --chain ur10e --length mm --angle deg --euler ZYX
-identify measured.csv --chain ur10e --session monday --json
-verify new.csv --chain ur10e --calibration result/
-verify recording/ --chain ur10e --calibration result/ --tolerance 0.3
-verify new.csv --chain ur10e --calibration result/ --commanded tests.csv
-compare monday/ tuesday/
-compare before.yaml after.yaml --json
-compensate program.csv --chain ur10e --calibration result/ --out corrected.csv
-compensate path.yaml --chain ur10e --calibration result/ --out corrected.yaml
-export result/calibration.yaml --chain ur10e --out export/
-export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/
-workspace result/ --chain ur10e --out map/
-workspace result/ --chain ur10e --task task.csv --out map/ --aim worst
-bag2csv recording/ measured.csv --chain ur10e
-csv2bag measured.csv measured_bag --chain ur10e --session monday
-import export.csv --length mm --angle deg --euler ZYX --out measured.csv
-import export.csv --preset optitrack --joints log.csv --joints-preset kuka --out measured.csv
-"""
-"""For the end of each help, without "calib_ros"."""
 
 
-def add_options(parser: argparse.ArgumentParser, written: str) -> None:
-    """Add options to a parser, as written in OPTIONS."""
+class Command(NamedTuple):
+    """A command as written above."""
+
+    group: str  # in the overview
+    home: str  # MODULE.FUNCTION, imported when it runs
+    text: str
+    examples: list[str]  # without "calib_ros"
+    options: list[str]
+
+
+def _commands() -> dict[str, Command]:
+    group, found = '', {}
+    for line in WRITTEN.strip().splitlines():
+        mark, _, rest = line.partition(' ')
+        if mark == '##':
+            group = rest
+        elif mark == '#':
+            head, text = rest.split('  ', 1)
+            name, home = head.split(' ')
+            found[name] = Command(group, home, text, [], [])
+        elif mark == '$':
+            found[name].examples.append(rest)
+        else:
+            found[name].options.append(line)
+    return found
+
+
+COMMANDS = _commands()
+"""By name, in the order of the overview."""
+
+
+def add_options(parser: argparse.ArgumentParser, written: Sequence[str]) -> None:
+    """Add the options of a command to its parser."""
     group: Group = parser
-    for line in filter(None, written.splitlines()):
+    for line in written:
         first, *names = line.split()
         if first == '@settings':
             add_settings(parser, names)
@@ -354,8 +385,3 @@ def _add_option(group: Group, option: str, text: str) -> None:
     action = group.add_argument(name.rstrip('!'), help=text, **given)
     if name.startswith('--chain'):
         action.completer = complete_robots  # type: ignore[attr-defined]
-
-
-def examples_of(name: str) -> list[str]:
-    """Return example commands of a name."""
-    return [line for line in EXAMPLES.splitlines() if line.split()[:1] == [name]]

@@ -20,47 +20,17 @@ import signal
 import sys
 import textwrap
 from collections.abc import Iterable, Sequence
+from itertools import groupby
 from typing import Any, NoReturn
 
 # matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from calib_ros import __version__
+from calib_ros.cli.commands import COMMANDS, add_options
 from calib_ros.cli.screen import Screen, fitted, help_width, wrapped
 from calib_ros.errors import CalibrationError, UnknownNameError, near, shortened, trouble
 
-GROUPS = {
-    'First steps': {
-        'demo': 'simulate an arm, identify it, and compare the result with the truth',
-        'robots': 'list the arms that come with calib_ros',
-        'chain': 'print the chain file of a robot, to read or edit',
-        'simulate': 'write the bag of a simulated robot cell, with the true chain',
-    },
-    'Calibrate': {
-        'plan': 'choose the poses to measure, and predict the accuracy',
-        'identify': 'identify the errors of an arm from a bag or a table of measured poses',
-    },
-    'Use the calibration': {
-        'export': 'write a calibration for controllers, drivers and URDF users',
-        'compensate': 'correct the joint values of a program',
-        'verify': 'judge a calibrated arm on new measurements: its errors, PASS or FAIL',
-        'workspace': 'map errors over the workspace, and place a task where they are smallest',
-    },
-    'Over time': {
-        'compare': 'test what changed between two calibrations of one robot',
-        'fleet': 'identify all new recordings of a plant, and report which robots changed',
-        'history': 'list results over time',
-    },
-    'Cameras and files': {
-        'board': 'make a board for cameras, as a PDF in true size',
-        'images': 'find the corners of a board in photographs',
-        'import': 'convert a table from another system',
-        'bag2csv': 'write the poses of a bag as a table',
-        'csv2bag': 'write a table of measured poses as a bag',
-    },
-}
-"""Commands by the groups of the overview, with descriptions."""
-TEXTS = {name: text for group in GROUPS.values() for name, text in group.items()}
 WAY = (
     ('calib_ros demo', 'a whole calibration, simulated'),
     ('calib_ros robots', 'the arms supplied'),
@@ -116,7 +86,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
         import argcomplete
 
         argcomplete.autocomplete(_parser(completed.split()[1:]))
-    if name == 'help' and given[1:2] and given[1] in TEXTS:
+    if name == 'help' and given[1:2] and given[1] in COMMANDS:
         name, *given = given[1], given[1], '--help'
     if name in ('-h', '--help', 'help') or not given:
         print(_overview())
@@ -124,14 +94,14 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
     if name == '--version':
         print(f'calib_ros {__version__}')
         raise SystemExit(0)
-    if name not in TEXTS:
+    if name not in COMMANDS:
         from pathlib import Path  # slow to load, not needed by the overview
 
         from calib_ros.cli.kinds import proposal
 
         words = proposal(Path(name))
         if words is None:
-            words = str(UnknownNameError('command', name, TEXTS))
+            words = str(UnknownNameError('command', name, COMMANDS))
         raise SystemExit(_failed(words, 2))
     parser = _parser(given)
     options, rest = parser.parse_known_args(given)
@@ -174,30 +144,24 @@ class _Parser(argparse.ArgumentParser):
 
 def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of all commands; only the given one has its options."""
-    from calib_ros.cli.commands import (  # not needed by the overview
-        COMMANDS,
-        add_options,
-        examples_of,
-    )
-
     parser = argparse.ArgumentParser(prog='calib_ros', add_help=False)
     names = parser.add_subparsers(required=True, metavar='COMMAND', parser_class=_Parser)
-    for name, text in TEXTS.items():
+    for name, command in COMMANDS.items():
         if name not in given:
             names.add_parser(name, add_help=False)
             continue
-        home, _, options = COMMANDS[name].partition('\n')
+        text = command.text
         added = names.add_parser(
             name,
             add_help=False,
             description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', help_width()),
-            epilog='\n'.join(['examples:', *map(_example, examples_of(name))]),
+            epilog='\n'.join(['examples:', *map(_example, command.examples)]),
             formatter_class=_Help,
         )
-        added.example = _example(examples_of(name)[0])
+        added.example = _example(command.examples[0])
         added.typed = given
-        added.set_defaults(home=home, parser=added)
-        add_options(added, options)
+        added.set_defaults(home=command.home, parser=added)
+        add_options(added, command.options)
         add_more = added.add_argument_group('output').add_argument
         text = 'print only warnings, errors and the output asked for'
         add_more('--quiet', action='store_true', help=text)
@@ -252,11 +216,10 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 def _overview() -> str:
     lines = [f'calib_ros {__version__}: kinematic calibration of industrial arms.']
-    for group, entries in GROUPS.items():
+    for group, commands in groupby(COMMANDS.items(), lambda each: each[1].group):
         lines += ['', f'{group}:']
-        for name, text in entries.items():
-            head = f'  {name:12}'
-            lines.append(wrapped(text, head, ' ' * 14, help_width()))
+        for name, command in commands:
+            lines.append(wrapped(command.text, f'  {name:12}', ' ' * 14, help_width()))
     lines += ['', 'Typical use:', *(f'  {command:45}{words}'.rstrip() for command, words in WAY)]
     lines += ['', '`calib_ros COMMAND --help` lists the options of a command, with examples.']
     return '\n'.join(lines)

@@ -27,8 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import Columns, check_quaternions, joints_left_out
-from calib_ros.files.csv_columns import read_columns
+from calib_ros.files.columns import Columns, check_quaternions, joints_left_out, read_columns
 from calib_ros.files.layouts import joint_columns
 from calib_ros.files.programs import POSE
 from calib_ros.kinematics import se3

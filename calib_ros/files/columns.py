@@ -1,39 +1,61 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A table by columns; errors name the line, and what its header lacks."""
+"""A table by columns, read from CSV; errors name the line, and what its header lacks."""
 
 from __future__ import annotations
 
+import csv
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import product, zip_longest
+from itertools import islice, product, zip_longest
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ColumnsError, InputError
+from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.progress import Notify, quiet
 from calib_ros.shown import some
-from calib_ros.texts import from_cell
+from calib_ros.texts import (
+    LARGEST_TABLE,
+    MOST_ROWS,
+    csv_lines,
+    decoded,
+    from_cell,
+    read_bytes,
+)
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 Row = tuple[int, Sequence[str]]  # line number and cells
+BETWEEN = '\0'
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The columns of the file at `path`; `lines` (N,) are those of the rows."""
+    """The columns of the file at `path`; `lines` (N,) are those of the rows.
+
+    They are `words` as read, one text with BETWEEN its cells, which takes a fifth of the memory of
+    a list, or `values` (N,) that were computed, with NaN for empty cells.
+    """
 
     path: Path
-    header: tuple[str, ...]
     lines: Index
+    words: Mapping[str, str]
+    values: Mapping[str, FloatArray] = field(default_factory=dict)
+    theirs: tuple[str, ...] = ()  # names in the file, if others
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """Return the names of the columns."""
+        return (*self.words, *self.values)
 
     def where(self, row: int, name: str) -> str:
         """Return the place of a cell for messages."""
@@ -49,7 +71,9 @@ class Columns:
 
     def numbers(self, names: Sequence[str], called: Sequence[str] = ()) -> FloatArray:
         """Return numbers (N, len(names)), NaN for empty cells; errors name them as `called`."""
-        found = self._numbers(names)
+        found = np.zeros((len(self.lines), len(names)))
+        for k, name in enumerate(names):
+            found[:, k] = self.values[name] if name in self.values else _numbers(self.texts(name))
         for row, k in np.argwhere(np.isinf(found))[:1].tolist():
             raise self._no_number(row, (called or names)[k], self.texts(names[k])[row])
         return found
@@ -58,14 +82,10 @@ class Columns:
         self,
         names: Sequence[str],
         largest: float = LARGEST,
-        values: FloatArray | None = None,
         needed: Flags | bool = True,
     ) -> FloatArray:
-        """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none.
-
-        `values` are the numbers if already read.
-        """
-        found = self.numbers(names) if values is None else values
+        """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none."""
+        found = self.numbers(names)
         highest = max(found.max(initial=0.0), -found.min(initial=0.0))
         if np.isnan(highest):
             blank = np.isnan(found)
@@ -96,77 +116,138 @@ class Columns:
         """Return the code (N,) of each row's name, and the names; empty without the column."""
         if name not in self.header:
             return np.zeros(len(self.lines), dtype=np.intp), ['']
-        numbers, found = self.codes(name)
+        numbers, found = numbered(self.texts(name))
         place, names = numbered([from_cell(each) for each in found])
         return place[numbers], names
 
     def blank(self, name: str) -> Flags:
         """Return (N,) which cells of a column are empty."""
+        if name in self.values:
+            return np.isnan(self.values[name])
         return np.array([not text for text in self.texts(name)], dtype=bool)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
-        raise NotImplementedError
+        if name in self.words:
+            return self.words[name].split(BETWEEN) if len(self.lines) else []
+        return ['' if value != value else repr(value) for value in self.values[name].tolist()]
 
     def select(self, rows: NDArray[np.generic] | slice) -> Columns:
         """Return some rows, by a mask (N,), indices (K,) or a slice."""
-        raise NotImplementedError
-
-    def codes(self, name: str) -> Codes:
-        """Return the code (N,) of each row's text, and the texts."""
-        return numbered(self.texts(name))
-
-    def _numbers(self, names: Sequence[str]) -> FloatArray:
-        """Return numbers (N, len(names)), infinite for cells without one."""
-        found = np.zeros((len(self.lines), len(names)))
-        for k, name in enumerate(names):
-            found[:, k] = list(map(_number, self.texts(name)))
-        return found
-
-
-@dataclass(frozen=True, eq=False)
-class MadeColumns(Columns):
-    """Columns that were computed, `values` (N,) with NaN for empty cells, or read by csv."""
-
-    values: Mapping[str, FloatArray]
-    words: Mapping[str, Sequence[str]]
-    theirs: tuple[str, ...] = ()  # names in the file, if others
-    header: tuple[str, ...] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, 'header', (*self.words, *self.values))
-
-    def select(self, rows: NDArray[np.generic] | slice) -> MadeColumns:
-        """Return some rows, by a mask (N,), indices (K,) or a slice."""
         index = np.arange(len(self.lines))[rows].tolist()
-        return replace(
-            self,
-            lines=self.lines[rows],
-            values={name: value[rows] for name, value in self.values.items()},
-            words={name: [words[k] for k in index] for name, words in self.words.items()},
+        words = {}
+        for name in self.words:
+            texts = self.texts(name)
+            words[name] = BETWEEN.join([texts[k] for k in index])
+        values = {name: value[rows] for name, value in self.values.items()}
+        return replace(self, lines=self.lines[rows], values=values, words=words)
+
+
+def of_rows(path: Path, rows: Iterable[Row], header: Sequence[str] = ()) -> Columns:
+    """Return columns of rows that may end early; further ones are `#1`, `#2` ..."""
+    lines: list[int] = []
+    blocks: list[list[str]] = []
+    blank: list[str] = []  # of each block
+    rows = iter(rows)
+    while block := list(islice(rows, MOST_ENTRIES)):
+        lines += [line for line, _ in block]
+        cells = zip_longest(*(cells for _, cells in block), fillvalue='')
+        blocks.append([BETWEEN.join(column) for column in cells])
+        blank.append(BETWEEN * (len(block) - 1))
+    width = max([len(header), *map(len, blocks)])
+    names = [*header, *(f'#{k + 1}' for k in range(len(header), width))]
+    words = {}
+    for k, name in enumerate(names):
+        parts = zip(blocks, blank, strict=True)
+        words[name] = BETWEEN.join(part[k] if k < len(part) else no for part, no in parts)
+    return Columns(path, np.array(lines, dtype=np.intp), words)
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Return the rows of successive parts of one file."""
+    some = [each for each in parts if len(each.lines)]
+    words = {name: BETWEEN.join([each.words[name] for each in some]) for name in parts[0].words}
+    return replace(parts[0], lines=np.concatenate([each.lines for each in parts]), words=words)
+
+
+def read_columns(path: Path, needed: Sequence[str]) -> Columns:
+    """Return the columns of a CSV that has rows and the needed columns."""
+    return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
+
+
+def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0) -> Columns:
+    """Return the columns of a CSV's content; refuse anything else, or too large.
+
+    `above` is the number of lines of the file before it.
+    """
+    if (place := data.find(b'\0')) >= 0:
+        line = above + 1 + data.count(b'\n', 0, place)
+        raise ColumnsError(
+            f'{path} is not UTF-8 text, line {line} has zero bytes: is it a workbook, or damaged? '
+            'Save it as CSV in UTF-8'
         )
-
-    def blank(self, name: str) -> Flags:
-        """Return (N,) which cells of a column are empty."""
-        return np.isnan(self.values[name]) if name in self.values else super().blank(name)
-
-    def texts(self, name: str) -> list[str]:
-        """Return the cells of a column."""
-        if name in self.words:
-            return list(self.words[name])
-        return ['' if value != value else repr(value) for value in self.values[name].tolist()]
-
-    def _numbers(self, names: Sequence[str]) -> FloatArray:
-        if set(names) <= set(self.values):
-            return np.array([self.values[name] for name in names]).T
-        return super()._numbers(names)
+    text = decoded(data, str(path), ColumnsError)
+    rows = csv_rows(path, text, strict=True, above=above)
+    header = [name.strip() for name in next((row for _, row in rows if row), [])]
+    twice = [name for name, count in Counter(header).items() if name and count > 1]
+    if twice:
+        raise ColumnsError(f'{path} has several columns {", ".join(twice)}: rename all but one')
+    end = above + text.count('\n') + 1
+    return of_rows(path, _below(path, header, rows, end, progress), header)
 
 
-def of_cells(path: Path, header: Sequence[str], rows: Sequence[Row]) -> MadeColumns:
-    """Return columns of rows that may end early, each with its line."""
-    cells = zip_longest(header, *(row for _, row in rows), fillvalue='')
-    words = {name: column for name, *column in cells}
-    return MadeColumns(path, np.array([line for line, _ in rows], dtype=np.intp), {}, words)
+def _below(
+    path: Path, header: Sequence[str], rows: Iterable[Row], end: int, progress: Notify
+) -> Iterator[Row]:
+    """Yield the rows below a header, up to a last line; refuse more values than names."""
+    width, count = len(header), 0
+    for line, row in rows:
+        if not row:
+            continue
+        if len(row) > width and any(row[width:]):
+            refuse_separator(path, header)
+            raise ColumnsError(
+                f'{path}, line {line}: more values than the {width} columns of its header; '
+                'remove other lines above that (of measurements: calib_ros import)'
+            )
+        if count == MOST_ROWS:
+            raise InputError(
+                f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
+            )
+        if count % MOST_ENTRIES == 0:
+            progress(min(line / end, 1.0))
+        count += 1
+        yield line, row[:width]
+
+
+def csv_rows(
+    path: Path, text: str, separator: str = ',', strict: bool = False, above: int = 0
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line at which each row ends, and its cells; `above` lines precede the text."""
+    reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
+    line = 0
+    try:
+        for row in reader:
+            if len(row) > MOST_ENTRIES:
+                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
+            line = reader.line_num
+            yield above + line, row
+    except csv.Error as err:
+        raise InputError(
+            f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '
+            'paired?'
+        ) from err
+
+
+def _numbers(texts: Sequence[str]) -> FloatArray:
+    """Return the numbers (N,) in cells, NaN if blank, infinity if there is none."""
+    if not any(texts):
+        return np.full(len(texts), np.nan)
+    try:
+        found = np.fromiter(map(float, texts), float, len(texts))
+    except (ValueError, OverflowError):
+        return np.fromiter(map(_number, texts), float, len(texts))
+    return np.where(np.isfinite(found), found, np.inf)
 
 
 def _number(text: str) -> float:

@@ -13,7 +13,8 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.columns import (
-    MadeColumns,
+    BETWEEN,
+    Columns,
     as_typed,
     like_joints,
     lines_in_words,
@@ -61,7 +62,7 @@ class Foreign:
     log: Path | None = None  # separate table of the joint values
     log_layout: Layout = field(default_factory=Layout)
 
-    def convert(self, path: Path) -> tuple[MadeColumns, tuple[str, ...]]:
+    def convert(self, path: Path) -> tuple[Columns, tuple[str, ...]]:
         """Return our columns of a table, and notes about guesses and omissions."""
         table = _Table(path, self.layout, self.chain, self.log is None)
         values, notes, lines = table.values(), table.notes, table.lines
@@ -84,7 +85,7 @@ class Foreign:
             how = f'by the column "{name}"' if name else 'row by row'
             notes += [*log.notes, f'{how}, {self.log} holds the joint values of {path}']
             values = {ours: each[partners] for ours, each in joints.items()} | values
-        made = MadeColumns(path, lines, values, table.words(), table.header)
+        made = Columns(path, lines, table.words(), values, table.header)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         measured = [made.values[name] for name in MEASURED if name in made.values]
@@ -96,7 +97,7 @@ class Foreign:
         return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
 
 
-def as_csv(columns: MadeColumns) -> str:
+def as_csv(columns: Columns) -> str:
     """Return the text of a table; numbers are exact."""
     names = sorted(columns.header, key=_place)
     return csv_text([names, *zip(*map(columns.texts, names), strict=True)])
@@ -194,13 +195,13 @@ class _Table:
     def header(self) -> tuple[str, ...]:
         return tuple(filter(None, self._sheet.header))
 
-    def words(self) -> dict[str, list[str]]:
-        return {o: self.cells(_bare(self._ours[o])) for o in WORDS if o in self._ours}
+    def words(self) -> dict[str, str]:
+        used = {ours: _bare(self._ours[ours]) for ours in WORDS if ours in self._ours}
+        return {ours: BETWEEN.join(self.cells(name)) for ours, name in used.items()}
 
     def cells(self, name: str) -> list[str]:
         """Return the texts of a column."""
-        cells, known = self._sheet.columns.codes(self._sheet.number(name) or '')
-        return [known[cell] for cell in cells.tolist()]
+        return self._sheet.columns.texts(self._sheet.number(name) or '')
 
     def values(self) -> dict[str, FloatArray]:
         """Return our columns in m and rad."""
@@ -294,7 +295,7 @@ def _own_names(chain: Chain | None, joints: bool, alone: bool) -> dict[str, str]
     return found
 
 
-def _shifted(made: MadeColumns, shift: int) -> MadeColumns:
+def _shifted(made: Columns, shift: int) -> Columns:
     count = len(made.lines)
     if abs(shift) >= count:
         raise ConfigError(f'--shift {shift} leaves none of {count} rows')

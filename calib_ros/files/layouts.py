@@ -26,7 +26,7 @@ import numpy as np
 
 from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import MadeColumns, check_quaternions
+from calib_ros.files.columns import BETWEEN, Columns, check_quaternions
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import TWO_TURNS, shared_files
 from calib_ros.kinematics.se3 import FloatArray
@@ -246,14 +246,14 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
     return replace(layout, columns=merged, **changes)
 
 
-def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
+def finished(made: Columns, layout: Layout) -> Columns:
     """Return the columns with quaternions for rotations, covariances for standard deviations."""
     path, values, words = made.path, dict(made.values), dict(made.words)
     time = values.pop('time', None)
     if time is not None:
         for line in made.lines[~(np.abs(time) <= 9e9)][:1].tolist():
             raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
-        words['stamp_ns'] = [str(round(each * 1e9)) for each in time.tolist()]
+        words['stamp_ns'] = BETWEEN.join(str(round(each * 1e9)) for each in time.tolist())
     rotation, axes = _rotations(values, layout, made)
     sigmas = [values.pop(name, None) for name in SIGMAS]
     for name in (*TURNS, *IN_TURN):
@@ -276,7 +276,7 @@ def finished(made: MadeColumns, layout: Layout) -> MadeColumns:
 
 
 def _rotations(
-    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
+    values: dict[str, FloatArray], layout: Layout, made: Columns
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """Return rotations (N, 3, 3), and the axes (N, 3, 3) of their sigmas in columns, or None."""
     if set(QUATERNION) & set(values):
@@ -337,7 +337,7 @@ def _from_euler(
 
 
 def _from_quaternions(
-    values: dict[str, FloatArray], layout: Layout, made: MadeColumns
+    values: dict[str, FloatArray], layout: Layout, made: Columns
 ) -> tuple[FloatArray, FloatArray]:
     missing = [name for name in QUATERNION if name not in values]
     if missing:
@@ -352,7 +352,7 @@ def _from_quaternions(
     return se3.from_quat(quat), np.tile(np.eye(3), (len(quat), 1, 1))
 
 
-def _require_whole(values: FloatArray, made: MadeColumns, names: str) -> None:
+def _require_whole(values: FloatArray, made: Columns, names: str) -> None:
     for row in np.flatnonzero(np.isnan(values).any(axis=1))[:1].tolist():
         raise InputError(f'{made.where(row, names)} must be numbers, not blank')
 

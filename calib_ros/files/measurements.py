@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,6 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
-    MadeColumns,
     check_quaternions,
     distinct,
     lines_in_words,
@@ -167,28 +166,6 @@ class Measurements:
                 )
 
 
-def joined(parts: Sequence[Measurements]) -> Measurements:
-    """Return the rows of successive parts of one file."""
-    found: dict[str, object] = {}
-    sizes = [len(each.lines) for each in parts]
-    for item in fields(Measurements):
-        values = [getattr(each, item.name) for each in parts]
-        some = next((value for value in values if value is not None), None)
-        if isinstance(some, np.ndarray):
-            found[item.name] = np.concatenate(
-                [
-                    np.full((size, *some.shape[1:]), np.nan) if value is None else value
-                    for value, size in zip(values, sizes, strict=True)
-                ]
-            )
-        elif isinstance(some, tuple):
-            place, names = numbered([name for _, different in values for name in different])
-            begins = np.cumsum([0, *(len(different) for _, different in values)])
-            codes = [place[begin + value[0]] for begin, value in zip(begins, values, strict=False)]
-            found[item.name] = np.concatenate(codes), names
-    return replace(parts[0], **found)  # type: ignore[arg-type]
-
-
 def measurements(columns: Columns, joints: int) -> Measurements:
     """Return the measurements in a table; refuse invalid rows."""
     header = columns.header
@@ -203,13 +180,11 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         )
     kind = filled.argmax(axis=0)
     placed = kind == POSE
-    read = _Blocks(columns, joints)
     count = len(columns.lines)
-    angles = read.of(joint_columns(joints), True)
-    assert angles is not None
-    position = read.of(POSITION, placed)
-    oriented, rotation = _turned(columns, read.of(QUATERNION, False), placed)
-    signs = read.of(joint_columns(joints, 's'), False, LARGEST_RATE)
+    angles = columns.block(joint_columns(joints))
+    position = _block(columns, POSITION, placed)
+    oriented, rotation = _turned(columns, _block(columns, QUATERNION, False), placed)
+    signs = _block(columns, joint_columns(joints, 's'), False, LARGEST_RATE)
     split = choices(columns, 'split', SPLITS, 'train or test')
     ones = np.ones(count, dtype=np.int64)
     return Measurements(
@@ -218,14 +193,14 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         _stamps(columns),
         angles,
         None if signs is None else np.sign(signs),
-        read.of(joint_columns(joints, 'v'), False, LARGEST_RATE),
-        read.of(joint_columns(joints, 'a'), False, LARGEST_RATE),
+        _block(columns, joint_columns(joints, 'v'), False, LARGEST_RATE),
+        _block(columns, joint_columns(joints, 'a'), False, LARGEST_RATE),
         kind,
         np.zeros((count, 3)) if position is None else position,
         rotation,
         oriented,
-        np.where(kind == PLANE, 0.0, read.one('distance', needed=kind == DISTANCE)),
-        _covariance(columns, read.of(COVARIANCE, False, LARGEST**2), placed, oriented),
+        np.where(kind == PLANE, 0.0, _one(columns, 'distance', needed=kind == DISTANCE)),
+        _covariance(columns, _block(columns, COVARIANCE, False, LARGEST**2), placed, oriented),
         columns.labels('session'),
         _devices(columns, kind),
         columns.labels('target'),
@@ -234,41 +209,28 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
         split == 'test',
         split == 'removed',
-        read.one('delay'),
+        _one(columns, 'delay'),
         columns.integers('count', ones) if 'count' in header else ones,
-        read.one('spread', math.inf),
+        _one(columns, 'spread', math.inf),
     )
 
 
-class _Blocks:
-    """The numbers of a table, read at once."""
+def _block(
+    columns: Columns, names: tuple[str, ...], needed: Flags | bool, largest: float = LARGEST
+) -> FloatArray | None:
+    """Return the numbers (N, len(names)) of a block, None if all are blank."""
+    if names[0] not in columns.header:
+        return None
+    found = columns.block(names, largest, needed)
+    return None if len(found) and np.isnan(found[:, 0]).all() else found
 
-    def __init__(self, columns: Columns, joints: int) -> None:
-        self._columns = columns
-        blocks = [joint_columns(joints, letter) for letter in 'qsva']
-        singles = [(name,) for name in ('distance', 'delay', 'count', 'spread')]
-        self._at: dict[Sequence[str], slice] = {}
-        names: list[str] = []
-        for block in (*blocks, POSITION, QUATERNION, COVARIANCE, *singles):
-            if block[0] in columns.header:
-                self._at[block] = slice(len(names), len(names) + len(block))
-                names += block
-        self._numbers = columns.numbers(names)
 
-    def of(
-        self, names: tuple[str, ...], needed: Flags | bool, largest: float = LARGEST
-    ) -> FloatArray | None:
-        """Return the numbers (N, len(names)) of a block, None if all are blank."""
-        if names not in self._at:
-            return None
-        found = self._numbers[:, self._at[names]]
-        found = self._columns.block(names, largest, found, needed)
-        return None if len(found) and np.isnan(found[:, 0]).all() else found
-
-    def one(self, name: str, largest: float = LARGEST, needed: Flags | bool = False) -> FloatArray:
-        """Return the numbers (N,) of a column, 0 if blank."""
-        found = self.of((name,), needed, largest)
-        return np.zeros(len(self._columns.lines)) if found is None else np.nan_to_num(found[:, 0])
+def _one(
+    columns: Columns, name: str, largest: float = LARGEST, needed: Flags | bool = False
+) -> FloatArray:
+    """Return the numbers (N,) of a column, 0 if blank."""
+    found = _block(columns, (name,), needed, largest)
+    return np.zeros(len(columns.lines)) if found is None else np.nan_to_num(found[:, 0])
 
 
 def _check_header(columns: Columns, joints: int) -> None:
@@ -282,7 +244,7 @@ def _check_header(columns: Columns, joints: int) -> None:
     missing = [name for name in dict.fromkeys(needed) if name not in header]
     if missing:
         refuse_separator(columns.path, columns.header)
-        found = (isinstance(columns, MadeColumns) and columns.theirs) or columns.header
+        found = columns.theirs or columns.header
         expected = ', '.join([*needed[:joints], *POSITION])
         raise ColumnsError(
             f'{columns.path} has no column {", ".join(missing)}; expected {expected} '

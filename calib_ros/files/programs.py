@@ -19,8 +19,13 @@ import numpy as np
 
 from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
-from calib_ros.files.columns import Columns, check_quaternions, with_rows
-from calib_ros.files.csv_columns import columns_of, read_columns
+from calib_ros.files.columns import (
+    Columns,
+    check_quaternions,
+    columns_of,
+    read_columns,
+    with_rows,
+)
 from calib_ros.files.layouts import POSITION, QUATERNION, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain

@@ -10,14 +10,13 @@ from __future__ import annotations
 import codecs
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import DECIMAL_COMMA, Columns, Row, lines_in_words, of_cells
-from calib_ros.files.csv_columns import csv_rows, regular
+from calib_ros.files.columns import DECIMAL_COMMA, Columns, Row, csv_rows, lines_in_words, of_rows
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
@@ -80,30 +79,25 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     low = {name.lower() for name in known}
     used += [k for k, cell in enumerate(header) if cell.lower() in low]
     first = _first(path, rows, at, used, decimal, notes)
-    width = len(rows[first][1])
-    header = header or ('',) * width
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
-    columns: Columns | None = None
     start = rows[first][0]
+    body: Iterable[Row] = rows[first:]
     if text:
-        body = text[_after(text, start - 1) :].encode()
-        if decimal == ',':
-            body = body.replace(b',', b'.')
-        columns = regular(path, body, separator, _numbered(width), start - 1)
-        if columns is None:
-            rows = _cells(path, text, separator)
-    if columns is None:
-        rows = [(line, cells) for line, cells in rows if line >= start]
-        if decimal == ',':
-            rows = [(line, [cell.replace(',', '.') for cell in cells]) for line, cells in rows]
-        width = max(len(header), *(len(cells) for _, cells in rows))
-        columns = of_cells(path, _numbered(width), rows)
+        body = _below(path, text, start, separator)
+    if decimal == ',':
+        body = ((line, [cell.replace(',', '.') for cell in cells]) for line, cells in body)
+    columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     header = (*header, *[''] * (len(columns.header) - len(header)))
-    return Sheet(header[: len(columns.header)], above, columns, tuple(notes))
+    return Sheet(header, above, columns, tuple(notes))
 
 
-def _numbered(columns: int) -> list[str]:
-    return [f'#{k + 1}' for k in range(columns)]
+def _below(path: Path, text: str, start: int, separator: str) -> Iterator[Row]:
+    """Yield the rows of a text from a line on."""
+    body = text[_after(text, start - 1) :]
+    for line, cells in csv_rows(path, body, separator, above=start - 1):
+        found = [*map(str.strip, cells)]
+        if any(found):
+            yield line, found
 
 
 def _after(text: str, lines: int) -> int:
@@ -122,12 +116,12 @@ def _text(path: Path) -> tuple[str, str]:
             return data.decode('utf-16'), ''
         except UnicodeDecodeError as err:
             raise InputError(f'cannot read {path}: {err}') from err
-    with suppress(UnicodeDecodeError):
-        return data.decode('utf-8-sig'), ''
     if b'\0' in data:
         raise InputError(
             f'cannot read {path}: it is not text, and not a workbook by its name (.xlsx)'
         )
+    with suppress(UnicodeDecodeError):
+        return data.decode('utf-8-sig'), ''
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is not UTF-8'
 
 

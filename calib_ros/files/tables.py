@@ -25,12 +25,12 @@ from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
     Columns,
-    MadeColumns,
+    columns_of,
     distinct,
+    joined,
     joints_left_out,
     lines_in_words,
 )
-from calib_ros.files.csv_columns import columns_of
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
 from calib_ros.files.measurements import (
@@ -39,7 +39,6 @@ from calib_ros.files.measurements import (
     POSE,
     SOCKET,
     Measurements,
-    joined,
     measurements,
 )
 from calib_ros.kinematics import se3
@@ -76,21 +75,15 @@ def read_table(
     Raises InputError for a missing column, a value that is not a number, an ambiguous session, or
     measurements of one device in different frames. The message names the line.
     """
-    path, journal = Path(path), None
-    if foreign is None and path.is_file():  # a pipe can be read once only
-        journal = _of_journal(path, joints, progress)
-    if journal is not None:
-        rows, warnings = journal
-        if rows is None:
-            raise InputError(f'{path} has no rows')
-        rows = rows.select(_rows_of(path, rows.session, sessions))
-        return _table(rows, sigmas, eye_in_hand, warnings)
-    found: Columns
+    path, read = Path(path), None
     if foreign is not None:
-        found, warnings = foreign.convert(path)
-    else:
+        read = foreign.convert(path)
+    elif path.is_file():  # a pipe can be read once only
+        read = _of_journal(path, joints, progress)
+    if read is None:
         found = columns_of(path, read_bytes(path, LARGEST_TABLE, InputError), progress)
-        warnings = tuple(_unread(found, joints))
+        read = found, tuple(_unread(found, joints))
+    found, warnings = read
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
     return _table(rows, sigmas, eye_in_hand, warnings, by_line)
 
@@ -143,7 +136,7 @@ def _table(
     return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)
 
 
-def check_table(made: MadeColumns) -> None:
+def check_table(made: Columns) -> None:
     """Refuse columns that no table may have: any sessions, with as many joints as there are."""
     joints = sum(re.fullmatch('q[0-9]+', name) is not None for name in made.header)
     if not joints:
@@ -151,37 +144,38 @@ def check_table(made: MadeColumns) -> None:
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
-    _table(_chosen(made, joints, tuple(dict.fromkeys(made.words.get('session', ())))))
+    sessions = made.texts('session') if 'session' in made.words else ()
+    _table(_chosen(made, joints, tuple(dict.fromkeys(sessions))))
 
 
 def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
     """Return the samples of a journal, possibly none, and warnings; leave out damaged rows."""
     damaged: list[int] = []
-    made, warnings = _of_journal(path, joints, damaged=damaged) or (
-        measurements(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), joints),
+    found, warnings = _of_journal(path, joints, damaged=damaged) or (
+        columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)),
         (),
     )
     if damaged:
         words = f'{path}: {lines_in_words(damaged)} cannot be read: left out, but kept in the file'
         warnings = (*warnings, words)
-    return () if made is None else tuple(_samples(made.kept())), warnings
+    return tuple(_samples(measurements(found, joints).kept())), warnings
 
 
 def _of_journal(
     path: Path, joints: int, progress: Notify = quiet, damaged: list[int] | None = None
-) -> tuple[Measurements | None, tuple[str, ...]] | None:
-    """Return the rows of a journal, None if empty, and warnings; None for other files.
+) -> tuple[Columns, tuple[str, ...]] | None:
+    """Return the columns of a journal, and warnings; None for other files.
 
     It may have any length, since its samples were in memory: it is read in parts. The lines of
     damaged rows go into a list; without one they are refused.
     """
     header = ','.join(columns(joints)).encode() + b'\n'
-    parts: list[Measurements] = []
+    parts = [columns_of(path, header)]
     lines, rest = 1, b''
     try:
         with path.open('rb') as file:
             if (begin := file.read(len(header))) != header:
-                return (None, ()) if begin and header.startswith(begin) else None
+                return (parts[0], ()) if begin and header.startswith(begin) else None
             size = path.stat().st_size
             while data := file.read(LARGEST_TEXT):
                 whole, end, rest = (rest + data).rpartition(b'\n')
@@ -197,18 +191,18 @@ def _of_journal(
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
     cut_off = f'{path}: line {lines + 1} was cut off and is ignored'
-    return joined(parts) if parts else None, (cut_off,) if rest else ()
+    return joined(parts), (cut_off,) if rest else ()
 
 
 def _rows(
     path: Path, joints: int, lines: Sequence[bytes], above: int, damaged: list[int] | None
-) -> Iterator[Measurements]:
+) -> Iterator[Columns]:
     """Yield the rows in lines of a journal, in halves if one is damaged, until it is alone."""
     header = ','.join(columns(joints)).encode() + b'\n'
     try:
         found = columns_of(path, header + b''.join(lines), above=above)
-        made = measurements(found, joints)
         if damaged is not None:
+            made = measurements(found, joints)
             if found.blank('split').any():
                 raise InputError(f'{path} has incomplete rows')
             for text in filter(None, made.view[1]):
@@ -223,7 +217,7 @@ def _rows(
         yield from _rows(path, joints, lines[:half], above, damaged)
         yield from _rows(path, joints, lines[half:], above + half, damaged)
     else:
-        yield made
+        yield found
 
 
 def is_whole(row: bytes, width: int) -> bool:

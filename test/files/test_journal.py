@@ -12,7 +12,8 @@ from calib_ros.files import tables
 from calib_ros.files.archive import Journal
 from calib_ros.files.tables import read_journal, read_table, table_text
 from calib_ros.kinematics import se3
-from calib_ros.sampling.sample import Sample
+from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.sample import Sample, View
 
 JOINTS = 3
 floats = st.floats(-1e6, 1e6)  # what a session takes
@@ -97,6 +98,15 @@ def test_what_is_written_is_read(tmp_path_factory, many):
 
 def plain(number, **more):
     return Sample(number, 0.1 * number * np.ones(JOINTS), position=np.arange(3.0), **more)
+
+
+def test_a_view_of_thousands_of_corners_is_read(tmp_path):
+    """Its cell is longer than csv reads unless told so."""
+    seen = View(np.full((3000, 3), 1 / 3), np.full((3000, 2), 1000 / 3), Lens(9e2, 9e2, 5e2, 4e2))
+    written(tmp_path / 'cell.csv', [replace(plain(1), rotation=np.eye(3), view=seen)])
+    ((found,), warnings) = read_journal(tmp_path / 'cell.csv', JOINTS)
+    assert warnings == ()
+    np.testing.assert_array_equal(found.view.pixels, seen.pixels)
 
 
 def test_the_samples_of_a_bag_are_a_table_with_any_names(tmp_path):

@@ -7,8 +7,7 @@ import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files import loading
-from calib_ros.files.columns import distinct
-from calib_ros.files.csv_columns import read_columns
+from calib_ros.files.columns import distinct, read_columns
 from calib_ros.files.layouts import COVARIANCE
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
