@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import islice, product, zip_longest
+from itertools import chain, product, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ from calib_ros.texts import (
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
-Row = tuple[int, Sequence[str]]  # line number and cells
+Row = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
@@ -143,22 +143,21 @@ class Columns:
         return replace(self, lines=self.lines[rows], values=values, words=words)
 
 
-def of_rows(path: Path, rows: Iterable[Row], header: Sequence[str] = ()) -> Columns:
-    """Return columns of rows that may end early; further ones are `#1`, `#2` ..."""
+def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] = ()) -> Columns:
+    """Return columns of blocks of rows that may end early; further ones are `#1`, `#2` ..."""
     lines: list[int] = []
-    blocks: list[list[str]] = []
-    blank: list[str] = []  # of each block
-    rows = iter(rows)
-    while block := list(islice(rows, MOST_ENTRIES)):
+    columns: list[list[str]] = []  # of each block
+    blank: list[str] = []
+    for block in filter(None, blocks):
         lines += [line for line, _ in block]
         cells = zip_longest(*(cells for _, cells in block), fillvalue='')
-        blocks.append([BETWEEN.join(column) for column in cells])
+        columns.append([BETWEEN.join(column) for column in cells])
         blank.append(BETWEEN * (len(block) - 1))
-    width = max([len(header), *map(len, blocks)])
+    width = max([len(header), *map(len, columns)])
     names = [*header, *(f'#{k + 1}' for k in range(len(header), width))]
     words = {}
     for k, name in enumerate(names):
-        parts = zip(blocks, blank, strict=True)
+        parts = zip(columns, blank, strict=True)
         words[name] = BETWEEN.join(part[k] if k < len(part) else no for part, no in parts)
     return Columns(path, np.array(lines, dtype=np.intp), words)
 
@@ -187,56 +186,66 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
             'Save it as CSV in UTF-8'
         )
     text = decoded(data, str(path), ColumnsError)
-    rows = csv_rows(path, text, strict=True, above=above)
-    header = [name.strip() for name in next((row for _, row in rows if row), [])]
+    blocks = csv_blocks(path, text, strict=True, above=above)
+    first: list[Row] = next(blocks, [(above, [])])
+    header = [name.strip() for name in first[0][1]]
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise ColumnsError(f'{path} has several columns {", ".join(twice)}: rename all but one')
     end = above + text.count('\n') + 1
-    return of_rows(path, _below(path, header, rows, end, progress), header)
+    return of_rows(path, _below(path, header, chain([first[1:]], blocks), end, progress), header)
 
 
 def _below(
-    path: Path, header: Sequence[str], rows: Iterable[Row], end: int, progress: Notify
-) -> Iterator[Row]:
+    path: Path, header: Sequence[str], blocks: Iterable[list[Row]], end: int, progress: Notify
+) -> Iterator[list[Row]]:
     """Yield the rows below a header, up to a last line; refuse more values than names."""
     width, count = len(header), 0
-    for line, row in rows:
-        if not row:
-            continue
-        if len(row) > width and any(row[width:]):
-            refuse_separator(path, header)
-            raise ColumnsError(
-                f'{path}, line {line}: more values than the {width} columns of its header; '
-                'remove other lines above that (of measurements: calib_ros import)'
-            )
-        if count == MOST_ROWS:
+    for block in blocks:
+        for line, cells in block:
+            if len(cells) > width:
+                if any(cells[width:]):
+                    refuse_separator(path, header)
+                    raise ColumnsError(
+                        f'{path}, line {line}: more values than the {width} columns of its '
+                        'header; remove other lines above that (of measurements: calib_ros import)'
+                    )
+                del cells[width:]
+        count += len(block)
+        if count > MOST_ROWS:
             raise InputError(
                 f'{path} has more than {MOST_ROWS} rows: leave some out, evenly over time'
             )
-        if count % MOST_ENTRIES == 0:
-            progress(min(line / end, 1.0))
-        count += 1
-        yield line, row[:width]
+        yield block
+        progress(min(block[-1][0] / end, 1.0) if block else 0.0)
 
 
-def csv_rows(
+def csv_blocks(
     path: Path, text: str, separator: str = ',', strict: bool = False, above: int = 0
-) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line at which each row ends, and its cells; `above` lines precede the text."""
+) -> Iterator[list[Row]]:
+    """Yield rows that are not blank: the line at which each ends, and its cells.
+
+    `above` lines precede the text.
+    """
     reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
-    line = 0
+    line, block = 0, list[Row]()
     try:
         for row in reader:
+            line = reader.line_num
+            if row:
+                block.append((above + line, row))
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
-            line = reader.line_num
-            yield above + line, row
+            if len(block) == MOST_ENTRIES:
+                yield block
+                block = []
     except csv.Error as err:
         raise InputError(
             f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '
             'paired?'
         ) from err
+    if block:
+        yield block
 
 
 def _numbers(texts: Sequence[str]) -> FloatArray:

@@ -16,7 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from calib_ros.errors import MOST_ENTRIES, InputError
-from calib_ros.files.columns import DECIMAL_COMMA, Columns, Row, csv_rows, lines_in_words, of_rows
+from calib_ros.files.columns import (
+    DECIMAL_COMMA,
+    Columns,
+    Row,
+    csv_blocks,
+    lines_in_words,
+    of_rows,
+)
 from calib_ros.files.layouts import SEPARATORS, Layout
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
@@ -81,23 +88,26 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     first = _first(path, rows, at, used, decimal, notes)
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
     start = rows[first][0]
-    body: Iterable[Row] = rows[first:]
+    body: Iterable[Sequence[Row]] = [rows[first:]]
     if text:
         body = _below(path, text, start, separator)
     if decimal == ',':
-        body = ((line, [cell.replace(',', '.') for cell in cells]) for line, cells in body)
+        body = map(_with_points, body)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header, above, columns, tuple(notes))
 
 
-def _below(path: Path, text: str, start: int, separator: str) -> Iterator[Row]:
+def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[Row]]:
     """Yield the rows of a text from a line on."""
     body = text[_after(text, start - 1) :]
-    for line, cells in csv_rows(path, body, separator, above=start - 1):
-        found = [*map(str.strip, cells)]
-        if any(found):
-            yield line, found
+    for block in csv_blocks(path, body, separator, above=start - 1):
+        rows = [(line, [*map(str.strip, cells)]) for line, cells in block]
+        yield [(line, cells) for line, cells in rows if any(cells)]
+
+
+def _with_points(block: Sequence[Row]) -> list[Row]:
+    return [(line, [cell.replace(',', '.') for cell in cells]) for line, cells in block]
 
 
 def _after(text: str, lines: int) -> int:
@@ -205,7 +215,8 @@ def _cells(path: Path, text: str, separator: str) -> list[Row]:
     """Return the cells of all non-empty lines, with line numbers."""
     found: list[Row] = [
         (line, [' '.join(cell.split()) for cell in row])
-        for line, row in csv_rows(path, text, separator)
+        for block in csv_blocks(path, text, separator)
+        for line, row in block
         if any(cell.strip() for cell in row)
     ]
     if not found:
