@@ -7,7 +7,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from calib_ros.errors import InputError
+from calib_ros.files import cameras
 from calib_ros.files.loading import TABLES
+from calib_ros.files.stored import RECORDED
+from calib_ros.kinematics.chain_file import URDF_SUFFIXES
 
 BEGINNINGS = (
     *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
@@ -16,10 +19,10 @@ BEGINNINGS = (
     (b'<', 'urdf'),
 )
 SUFFIXES = {
-    **dict.fromkeys(('.mcap', '.db3', '.zstd', '.bag'), 'bag'),
-    **dict.fromkeys(('.urdf', '.xacro', '.xml'), 'urdf'),
+    **dict.fromkeys((*RECORDED, '.bag'), 'bag'),
+    **dict.fromkeys(URDF_SUFFIXES, 'urdf'),
     **dict.fromkeys(('.yaml', '.yml'), 'chain'),
-    **dict.fromkeys(('.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp'), 'image'),
+    **dict.fromkeys(cameras.SUFFIXES, 'image'),
     **dict.fromkeys(('.html', '.pdf', '.md', '.json'), 'report'),
     **dict.fromkeys(TABLES, 'table'),
     **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),

@@ -21,14 +21,7 @@ from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.shown import some
-from calib_ros.texts import (
-    LARGEST_TABLE,
-    MOST_ROWS,
-    csv_lines,
-    decoded,
-    from_cell,
-    read_bytes,
-)
+from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, from_cell, read_bytes
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
@@ -79,10 +72,7 @@ class Columns:
         return found
 
     def block(
-        self,
-        names: Sequence[str],
-        largest: float = LARGEST,
-        needed: Flags | bool = True,
+        self, names: Sequence[str], largest: float = LARGEST, needed: Flags | bool = True
     ) -> FloatArray:
         """Return numbers (N, len(names)); a row has all of them or, if not `needed`, none."""
         found = self.numbers(names)

@@ -40,6 +40,8 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 LARGEST_MESSAGE = 64 * MOST_ENTRIES
 """Bytes of a message: a joint state with a name and three numbers per joint."""
 LARGEST_IMAGE = 2 * LARGEST_TABLE  # bytes of an image, as a message or a file
+UNPACKED = ('.mcap', '.db3')  # suffixes of the files of a recording
+RECORDED = (*UNPACKED, '.zstd')  # also if it is compressed as a whole
 NOT_CLOSED = 'the recording was not closed'
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
@@ -65,7 +67,7 @@ def recorded(path: Path) -> int | None:
 @contextmanager
 def unpacked_files(path: Path) -> Iterator[Path]:
     """Provide a bag whose files are neither compressed nor partly in a write-ahead log."""
-    files = _files(path, '.mcap', '.db3', '.zstd')
+    files = _files(path, RECORDED)
     if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
         yield path
         return
@@ -179,9 +181,9 @@ def salvage(path: Path) -> Salvage | None:
     return found if found.count else None
 
 
-def _files(path: Path, *kinds: str) -> tuple[Path, ...]:
+def _files(path: Path, kinds: Sequence[str] = UNPACKED) -> tuple[Path, ...]:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return tuple(file for file in files if file.suffix in (kinds or ('.mcap', '.db3')))
+    return tuple(file for file in files if file.suffix in kinds)
 
 
 def _open(file: Path) -> sqlite3.Connection:

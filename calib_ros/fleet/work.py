@@ -17,6 +17,7 @@ from calib_ros.errors import CalibrationError, ConfigError, shortened
 from calib_ros.files.history import is_local
 from calib_ros.files.loading import TABLES, of_bag, of_table, replayed, table
 from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
+from calib_ros.files.stored import RECORDED
 from calib_ros.fleet.plant import Robot
 from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, inputs_of, render
@@ -165,7 +166,7 @@ def _hidden(path: str) -> int:
 def _is_folder(files: Any, path: str) -> bool:
     """Tell whether a path is a folder; names with a file suffix are not asked for."""
     name = PurePosixPath(path).name.lower()
-    return not name.endswith((*TABLES, '.mcap', '.db3', '.zstd')) and bool(files.isdir(path))
+    return not name.endswith((*TABLES, *RECORDED)) and bool(files.isdir(path))
 
 
 def _state(files: Any, path: str, info: dict[str, Any]) -> tuple[str, datetime | None]:

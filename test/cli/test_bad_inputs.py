@@ -92,7 +92,7 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
-    for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.jpg')):
+    for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / (file or 'notes')).write_text('{}')
     status, _, err = run(*arguments)
