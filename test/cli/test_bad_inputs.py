@@ -43,7 +43,8 @@ def bad_inputs():
         yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be positive'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
     yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
-    yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag'
+    yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag\n'
+    yield 'useless side', (*bag_of, 'folder', '--eye-in-hand'), ': add eye_in_hand=true to its --'
     names = ('--joint-names', 'a,a,b,c,d,e,f')
     yield 'joint names', (*bag_of, 'folder', *names), 'wrist_3_joint; not a, a, b, c, d, e, f'
     yield 'out is a file', (*good, '--out', 'empty'), 'empty'

@@ -225,12 +225,17 @@ def test_every_command_has_a_screen():
 @pytest.mark.parametrize('served', [*RESULTS, *MORE], indirect=True)
 @pytest.mark.usefixtures('new')
 def test_the_result_of_a_command(monkeypatch, served):
-    """In 80 columns; what may take over 2 s works where a sign of life is shown."""
+    """In 80 columns; what may take over 2 s works where a sign of life is shown.
+
+    A verdict is green or red as the status is, or neither if there is nothing to correct.
+    """
     name, more = served
     expected, *arguments = MORE.get(name) or (RESULTS[name][0], name, *RESULTS[name][1:], *more)
     monkeypatch.setenv('TERM', 'dumb')
     monkeypatch.setattr(screen, 'FIRST_S', 1e6)
-    begun = []
+    begun, verdicts, title = [], [], screen.Screen.title
+    told = lambda of, text, good=None: verdicts.append(good) or title(of, text, good)  # noqa: E731
+    monkeypatch.setattr(screen.Screen, 'title', told)
     monkeypatch.setattr(screen, 'Work', lambda what: begun.append(what) or Work(what))
     terminal = Terminal()
     monkeypatch.setattr(sys, 'stdout', terminal)
@@ -240,6 +245,7 @@ def test_the_result_of_a_command(monkeypatch, served):
     except SystemExit as err:
         status = err.code
     assert status == expected
+    assert verdicts in ([], [None if name == 'identify_refused' else expected == 0])
     assert ESCAPE not in terminal.getvalue()
     assert begun or name not in {*RESULTS} - {'board', 'chain', 'export', 'history', 'robots'}
     assert_shown(name, without_digits(terminal.getvalue()))

@@ -98,28 +98,6 @@ def test_a_joint_that_counts_turns_is_left_alone():
     np.testing.assert_allclose(motion.joints, [[6.3, -9.2]], atol=1e-12)
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_angles_within_one_turn_are_as_good_as_those_that_count(seed):
-    """Everything but the values themselves is the same, and those are by whole turns."""
-    rng = np.random.default_rng(seed)
-    count = 200
-    moving = np.repeat(rng.random(count // 20) < 0.5, 20)
-    path = np.cumsum(moving[:, np.newaxis] * rng.uniform(-0.2, 0.2, (count, 2)), axis=0) + np.pi
-    within = (path + np.pi) % (2.0 * np.pi) - np.pi
-    first, second = (
-        filled(enumerate(values.tolist()), revolute=(True, True)) for values in (path, within)
-    )
-    for made in (first, second):
-        made.release(30 * MS)
-    assert first.standing(1e-3, 0.008).tolist() == second.standing(1e-3, 0.008).tolist()
-    stamps = rng.uniform(35, count - 1, 50)
-    one, other = at(first, *stamps), at(second, *stamps)
-    turns = (one.joints - other.joints) / (2.0 * np.pi)
-    np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
-    np.testing.assert_allclose(one.velocity, other.velocity, atol=1e-6)
-    np.testing.assert_array_equal(came(first, *stamps), came(second, *stamps))
-
-
 # Order of arrival
 # Few distinct stamps and values, so that equal stamps, hits and gaps are frequent.
 ticks = st.integers(1, 12).map(lambda k: 50 * k)
