@@ -111,6 +111,7 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             Node(
                 package='diagnostic_aggregator',
                 executable='aggregator_node',
+                namespace=namespace,
                 parameters=[str(CONFIG / 'diagnostics.yaml')],
                 output='screen',
             )
@@ -126,7 +127,8 @@ def start(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         ) as file:
             file.write(shown)
         atexit.register(Path(file.name).unlink, missing_ok=True)
-        started.append(Node(package='rviz2', executable='rviz2', arguments=['-d', file.name]))
+        shows = {'namespace': namespace, 'arguments': ['-d', file.name]}
+        started.append(Node(package='rviz2', executable='rviz2', **shows))
     return [*started, *calibration(given)]
 
 
