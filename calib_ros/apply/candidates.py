@@ -182,16 +182,21 @@ def iso_9283_poses(
             'the arm cannot reach all corners of any cube: choose test poses yourself; any new '
             'ones will do'
         )
-    travel = np.abs(cubes.corners - cubes.middle[:, np.newaxis]).max(axis=(1, 2))
-    best = cubes.select(travel.argmin()[np.newaxis])
-    wanted = _poses(design, best.centres, 0.8 * edge)[0, TILTED]
-    frames = design.base, design.tool
-    found = inverse.solve(design.chain, wanted, best.corners[0, TILTED], *frames, part)
-    if not found.converged.all():
+    inside = 0.8  # of the edge: a tenth of the diagonal from the corners
+    away = cubes.corners - cubes.middle[:, np.newaxis]
+    start = (cubes.middle[:, np.newaxis] + inside * away)[:, TILTED]
+    wanted = _poses(design, cubes.centres, inside * edge)[:, TILTED]
+    size, frames = (*start.shape[:2], -1), (design.base, design.tool)
+    flat = wanted.reshape(-1, 4, 4), start.reshape(-1, start.shape[-1])
+    found = inverse.solve(design.chain, *flat, *frames, part)
+    lost = ~found.converged.reshape(size[:2]).all(axis=1)
+    if lost.all():
         raise InputError(
             'the arm does not reach the inside of the cube that it reaches: try --seed'
         )
-    return TestPoses(np.concatenate([best.middle, found.joints]), edge, part == slice(6))
+    best = np.where(lost, np.inf, np.abs(away).max(axis=(1, 2))).argmin()
+    joints = np.concatenate([cubes.middle[[best]], found.joints.reshape(size)[best]])
+    return TestPoses(joints, edge, part == slice(6))
 
 
 def _at(

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from calib_ros.errors import InputError, UnknownNameError
+from calib_ros.estimation.configurations import STILL
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import inverse, se3
 from calib_ros.kinematics.chain import Chain
@@ -191,7 +192,7 @@ def place(
     cells: int = 9,
     turns: int = 1,
     refinements: int = 4,
-    starts: int = 6,
+    starts: int = 24,
     drawn: int = 20_000,
     progress: Notify = quiet,
 ) -> Placements:
@@ -201,7 +202,8 @@ def place(
     0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, commanded
     by a `model`, reaches. The grid has `cells` along each axis and `turns` about the vertical, and
     is halved `refinements` times about the best placement. The first pose is solved from the
-    nearest `starts` of `drawn` random joint values. An arm with fewer than six freedoms reaches a
+    nearest `starts` of `drawn` random joint values, since an arm reaches it in several postures
+    with other errors. An arm with fewer than six freedoms reaches a
     pose at its position, with the orientation to 0.02 rad.
     """
     search = _Search(arm, task, aim, model, starts, drawn, progress)
@@ -298,10 +300,20 @@ class _Search:
             if not self._complete:  # tolerated as by `compensate`
                 near = (found.position <= EXACT) & (found.orientation <= TURN_IN_PART)
             reached[placement, branch] = near
+            if not k:
+                reached &= ~self._known_before(joints[:, :, 0], reached)
             self._solved += len(wanted)
             left = np.count_nonzero(reached) * (length - k - 1) + later * self._starts * length
             self._progress(self._solved / max(self._solved + left, 1))
         return joints, reached
+
+    def _known_before(self, joints: FloatArray, reached: Flags) -> Flags:
+        """Tell (M, S) whether an earlier start led to the same joint values (M, S, n)."""
+        found = np.zeros_like(reached)
+        for k in range(1, self._starts):
+            apart = np.abs(joints[:, :k] - joints[:, k, np.newaxis]).max(axis=2)
+            found[:, k] = (reached[:, :k] & (apart < STILL)).any(axis=1)
+        return found
 
 
 def _features(poses: FloatArray) -> FloatArray:

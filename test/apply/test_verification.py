@@ -41,11 +41,13 @@ def with_errors(arm, errors):
 # Test poses
 
 
-@pytest.mark.parametrize('name', ['kuka_iiwa14', 'denso_hsr065'])
-def test_the_test_poses_are_those_of_the_standard(name, rng):
+@pytest.mark.parametrize(
+    ('name', 'seed'), [('kuka_iiwa14', 0), ('denso_hsr065', 0), ('abb_irb120', 2)]
+)
+def test_the_test_poses_are_those_of_the_standard(name, seed, rng):
     chain = replace(load_chain(name), base=simulation.random_frame(rng, 2.0))
     design = design_of(chain)
-    found = iso_9283_poses(design, rng)
+    found = iso_9283_poses(design, np.random.default_rng(seed))
     poses = invert(chain.base.matrix) @ design.targets(found.joints)
     np.testing.assert_allclose(poses[:, :3, :3], poses[:1, :3, :3].repeat(5, 0), atol=1e-6)
     away = (poses[1:, :3, 3] - poses[0, :3, 3]) / found.edge
