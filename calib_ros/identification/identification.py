@@ -19,7 +19,7 @@ import numpy as np
 
 from calib_ros.decision import mistakes, suspicions
 from calib_ros.decision.acceptance import refusals, remarks
-from calib_ros.decision.comparison import compare
+from calib_ros.decision.comparison import Verdict, compare
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, lacking, outliers_of
 from calib_ros.decision.region import Region, region_of
@@ -40,7 +40,6 @@ from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import Notify, quiet, share_of
 from calib_ros.settings import EXCEPTION
 

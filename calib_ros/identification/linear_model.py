@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from calib_ros.decision.comparison import COUNTS, log_gain
+from calib_ros.decision.comparison import COUNTS, Verdict, log_gain
 from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import group_of
@@ -27,7 +27,6 @@ from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.progress import Notify, quiet
