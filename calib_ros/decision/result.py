@@ -18,7 +18,7 @@ from calib_ros.decision.steps import Step
 from calib_ros.errors import ConfigError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Posterior
-from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
 from calib_ros.kinematics.chain import Chain

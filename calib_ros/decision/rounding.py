@@ -18,7 +18,7 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.decision.changes import Information
-from calib_ros.estimation.fitting import Fitted
+from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
