@@ -109,12 +109,12 @@ class Streamed:
         self.count = given.facts['poses']
         self.rows = self.count * (6 if given.oriented else 3)
 
-    def blocks(self, chain, names):
-        """Yield weighted rows of Jacobian and residual; see `leastsquares.Samples`."""
+    def parts(self, chain, names):
+        """Yield weighted rows of Jacobian and residual; see `samples.Samples`."""
         from calib_ros.estimation.samples import Samples
 
         for chunk in self.given.chunks():
-            yield from Samples(_observations(self.given, chunk), *self.sigmas).blocks(chain, names)
+            yield from Samples(_observations(self.given, chunk), *self.sigmas).parts(chain, names)
 
     def products(self, *which):
         """Return the products of all rows."""

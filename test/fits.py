@@ -10,6 +10,7 @@ import numpy as np
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.comparison import residuals
 from calib_ros.estimation import fitting
+from calib_ros.estimation.fitted import parameter_rows
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
@@ -65,7 +66,7 @@ def fitted(problem):
     """
     known, start, fit = fitting.fit(problem)
     names = fit.names
-    found = fitting.parameter_rows(fit, known, fit.uncertainty)
+    found = parameter_rows(fit, known, fit.uncertainty)
     frames = [name for name in names if start.owns_frame(name)]
     return SimpleNamespace(
         before=minimise(start, frames, fit.system).chain,

@@ -36,6 +36,16 @@ class ErrorFigures:
     rms_px: float | None = None
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """Held-out RMS with and without a group of effects or a harmonic."""
+
+    what: str
+    rms_mm_before: float
+    rms_mm_after: float
+    pays: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Residuals:
     """Measured minus predicted: position (N, 3) [m] and rotation vector (N, 3) [rad].

@@ -13,7 +13,7 @@ from scipy import special
 from calib_ros.decision.drift import chance
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL, stops
-from calib_ros.estimation.fitting import Fitted
+from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.estimation.levels import CERTAIN, FEW, SURE
 from calib_ros.estimation.observations import SOME_POSES

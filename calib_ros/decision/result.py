@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.comparison import Comparison, Verdict
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
@@ -18,10 +18,9 @@ from calib_ros.decision.steps import Step
 from calib_ros.errors import ConfigError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.evidence import Posterior
-from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
-from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
@@ -71,7 +70,7 @@ class Identification(Shown):
     """Where the calibration may be used; None if nowhere."""
     weak: tuple[str, ...] = ()
     """Parameters that the poses hardly determine, held near nominal by a prior."""
-    verdicts: tuple[effects.Verdict, ...] = ()
+    verdicts: tuple[Verdict, ...] = ()
     """Effects tried if the model was chosen."""
     step: Step | None = None
     """What moved during the measurement (`steps.py`)."""

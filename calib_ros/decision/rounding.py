@@ -15,10 +15,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from scipy import linalg
 
 from calib_ros.decision.changes import Information
-from calib_ros.estimation.fitting import Fitted
+from calib_ros.estimation.considered import Doubted
+from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
@@ -98,8 +98,8 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
     first, rest = np.s_[: beside.shape[1]], np.s_[beside.shape[1] :]
     products = every.T @ every
     prior = np.diag(np.arange(beside.shape[1]) >= len(frames)).astype(float)
-    taken = linalg.solve(products[first, first] + prior, products[first, rest], assume_a='pos')
-    left = products[rest, rest] - products[rest, first] @ taken
+    inner = products[first, first] + prior
+    left = Doubted(products[rest, rest], products[rest, first], inner).reduced
     information = Information(tuple(map(Parameter, arm)), left[:-1, :-1], left[:-1, -1])
     gain, _, _, rank = information.explained(np.eye(len(arm)))
     freedom = max(len(rows) - len(frames) - rank, 1)

@@ -22,7 +22,8 @@ import numpy as np
 from calib_ros.decision.drift import inverse_root, slow_cosines
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import stops
-from calib_ros.estimation.fitting import SOME, Fitted
+from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.leastsquares import STEP_TOLERANCE, gram
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.observations import Observations

@@ -11,7 +11,7 @@ import numpy as np
 
 from calib_ros.decision.comparison import Comparison, Residuals, compare, joined, residuals
 from calib_ros.estimation.configurations import distinct
-from calib_ros.estimation.fitting import Fitted
+from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import System, minimise, without_each
 from calib_ros.estimation.levels import TELLING

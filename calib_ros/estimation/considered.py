@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
+from typing import NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
-from calib_ros.estimation.leastsquares import Normal, System, gram, normal_equations
+from calib_ros.estimation.leastsquares import System, gram, normal_equations
 from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import Samples
@@ -56,49 +58,74 @@ def lenses(chain: Chain) -> dict[Parameter, float]:
     }
 
 
-def products_with_doubts(
+@dataclass(frozen=True, eq=False)
+class Doubts:
+    """What else may move the measurements, each with a standard deviation.
+
+    Parameters by `sizes` that something else moves too, all `lengths` together with the scale of
+    the device, smooth errors of the device if `by_device`, and `unmodelled` waves beside what the
+    parameters follow of them.
+    """
+
+    sizes: Mapping[str, float] = field(default_factory=dict)
+    lengths: Mapping[str, float] = field(default_factory=dict)
+    by_device: bool = False
+    unmodelled: Unmodelled = NOTHING
+
+
+class Doubted(NamedTuple):
+    """Products of columns and residual (Q, Q), and with K doubtful columns (Q, K) and (K, K).
+
+    The columns are those of the parameters, of the device's scale if there are lengths, and of the
+    residual. Doubtful ones are scaled by their standard deviations; their own products have 1
+    added.
+    """
+
+    plain: FloatArray
+    cross: FloatArray
+    doubtful: FloatArray
+
+    @property
+    def reduced(self) -> FloatArray:
+        """Return the products (Q, Q) without what the doubtful columns explain."""
+        taken = linalg.solve(self.doubtful, self.cross.T, assume_a='pos')
+        return np.asarray(self.plain - self.cross @ taken)
+
+
+def doubted_products(
     chain: Chain,
     names: Sequence[str],
     system: System,
-    noise: float,
-    doubts: Mapping[str, float],
-    lengths: Mapping[str, float],
-    by_device: bool,
-    known: Normal | None,
+    doubts: Doubts,
+    noise: float = 1.0,
     most: int = 10 * SOME_POSES,
-    unmodelled: Unmodelled = NOTHING,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return products of columns and residual, and their products with doubtful columns.
+) -> Doubted:
+    """Return the products of a system, in units of `noise` [sigma given], without priors.
 
-    The first (P + 1, P + 1) are those of the names, of the device's scale if there are `lengths`,
-    and of the residual. A^T N (P + 1, K) and N^T N + 1 (K, K) follow, with N scaled by its
-    standard deviations. All are in units of `noise` [sigma given], without priors. `doubts` are
-    standard deviations of parameters that something else moves too; `by_device` includes smooth
-    device errors, `unmodelled` waves that the names do not follow already. Larger systems are
-    thinned to `most` samples; `known` holds the products of all samples for the names alone.
+    Larger systems are thinned to `most` samples.
     """
-    columns = list(dict.fromkeys([*names, *lengths, *(moving(chain) if unmodelled.waves else ())]))
+    waves = moving(chain) if doubts.unmodelled.waves else ()
+    columns = list(dict.fromkeys([*names, *doubts.lengths, *waves]))
     share = -(-system.count // most)
-    if known is not None and share == 1 and not lengths and not by_device:
-        products = known.products.sum(axis=0)
-    else:
-        few = replace(system.spread(most), prior=None)
-        products = share * _products(chain, columns, few, by_device, unmodelled)
+    few = replace(system.spread(most), prior=None)
+    products = share * _products(chain, columns, few, doubts)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own = [*range(len(columns)), -1]
     products[np.ix_(own, own)] += share * (extra.T @ extra)
     every = np.eye(len(products))
     row = {str(name): k for k, name in enumerate(columns)}
-    grown = every[:, [row[str(name)] for name in lengths]] * [*lengths.values()]
-    grown = grown.sum(axis=1)[:, np.newaxis][:, : len(lengths)]  # none without lengths
-    doubted = every[:, [row[str(name)] for name in doubts]] * [*doubts.values()]
-    fields = every[:, len(columns) : -1]
+
+    def scaled(sizes: Mapping[str, float]) -> FloatArray:
+        return every[:, [row[str(name)] for name in sizes]] * [*sizes.values()]
+
+    grown = scaled(doubts.lengths).sum(axis=1, keepdims=True)[:, : len(doubts.lengths)]
     kept = np.column_stack([every[:, : len(names)], grown, every[:, -1]])
-    mixing = np.column_stack([kept, doubted, fields])
+    fields = every[:, len(columns) : -1]
+    mixing = np.column_stack([kept, scaled(doubts.sizes), fields])
     mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
-    plain, cross, doubtful = mixed[first, first], mixed[first, rest], mixed[rest, rest]
-    return plain, cross, doubtful + np.eye(len(doubtful))
+    doubtful = mixed[rest, rest]
+    return Doubted(mixed[first, first], mixed[first, rest], doubtful + np.eye(len(doubtful)))
 
 
 def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
@@ -118,21 +145,21 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 
-def _products(
-    chain: Chain, columns: Sequence[str], system: System, by_device: bool, unmodelled: Unmodelled
-) -> FloatArray:
-    fields = bends(system.sets) if by_device else []
+def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doubts) -> FloatArray:
+    """Return products of columns, smooth device errors, waves and residual."""
+    unmodelled = doubts.unmodelled
+    fields = bends(system.sets) if doubts.by_device else []
     waves = 8 * len(chain.joints) if unmodelled.waves else 0
     if not (any(map(len, fields)) or waves):
         return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
     found = np.zeros((len(columns) + len(fields[0]) + waves + 1,) * 2)
-    for samples, field in zip(system.sets, fields, strict=True):
+    for samples, bend in zip(system.sets, fields, strict=True):
         first = 0
         for parts in samples.parts(chain, columns):
             block = slice(first, first := first + parts[0].shape[2])
             joints = samples.observations.joints[block]
             for number, rows in enumerate(parts):
-                bent = field[:, :, block] * (number == 0)  # distortion does not turn
+                bent = bend[:, :, block] * (number == 0)  # distortion does not turn
                 more = [unmodelled.columns(chain, columns, joints, rows)[-waves:]] if waves else []
                 found += gram(np.concatenate([rows[:-1], bent, *more, rows[-1:]]))
     return found

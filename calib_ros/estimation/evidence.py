@@ -24,11 +24,10 @@ from functools import cached_property, lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from scipy import linalg
 
-from calib_ros.estimation.considered import lengths_of, products_with_doubts
+from calib_ros.estimation.considered import Doubts, doubted_products, lengths_of, lenses
+from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
-from calib_ros.estimation.leastsquares import Normal, System
 from calib_ros.estimation.levels import OUT_OF_SCALE, SCALE
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
@@ -125,37 +124,35 @@ class Posterior(Shown):
 
 
 def posterior_of(
-    chain: Chain,
-    nominal: Chain,
-    names: Sequence[str],
-    system: System,
+    fitted: Fitted,
     noise: float,
-    known: Mapping[str, float],
     more: Sequence[str] = (),
-    doubts: Mapping[str, float] | None = None,
-    at_the_fit: Normal | None = None,
+    rounding: Mapping[str, float] | None = None,
     judging: bool = True,
 ) -> Posterior:
-    """Return the posterior of fitted parameters and considered effects, linearised at the fit.
+    """Return the posterior of a fit and of `more` considered effects, linearised at the fit.
 
-    Offsets of the fitted `chain` from the `nominal` one are normal about zero. `names` were fitted
-    to the `system` with its weights and noise of size `noise` [sigma given]; `more` effects are
-    considered. `known` are given priors [m or rad], also of the device's scale, `doubts` standard
-    deviations of parameters that something else moves too, `at_the_fit` the last normal equations
-    if known. Doubts are only evaluated if `judging`.
+    Offsets of the fitted chain from the nominal one are normal about zero. The samples have their
+    weights in the fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations
+    of parameters that rounded joint values move too. Plausible sizes and the device's scale are
+    only evaluated if `judging`.
     """
-    own = [n for n in more if not (Parameter(n).of_dh or chain.owns_frame(n))]
-    chain = chain.with_effects(own)
-    every = (*names, *more)
-    beside = {name: std for name, std in (doubts or {}).items() if name in names}
+    problem, names, system = fitted.problem, fitted.names, fitted.system
+    nominal, every = problem.model, (*names, *more)
+    known: dict[str, float] = {**problem.given} | {**lenses(nominal)}
+    if problem.sigma_scale:
+        known['scale'] = problem.sigma_scale
+    own = [n for n in more if not (Parameter(n).of_dh or nominal.owns_frame(n))]
+    chain = fitted.chain.with_effects(own)
+    beside = {name: std for name, std in (rounding or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
     unsure = bool(lengths) and scale == SCALE and 'scale' not in known
-    what = beside, lengths, bool(more), at_the_fit
-    plain, cross, doubtful = products_with_doubts(whole, every, system, noise, *what)
+    products = doubted_products(whole, every, system, Doubts(beside, lengths, bool(more)), noise)
+    plain, cross, doubtful = products
     offsets = np.zeros(len(plain) - 1)
     arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
     offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
-    reduced = plain - cross @ linalg.solve(doubtful, cross.T, assume_a='pos')
+    reduced = products.reduced
     alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
     vector = matrix @ offsets + reduced[:-1, -1]
     also = ['scale'] if lengths else []
@@ -183,7 +180,8 @@ def posterior_of(
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
-    return Posterior(chain, every, *found, doubted, rival)
+    posterior = Posterior(chain, every, *found, doubted, rival)
+    return posterior if fitted.held is None else posterior.held_at(*fitted.held)
 
 
 def _rival(

@@ -30,19 +30,17 @@ errors would put a tool anywhere, even kilometres away."""
 
 
 def independent(
-    factor: FloatArray, names: Sequence[str], frame_tolerance: float = HALF_THE_DIGITS
+    factor: FloatArray, names: Sequence[str], tolerance: FloatArray | float = HALF_THE_DIGITS
 ) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
-    `factor` (P, P) is the upper triangular factor of the weighted Jacobian, columns in the order
+    `factor` (R, P) is the upper triangular factor of the weighted Jacobian, columns in the order
     of the names: of parameters that trade against each other, the last are left out and stay
-    nominal. At least this share of a column must be left by those before it: `frame_tolerance` for
-    frames, HALF_THE_DIGITS for others; and of the largest column more than rounding.
+    nominal. At least the share `tolerance` (P,) of a column must be left by those before it, and
+    of the largest column more than rounding.
     """
-    frames = [Parameter(name).kind in FRAME_KINDS for name in names]
     sizes = np.linalg.norm(factor, axis=0)
-    least = np.where(frames, frame_tolerance, HALF_THE_DIGITS) * sizes
-    least = np.maximum(least, ROUNDING * sizes.max(initial=0.0))  # less shows nowhere
+    least = np.maximum(tolerance * sizes, ROUNDING * sizes.max(initial=0.0))  # less shows nowhere
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
         return tuple(names)  # the diagonal holds the rest of each column
     basis = np.zeros(factor.shape)
@@ -60,7 +58,8 @@ def independent(
 
 def excited(factor: FloatArray, names: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that measured poses determine, by their factor R (P, P)."""
-    return independent(factor, names, DEGENERATE)
+    frames = [Parameter(name).kind in FRAME_KINDS for name in names]
+    return independent(factor, names, np.where(frames, DEGENERATE, HALF_THE_DIGITS))
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from calib_ros.estimation.levels import SEVERAL
-from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.samples import Samples, gram as gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, Index
@@ -125,12 +125,6 @@ class System(Shown):
 def stacked(rows: Sequence[FloatArray]) -> FloatArray:
     """Return the rows (P, c, N) of all sets as one array (R, P)."""
     return np.concatenate([each.reshape(len(each), -1) for each in rows], axis=1).T
-
-
-def gram(rows: FloatArray) -> FloatArray:
-    """Return the products (P, P) of rows (P, c, N)."""
-    flat = rows.reshape(len(rows), -1)
-    return np.asarray(flat @ flat.T)
 
 
 def owners(rows: Sequence[FloatArray]) -> Index:

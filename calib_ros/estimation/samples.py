@@ -29,12 +29,8 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.kinematics.walk import BLOCK as BLOCK
 from calib_ros.values import LARGEST
 
-Block: TypeAlias = tuple[slice, FloatArray, FloatArray, FloatArray, ErrorModel]
 Both: TypeAlias = tuple[FloatArray, FloatArray]
 """Residuals by position and orientation, or in the image and at the board."""
-Places: TypeAlias = tuple[Index, list[tuple[int, Index]]]
-"""The place (P + 1,) of each parameter and the residual in `_products`, -1 if none; and by row the
-numbers of the effects that multiply it."""
 
 
 class Samples:
@@ -78,40 +74,6 @@ class Samples:
         found.weights = None if weights is None else np.sqrt(weights)
         return found
 
-    def blocks(self, chain: Chain, names: Sequence[str]) -> Iterator[Block]:
-        """Yield weighted rows of Jacobian and residual in blocks.
-
-        Each is a slice of samples; `shift` (K + 1, c, B), the derivative of the residual, which is
-        the last row; `turn` (K_rotational + 1, 3, B) of a separate orientation, else empty; `phi`
-        (E, B) of the effects; and the error model with the order of the parameters in the rows.
-        """
-        model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
-        empty = np.zeros((0, 0, 0))
-        joints, velocity = self.moving(chain)
-        out = None
-        for start in range(0, self.count, BLOCK):
-            part = slice(start, start + BLOCK)
-            if start + BLOCK > self.count:
-                out = None  # the last is shorter
-            approach = None if self.approach is None else self.approach[:, part]
-            moving = None if velocity is None else velocity[:, part]
-            axes, origin, *rows, phi = model.linearise(joints[:, part], approach, moving, out)
-            out = shift, turn = rows[0], rows[1]
-            if self.distances is not None:
-                shift = _along(origin, shift, self.distances[part], self.observations.plane)
-            else:
-                np.subtract(self.positions[:, part], origin, out=shift[-1])
-            if self.oriented:
-                turn[-1] = orientation_error(self.rotations[:, :, part], axes)
-            weights = 1.0 if self.weights is None else self.weights[part]
-            sigmas = self.sigmas if self.whitening is None else (1.0, 1.0)
-            shift *= weights / sigmas[0]
-            if self.oriented:
-                turn *= weights / sigmas[1]
-            if self.whitening is not None:
-                shift, turn = self._whitened(shift, turn, part), empty
-            yield part, shift, turn if self.oriented else empty, phi, model
-
     def products(
         self, chain: Chain, names: Sequence[str], count: int = 1, folds: Index | None = None
     ) -> FloatArray:
@@ -121,23 +83,14 @@ class Samples:
             ends = np.append(0, np.cumsum(np.bincount(folds, minlength=count)))
             if (np.diff(folds) < 0).any():
                 samples = self.select(np.argsort(folds, kind='stable'))
-        found = np.zeros((count, 2, len(names) + 1, len(names) + 1))
-        sums: dict[tuple[int, int], FloatArray] = {}
-        places: list[Places] = []
-        for which, shift, turn, phi, model in samples.blocks(chain, names):
-            parts = [rows for rows in (shift, turn) if len(rows)]
-            places = places or [_places(model, len(rows) - 1) for rows in parts]
-            cuts = np.clip(ends - which.start, 0, shift.shape[2]).tolist()
+        found, done = np.zeros((count, 2, len(names) + 1, len(names) + 1)), 0
+        for parts in samples.parts(chain, names):
+            width = parts[0].shape[2]
+            cuts = np.clip(ends - done, 0, width).tolist()
+            done += width
             for fold, (first, last) in enumerate(pairwise(cuts)):
-                cut = np.s_[..., first:last]
-                for k, (rows, (_, driven)) in enumerate(zip(parts, places, strict=True)):
-                    new = _products(rows[cut], phi[cut], driven)
-                    sums[fold, k] = sums[fold, k] + new if (fold, k) in sums else new
-        for (fold, k), lower in sums.items():
-            place, driven = places[k]
-            every = np.tril(lower) + np.tril(lower, -1).T if driven else lower
-            known = np.flatnonzero(place >= 0)
-            found[fold, k, known[:, np.newaxis], known] = every[place[known]][:, place[known]]
+                for k, rows in enumerate(parts if first < last else ()):
+                    found[fold, k] += gram(rows[..., first:last])
         return found
 
     def sums(
@@ -163,21 +116,44 @@ class Samples:
         return np.ascontiguousarray(then.joints.T), velocity
 
     def parts(self, chain: Chain, names: Sequence[str]) -> Iterator[tuple[FloatArray, ...]]:
-        """Yield the rows by position and orientation, (P + 1, c, B) each, in blocks.
+        """Yield the weighted rows by position and orientation, (P + 1, c, B) each, in blocks.
 
-        Parameters are in the order of their names, the residual last. Without a separate
-        orientation there is one part.
+        Derivatives by the parameters in the order of their names, the residual last. Without a
+        separate orientation there is one part.
         """
-        for _, shift, turn, phi, model in self.blocks(chain, names):
-            found = [shift[[*model.order, -1]]]
-            if len(turn):
-                full = np.zeros((len(names) + 1, *turn.shape[1:]))
-                rotational = np.flatnonzero(model.order < model.rotations)
-                full[rotational], full[-1] = turn[model.order[rotational]], turn[-1]
-                found.append(full)
-            for rows in found:
+        model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
+        turning = np.flatnonzero(model.order < model.rotations)
+        joints, velocity = self.moving(chain)
+        out = None
+        for start in range(0, self.count, BLOCK):
+            part = slice(start, start + BLOCK)
+            if start + BLOCK > self.count:
+                out = None  # the last is shorter
+            approach = None if self.approach is None else self.approach[:, part]
+            moving = None if velocity is None else velocity[:, part]
+            axes, origin, *found, phi = model.linearise(joints[:, part], approach, moving, out)
+            out = found[0], found[1]
+            shift = found[0][[*model.order, -1]]
+            turn = np.zeros((len(shift), *found[1].shape[1:]))
+            turn[turning] = found[1][model.order[turning]]
+            for rows in (shift, turn):
                 rows[model.spread] *= phi[:, np.newaxis]
-            yield tuple(found)
+            if self.distances is not None:
+                shift = _along(origin, shift, self.distances[part], self.observations.plane)
+            else:
+                np.subtract(self.positions[:, part], origin, out=shift[-1])
+            if self.oriented:
+                turn[-1] = orientation_error(self.rotations[:, :, part], axes)
+            weights = 1.0 if self.weights is None else self.weights[part]
+            if self.whitening is not None:
+                both = np.concatenate([shift, turn], axis=1) * weights
+                whitening = self.whitening[:, :, part]
+                mixed = np.einsum('rsb,psb->prb', whitening, both, optimize=True)
+                yield (np.ascontiguousarray(mixed),)
+                continue
+            shift *= weights / self.sigmas[0]
+            turn *= weights / self.sigmas[1]
+            yield (shift, turn) if self.oriented else (shift,)
 
     @property
     def width(self) -> int:
@@ -188,16 +164,6 @@ class Samples:
         """Return the weighted rows (P + 1, c, N) sample by sample, the residual last."""
         found = [np.concatenate(parts, axis=1) for parts in self.parts(chain, names)]
         return found[0] if len(found) == 1 else np.concatenate(found, axis=2)
-
-    def _whitened(self, shift: FloatArray, turn: FloatArray, part: slice) -> FloatArray:
-        """Return (P + 1, 6, B): position and orientation rows mixed by each sample's whitening."""
-        assert self.whitening is not None
-        full = np.zeros((len(shift), 6, shift.shape[2]))
-        full[:, :3] = shift
-        full[: len(turn) - 1, 3:] = turn[:-1]
-        full[-1, 3:] = turn[-1] if self.oriented else 0.0
-        mixed = np.einsum('rsb,psb->prb', self.whitening[:, :, part], full, optimize=True)
-        return np.ascontiguousarray(mixed)
 
     def position_errors(self, residuals: FloatArray) -> FloatArray:
         """Return position errors (N, 3) [m] of weighted residuals (rows,).
@@ -236,37 +202,10 @@ class Samples:
             yield part, slice(None)
 
 
-def _places(model: ErrorModel, last: int) -> Places:
-    """Return the places for rows (last + 1, c, B) of a block, the residual last."""
-    place = np.append(np.where(model.order < last, model.order, -1), last)
-    own = np.arange(len(place))[model.spread]
-    rows = place[own]
-    effects = [(row, np.flatnonzero(rows == row)) for row in sorted({*rows.tolist()} - {-1})]
-    if effects:
-        ordered = own[np.concatenate([numbers for _, numbers in effects])]
-        place[ordered] = last + 1 + np.arange(len(ordered))
-    return place, effects
-
-
-def _products(rows: FloatArray, phi: FloatArray, effects: list[tuple[int, Index]]) -> FloatArray:
-    """Return the lower triangle of products of rows (K, c, B), and of some times phi (E, B).
-
-    The `effects` of a row share its products with the others, so theirs need no components.
-    """
-    size = len(rows)
-    flat = rows.reshape(size, -1)
-    if not effects:
-        return np.asarray(flat @ flat.T)
-    parts = [phi[numbers] for _, numbers in effects]
-    ends = np.cumsum([size, *map(len, parts)]).tolist()
-    found = np.zeros((ends[-1], ends[-1]))
-    found[:size, :size] = flat @ flat.T
-    for k, (row, _) in enumerate(effects):
-        inner, which = np.einsum('kcb,cb->kb', rows, rows[row]), slice(ends[k], ends[k + 1])
-        found[which, :size] = parts[k] @ inner.T
-        for m, (other, _) in enumerate(effects[k:], k):
-            found[ends[m] : ends[m + 1], which] = (parts[m] * inner[other]) @ parts[k].T
-    return found
+def gram(rows: FloatArray) -> FloatArray:
+    """Return the products (P, P) of rows (P, c, N)."""
+    flat = rows.reshape(len(rows), -1)
+    return np.asarray(flat @ flat.T)
 
 
 def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:

@@ -321,45 +321,35 @@ def _successive(
     system: System,
     kernels: Mapping[int, Sequence[tuple[float, float]]],
 ) -> dict[int, FloatArray]:
-    """Return by part J^T K J of errors fading in succession, for (length, size) each."""
+    """Return by part J^T K J of errors fading in succession, for (length, size) each.
+
+    K = L + L^T - I, where L sums the stops so far, faded.
+    """
     size = len(names)
-    inside = {part: np.zeros((size, size)) for part in kernels}
-    across = {part: np.zeros((size, size)) for part in kernels}
+    found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
-        states: dict[int, FloatArray] = {}
+        before: dict[tuple[int, float], FloatArray] = {}
         for _, sums in samples.sums(chain, names, samples.observations.stops):
-            for part, own_kernels in kernels.items():
+            for part, own in kernels.items():
                 if part >= len(sums):
                     continue
-                rows = sums[part][:-1].reshape(-1, sums[part].shape[2])
-                mixed, later, earlier, states[part] = _by_runs(rows, states.get(part), own_kernels)
-                inside[part] += gram(mixed.reshape(size, -1))
-                across[part] += later.reshape(size, -1) @ earlier.reshape(size, -1).T
-    return {part: inside[part] + cross + cross.T for part, cross in across.items()}
+                rows = sums[part][:-1]
+                for length, weight in own:
+                    faded = _faded_sums(rows, length, before.get((part, length), 0.0))
+                    before[part, length] = faded[..., -1]
+                    cross = rows.reshape(size, -1) @ faded.reshape(size, -1).T
+                    found[part] += weight * (cross + cross.T - gram(rows))
+    return found
 
 
-def _by_runs(
-    rows: FloatArray, state: FloatArray | None, kernels: Sequence[tuple[float, float]]
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return parts of the products of columns (R, n) with kernels of (length, size) each.
+def _faded_sums(rows: FloatArray, length: float, before: FloatArray | float) -> FloatArray:
+    """Return sums (P, c, n) of rows (P, c, n), each of which fades over a number of stops.
 
-    Within runs of about the root of n columns these are the products of the first (R, n). Between
-    runs kernels separate: for each kernel and run, products of the second (R, K L) with the third,
-    the faded sums before. The last (R, K) are those so far, which continue `state`.
+    They continue `before` (P, c): s_k = x_k + exp(-1 / length) s_(k - 1).
     """
-    lengths, sizes = np.array(kernels).T
-    run = int(np.sqrt(rows.shape[1]))
-    apart = np.abs(np.subtract.outer(np.arange(run), np.arange(run)))[..., np.newaxis]
-    root = np.linalg.cholesky(np.exp(-apart / lengths) @ sizes)
-    fading = np.exp(-np.arange(1, run + 1)[:, np.newaxis] / lengths)
-    after = np.exp(-np.arange(run)[::-1, np.newaxis] / lengths)
-    mixed, later, earlier = np.empty_like(rows), list[FloatArray](), list[FloatArray]()
-    state = np.zeros((len(rows), len(lengths))) if state is None else state
-    for first in range(0, rows.shape[1], run):
-        part = np.ascontiguousarray(rows[:, first : first + run])
-        width = part.shape[1]
-        mixed[:, first : first + width] = part @ root[:width, :width]
-        later.append(part @ (fading[:width] * sizes))
-        earlier.append(state)
-        state = state * fading[width - 1] + part @ after[run - width :]
-    return mixed, np.concatenate(later, axis=1), np.concatenate(earlier, axis=1), state
+    count, fading = rows.shape[2], float(np.exp(-1.0 / length))
+    added = rows.copy()
+    added[..., 0] += fading * before
+    bands = np.array([np.ones(count), np.full(count, -fading)])
+    sums = linalg.solve_banded((1, 0), bands, added.reshape(-1, count).T, check_finite=False)
+    return np.asarray(sums.T.reshape(rows.shape))

@@ -41,7 +41,12 @@ def start_frames(problem: Problem) -> Chain:
     """
     chain, sigmas = problem.model, (problem.sigma_position, problem.sigma_orientation)
     found: set[str] = set()
-    for observations in sorted(problem.sets, key=_equations, reverse=True):
+    equations = [
+        distinct(each.configurations) * kind.rows
+        for each, kind in zip(problem.sets, problem.kinds, strict=True)
+    ]
+    for number in sorted(range(len(equations)), key=equations.__getitem__, reverse=True):
+        observations = problem.sets[number]
         placed = {name: replace(chain.frame(name), fixed=True) for name in found}
         known = {**chain.all_frames, **placed}
         base, tool = observations.base, observations.tool
@@ -57,11 +62,6 @@ def start_frames(problem: Problem) -> Chain:
             chain = chain.with_frame(name, frame)
         found |= {base, tool}
     return chain
-
-
-def _equations(each: Observations) -> int:
-    rows = 6 if each.oriented.any() or each.pixels is not None else 3
-    return distinct(each.configurations) * (rows if each.distances is None else 1)
 
 
 def _start_one(

@@ -19,7 +19,7 @@ import numpy as np
 
 from calib_ros.decision import mistakes, suspicions
 from calib_ros.decision.acceptance import refusals, remarks
-from calib_ros.decision.comparison import compare
+from calib_ros.decision.comparison import Verdict, compare
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, lacking, outliers_of
 from calib_ros.decision.region import Region, region_of
@@ -31,8 +31,9 @@ from calib_ros.errors import InputError
 from calib_ros.estimation import identifiability
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior
-from calib_ros.estimation.fitting import SOME, Fitted, ParameterRow, Simpler, fit, parameter_rows
+from calib_ros.estimation.evidence import Posterior, posterior_of
+from calib_ros.estimation.fitted import Fitted, ParameterRow, Simpler, parameter_rows
+from calib_ros.estimation.fitting import SOME, fit
 from calib_ros.estimation.leastsquares import System, minimise, normal_equations
 from calib_ros.estimation.levels import SCALE, SEVERAL
 from calib_ros.estimation.problem import Problem
@@ -40,7 +41,6 @@ from calib_ros.estimation.unmodelled import unmodelled_errors
 from calib_ros.identification.linear_model import COMPARED, HARMONICS, LinearModel
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import Notify, quiet, share_of
 from calib_ros.settings import EXCEPTION, effects_of
 
@@ -87,7 +87,7 @@ def _identified(
     share = lacking(fitted)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
-    posterior = fitted.posterior(size, more, doubts)
+    posterior = posterior_of(fitted, size, more, doubts)
     unmodelled, moved = unmodelled_errors(posterior, fitted.factor, fitted.system)
     posterior = replace(posterior, unmodelled=unmodelled)
     uncertainty = fitted.uncertainty.with_part(moved).with_part(unmodelled.square)
@@ -145,7 +145,7 @@ def _region(
     region = region_of(posterior, sets, freedom)
     if region is None and posterior.rival is not None:
         checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
-        if region_of(checked.posterior(size, more, doubts), sets, freedom) is not None:
+        if region_of(posterior_of(checked, size, more, doubts), sets, freedom) is not None:
             return None, posterior.rival[1]
     return region, 0.0
 

@@ -16,10 +16,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from calib_ros.decision.comparison import COUNTS, log_gain
+from calib_ros.decision.comparison import COUNTS, Verdict, log_gain
 from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import group_of
+from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.leastsquares import Folds, System, gram, owners, products_of, stacked
 from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
@@ -27,7 +28,6 @@ from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.effects import Verdict
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.progress import Notify, quiet
@@ -100,27 +100,19 @@ class LinearModel:
         self._seen: Columns | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-        """Return the effects of each group that are independent of the geometric model.
-
-        The part of a column that this model does not explain is in the lower rows of the factor.
-        """
+        """Return the effects of each group that are independent of the geometric model."""
+        known = [*self._names]
         every = list(dict.fromkeys(name for names in groups.values() for name in names))
-        count = len(self._names)
-        which = self._columns_of([*self._names, *every])
+        which = self._columns_of([*known, *every])
         factor = np.asarray(np.linalg.qr(self._columns[which].T, mode='r'))
-        number = {name: k for k, name in enumerate(every, count)}
+        number = {name: k for k, name in enumerate([*known, *every])}
         found: dict[str, list[str]] = {}
         for group, names in groups.items():
-            basis = np.zeros((len(factor[count:]), 0))
-            found[group] = kept = list[str]()
-            for name in names:
-                column = factor[:, number[name]]
-                rest = column[count:] - basis @ (basis.T @ column[count:])
-                rest -= basis @ (basis.T @ rest)
-                size = float(np.linalg.norm(rest))
-                if size > 1e3 * HALF_THE_DIGITS * float(np.linalg.norm(column)):
-                    basis = np.column_stack([basis, rest / size])
-                    kept.append(name)
+            together = [*known, *names]
+            columns = factor[:, [number[name] for name in together]]
+            least = np.repeat([0.0, 1e3 * HALF_THE_DIGITS], [len(known), len(names)])
+            seen = independent(columns, together, least)
+            found[group] = [name for name in seen if name not in known]
         return found
 
     def judge(

@@ -27,7 +27,7 @@ from calib_ros.decision.comparison import Comparison, residuals
 from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
-from calib_ros.estimation.considered import products_with_doubts
+from calib_ros.estimation.considered import Doubts, doubted_products
 from calib_ros.estimation.leastsquares import System, minimise, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.noise import Noise
@@ -270,21 +270,12 @@ class _Arm:
         The prior is a whole covariance, while `leastsquares` takes single sigmas.
         """
         change = np.zeros(len(self.names))
+        doubts = Doubts(by_device=True, unmodelled=self.previous.unmodelled)
         for _ in range(4):  # changes of millimetres converge in two
             chain = self.chain.with_offsets(dict(zip(self.names, change, strict=True)))
-            plain, cross, doubtful = products_with_doubts(
-                chain,
-                self.names,
-                system,
-                noise=1.0,
-                doubts={},
-                lengths={},
-                by_device=True,
-                known=None,
-                most=system.count,
-                unmodelled=self.previous.unmodelled,
-            )
-            products = plain - cross @ np.linalg.solve(doubtful, cross.T)
+            products = doubted_products(
+                chain, self.names, system, doubts, most=system.count
+            ).reduced
             matrix, gradient = products[:-1, :-1], products[:-1, -1]
             information = Information(self.names, matrix, gradient + matrix @ change)
             squares = float(products[-1, -1] + change @ (gradient + information.vector))

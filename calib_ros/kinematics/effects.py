@@ -21,7 +21,6 @@ of any masses along the arm.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Protocol
 
@@ -51,16 +50,6 @@ class _Arm(Protocol):
     @property
     def walk(self) -> Walk: ...
     def frame(self, name: str) -> Frame: ...
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Held-out RMS with and without a group of effects or a harmonic."""
-
-    what: str
-    rms_mm_before: float
-    rms_mm_after: float
-    pays: bool
 
 
 GROUPS = ('ratio', 'coupling', 'eccentricity', 'gear', 'gravity', 'compliance', 'backlash')

@@ -13,7 +13,7 @@ import numpy as np
 import calib_ros
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.result import Identification
-from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.report import words
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_yaml

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import special
 
 from calib_ros.apply.workspace import Survey, rms_map
-from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from calib_ros.errors import CalibrationError
 from calib_ros.estimation.configurations import configurations, distinct
@@ -39,11 +38,12 @@ from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTER, robust_fit, thorough_fit
 from calib_ros.estimation.samples import Samples, residual_arrays
+from calib_ros.estimation.sizes import solved
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
-from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 from calib_ros.sampling.gathered import collect
 from calib_ros.sampling.sample import Frames, Sample
 from calib_ros.settings import EXCEPTION, Settings
@@ -246,14 +246,12 @@ class LiveEstimate:
                 (self.suspicious if far else good).append(sample)
         return good
 
-    def _scaled(self) -> tuple[FloatArray, FloatArray]:
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._information), 1e-12))
-        matrix = self._information * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
-        return scale, matrix
+    def _solved(self) -> tuple[FloatArray, FloatArray]:
+        """Return the step to the estimate (P,), and a root (P, P) of its covariance."""
+        return solved(self._information, self._vector, np.zeros(len(self._names)))
 
     def _step(self) -> FloatArray:
-        scale, matrix = self._scaled()
-        return np.asarray(scale * linalg.solve(matrix, scale * self._vector, assume_a='pos'))
+        return self._solved()[0]
 
     def _estimate(self) -> Chain:
         assert self._chain is not None
@@ -261,11 +259,11 @@ class LiveEstimate:
 
     def _uncertainty(self) -> tuple[FloatArray, float]:
         """Return the covariance for the noise of the residuals, and its variance."""
-        left = max(self._cost - float(self._step() @ self._vector), 0.0)
+        step, root = self._solved()
+        left = max(self._cost - float(step @ self._vector), 0.0)
         freedom = self._rows - len(self._names)
         noise = max(left / freedom, STEP_TOLERANCE**2) if freedom > 0 else 1.0
-        scale, matrix = self._scaled()
-        return noise * np.outer(scale, scale) * np.linalg.inv(matrix), noise
+        return noise * root @ root.T, noise
 
     def _result(self) -> Estimate:
         chain = self._estimate()

@@ -15,7 +15,7 @@ from calib_ros.decision.acceptance import refusals
 from calib_ros.decision.comparison import Comparison, Residuals, compare, log_gain, residuals
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.validation import left_out
-from calib_ros.estimation.fitting import ParameterRow
+from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.parameter import Parameter
 

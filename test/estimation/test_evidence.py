@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -223,13 +224,14 @@ def test_only_what_is_fitted_is_doubted(monkeypatch):
     class AskedError(Exception):
         pass
 
-    def products_with_doubts(chain, names, system, noise, beside, *_):
-        assert (noise, beside) == (2.0, {'elbow_joint.theta': 1e-3})
+    def doubted_products(chain, names, system, doubts, noise):
+        assert (noise, doubts.sizes) == (2.0, {'elbow_joint.theta': 1e-3})
         raise AskedError
 
-    monkeypatch.setattr(evidence, 'products_with_doubts', products_with_doubts)
-    doubts = {'elbow_joint.theta': 1e-3, 'wrist_1_joint.theta': 2e-3}
+    monkeypatch.setattr(evidence, 'doubted_products', doubted_products)
+    rounding = {'elbow_joint.theta': 1e-3, 'wrist_1_joint.theta': 2e-3}
+    problem = SimpleNamespace(model=UR10E, given={}, sigma_scale=0.0)
+    names = ('base.x', 'elbow_joint.theta')
+    fitted = SimpleNamespace(problem=problem, names=names, chain=UR10E, system=System(()))
     with pytest.raises(AskedError):
-        evidence.posterior_of(
-            UR10E, UR10E, ['base.x', 'elbow_joint.theta'], System(()), 2.0, {}, doubts=doubts
-        )
+        evidence.posterior_of(fitted, 2.0, rounding=rounding)

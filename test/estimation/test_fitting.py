@@ -12,7 +12,8 @@ from fits import UR10E, measured_arm
 from calib_ros.apply.simulation import random_frame
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import fitting
-from calib_ros.estimation.fitting import SOME, Simpler, parameter_rows
+from calib_ros.estimation.fitted import Simpler, _to_values, parameter_rows
+from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.problem import Learned, Problem
@@ -98,7 +99,7 @@ def test_turns_of_frames_become_rotation_vectors():
             for step in (-1e-6, 1e-6)
         ]
         expected[order, k] = (ends[1] - ends[0]) / 2e-6
-    np.testing.assert_allclose(fitting._to_values(chain, names), expected, atol=1e-8)
+    np.testing.assert_allclose(_to_values(chain, names), expected, atol=1e-8)
 
 
 def test_every_parameter_has_a_row_with_what_became_of_it():
@@ -160,9 +161,10 @@ class Done:
     chain: object
     told: dict
 
-    def posterior(self, size, judging):
-        assert (size, judging) == (self.noise.size, False)
-        return SimpleNamespace(priors=self.told, held=lambda name: float(name == 'elbow_joint.a'))
+
+def posterior_of(done, size, judging):
+    assert (size, judging) == (done.noise.size, False)
+    return SimpleNamespace(priors=done.told, held=lambda name: float(name == 'elbow_joint.a'))
 
 
 def test_a_fit_is_repeated_with_guards_and_with_what_it_tells(monkeypatch):
@@ -178,6 +180,7 @@ def test_a_fit_is_repeated_with_guards_and_with_what_it_tells(monkeypatch):
         return Done(poor, noise(size, True), size, next(chains), told)
 
     monkeypatch.setattr(fitting, '_fit', fit)
+    monkeypatch.setattr(fitting, 'posterior_of', posterior_of)
     found = fitting._fit_all(problem, names, UR10E, 100.0 * np.eye(3), None)
     guards, priors = {'elbow_joint.a': length}, {**told, 'elbow_joint.a': length}
     assert calls == [

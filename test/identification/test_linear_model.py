@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from fits import UR10E, measured_arm
 
-from calib_ros.decision.comparison import log_gain
+from calib_ros.decision.comparison import Verdict, log_gain
 from calib_ros.decision.drift import Shifts
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.identification import linear_model
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.effects import Verdict
 from calib_ros.progress import quiet
 
 NAMES = (

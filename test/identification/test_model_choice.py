@@ -8,6 +8,7 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision.comparison import Verdict
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -15,7 +16,7 @@ from calib_ros.identification import identification
 from calib_ros.identification.identification import identify, identify_model
 from calib_ros.identification.linear_model import LinearModel
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.effects import Verdict, group_of
+from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.settings import Settings
 

@@ -12,11 +12,10 @@ from plotly import graph_objects
 
 from calib_ros import Observations, Settings, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
-from calib_ros.decision.comparison import compare
+from calib_ros.decision.comparison import Verdict, compare
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.kinematics.effects import Verdict
 from calib_ros.report.figures import against_noise, coverage, cumulated, drives, forest
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import poses_to_verify

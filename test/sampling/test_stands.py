@@ -1,12 +1,55 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from calib_ros.sampling.slices import Piece, Slice, StreamKey, Waiting
-from calib_ros.sampling.stops import SPIKE, Known, Rests, seen_stops
+from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
+from calib_ros.settings import Settings
+
+S = 10**9
+MOVING, SHORT = 'the arm was moving', 'the stop was too short'
+
+
+@pytest.mark.parametrize(
+    ('stands', 'until', 'newest', 'expected', 'more'),
+    [
+        ([], 10, 12, [(10, MOVING, 0)], {}),
+        # A stop of just the shortest time is one; what is left of a longer one is not used.
+        ([(2, 3)], 10, 12, [(2, MOVING, 0), (3, '', 2), (10, MOVING, 0)], {}),
+        ([(2, 9)], 10, 12, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)], {}),
+        # One that goes on is waited for, unless it has the longest time already.
+        ([(2, 4)], 4, 4, [(2, MOVING, 0)], {}),
+        ([(2, 5)], 5, 5, [(2, MOVING, 0)], {}),
+        ([(2, 6)], 5, 6, [(2, MOVING, 0), (5, '', 2)], {}),
+        ([(2, 6)], 4, 6, [(2, MOVING, 0)], {}),
+        # Without a newest stamp everything ends.
+        ([(2, 6)], 4, None, [(2, MOVING, 0), (4, '', 2)], {}),
+        ([(12, 16)], 10, 16, [(10, MOVING, 0)], {}),
+        # A short one is none.
+        (
+            *([(2, 3), (5, 7)], 10, 12),
+            [(2, MOVING, 0), (3, SHORT, 0), (5, MOVING, 0), (7, '', 5), (10, MOVING, 0)],
+            {'shortest': 2.0},
+        ),
+        # Of one that was sampled nothing more is used, nor again what was dealt with.
+        ([(3, 8)], 10, 12, [(8, SAMPLED, 0), (10, MOVING, 0)], {'done': 5, 'sampled': 5}),
+        ([(5, 8)], 10, 12, [(8, SAMPLED, 0), (10, MOVING, 0)], {'done': 5, 'sampled': 5}),
+        (*([(1, 5), (6, 8)], 10, 12), [(6, MOVING, 0), (8, '', 6), (10, MOVING, 0)], {'done': 5}),
+    ],
+)
+def test_stands_become_stops(stands, until, newest, expected, more):
+    done, settings = more.get('done', 0), Settings(longest_stop=3.0)
+    settings = replace(settings, shortest_stop=more.get('shortest', 1.0))
+    plan = Schedule(done * S, more.get('sampled', 0) * S)
+    stands = np.array(stands, dtype=np.int64).reshape(-1, 2) * S
+    plan.of_stands(stands, until * S, None if newest is None else newest * S, settings)
+    assert plan.done_ns == (plan.ends[-1] if plan.ends else done * S)
+    found = zip(plan.ends, plan.why, plan.begins, strict=True)
+    assert [(end // S, why, begin // S) for end, why, begin in found] == expected
 
 
 def test_a_stop_seen_before_is_known_where_and_when_it_was():
@@ -45,26 +88,3 @@ def test_rests_unseen_count_once_each_up_to_a_capacity():
     assert rests.needed(0.0) == SPIKE * 2.0
     rests.sampled = 3
     assert rests.needed(0.0) is None
-
-
-def test_a_stop_shows_from_its_shortest_time_on_until_it_is_dealt_with():
-    stands = np.array([[10, 20]])
-    rounds = [13, 14, 19, 23, 24, 25]
-    found = seen_stops(stands, rounds, 9, 4, 4)
-    assert found == [False, True, True, True, True, False]
-    assert seen_stops(stands, [15], 20, 4, 4) == [False]
-    assert seen_stops(stands, [15], 19, 4, 4) == [True]
-
-
-def test_there_is_room_up_to_the_first_message_that_does_not_fit():
-    key = StreamKey('', '', False, False, False)
-    joints = Piece(('j',), np.array([0]), np.array([0]), np.zeros((1, 1)))
-    poses = Piece(key, np.array([1, 3, 4]), np.array([5, 6, 7]), np.zeros((3, 1)))
-    dropped = Counter()
-    waiting, given = Waiting(1, 3, dropped, lambda key: False), Slice.of([joints, poses])
-    assert waiting.room(given) == len(given) == 4
-    waiting.extend(key, np.array([1, 2]), np.zeros((2, 1)), 1)
-    assert (waiting.count, dropped.total()) == (1, 1)
-    assert waiting.room(given) == 3
-    waiting.extend(key, np.array([2, 3]), np.zeros((2, 1)), 1)
-    assert (waiting.count, waiting.room(given)) == (3, 1)

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A fit, and the parameters it determines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from calib_ros.estimation import identifiability
+from calib_ros.estimation.leastsquares import System
+from calib_ros.estimation.levels import CONFIDENT, KNOWN
+from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import Robust
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter, parameters_of
+from calib_ros.kinematics.se3 import FloatArray, left_jacobian_inverse
+
+
+@dataclass(frozen=True)
+class ParameterRow:
+    """One parameter of the model: m for lengths, rad for angles.
+
+    `status` is 'fitted', 'gauge' (redundant by the chain's structure), 'not excited' (the poses do
+    not determine it) or 'fixed'; all but the first keep the nominal value. `freedom` are the
+    degrees of freedom of `std`; infinite if the noise is known.
+    """
+
+    name: Parameter
+    value: float
+    offset: float
+    std: float | None
+    status: str
+    freedom: float = np.inf
+
+    def half_width(self, level: float = CONFIDENT) -> float | None:
+        """Return the half width of the confidence interval, by Student's t."""
+        if self.std is None:
+            return None
+        return self.std * float(special.stdtrit(min(self.freedom, KNOWN), 0.5 + 0.5 * level))
+
+    def beyond(self, length: float, angle: float) -> bool:
+        """Tell whether a DH parameter is certainly further from nominal than a limit."""
+        limit = length if self.name.is_length else angle
+        return self.std is not None and self.name.of_dh and abs(self.offset) - 3 * self.std > limit
+
+
+@dataclass(frozen=True, eq=False)
+class Simpler:
+    """Results of the fit of a simpler model, without effects."""
+
+    chain: Chain
+    distances: tuple[FloatArray, ...]
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A robust fit with what follows from its residuals.
+
+    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors.
+    `held` are K parameters held at nominal that only other kinds of measurement determine, and how
+    the fitted ones follow them (P, K).
+    """
+
+    problem: Problem
+    names: tuple[str, ...]
+    robust: Robust
+    factor: FloatArray
+    noise: Noise
+    uncertainty: identifiability.Uncertainty
+    size: float
+    held: tuple[tuple[str, ...], FloatArray] | None = None
+
+    @property
+    def chain(self) -> Chain:
+        """Return the fitted chain."""
+        return self.robust.fit.chain
+
+    @property
+    def system(self) -> System:
+        """Return the samples with their weights in the fit."""
+        return self.robust.system
+
+
+def parameter_rows(
+    fitted: Fitted, structural: Sequence[str], uncertainty: identifiability.Uncertainty
+) -> tuple[ParameterRow, ...]:
+    """Return every parameter of a fitted chain, with its standard deviation if fitted."""
+    problem, chain, names = fitted.problem, fitted.chain, fitted.names
+    change = _to_values(chain, names)
+    variances = np.einsum('vp,kpr,vr->kv', change, uncertainty.parts, change, optimize=True)
+    std = dict(zip(names, np.sqrt(variances.sum(axis=0)).tolist(), strict=True))
+    freedom = dict(zip(names, uncertainty.freedom_of(variances).tolist(), strict=True))
+    free = set(problem.free)
+    rows = []
+    for name in problem.model.parameter_names:
+        if name in std:
+            status = 'fitted'
+        elif name in structural:
+            status = 'not excited'
+        else:
+            status = 'gauge' if name in free else 'fixed'
+        offset = chain.offset(name, problem.model)
+        value, spread = chain.value(name), std.get(name)
+        rows.append(ParameterRow(name, value, offset, spread, status, freedom.get(name, np.inf)))
+    return tuple(rows)
+
+
+def _to_values(chain: Chain, names: Sequence[str]) -> FloatArray:
+    """Return the derivative (P, P) of the values, which differ for rotation vectors of frames.
+
+    A turn by w in the parent's axes changes the vector v = log R by J_l(v)^-1 w.
+    """
+    change = np.eye(len(names))
+    for frame in chain.frame_names:
+        index = [names.index(name) for name in parameters_of(frame)[3:] if name in names]
+        if len(index) == 3:
+            vector = chain.frame(frame).offsets()[3:]
+            change[np.ix_(index, index)] = left_jacobian_inverse(vector)
+    return change
