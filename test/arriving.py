@@ -5,7 +5,7 @@
 from dataclasses import fields
 
 import numpy as np
-from streams import stamps, stops
+from streams import START, stamps, stops
 
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.sample import Sample
@@ -75,9 +75,9 @@ def give(made, come):
     ]
     left = Slice.of(pieces, round(1e9 * made.settings.delay)) if pieces else ()
     while len(left):
-        count = made.reach(left)
-        if (due := made.take(left.between(0, count))) is not None:
-            made.round(due)
+        count = made.reach(left, (0, 2 * START))
+        if rounds := made.take(left.between(0, count)):
+            made.round(rounds)
         left = left.between(count, len(left))
 
 

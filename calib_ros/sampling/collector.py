@@ -27,10 +27,11 @@ from calib_ros.sampling.slices import (
     Rows,
     Series,
     Slice,
+    Stamps,
     StreamKey,
     Waiting,
 )
-from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule
+from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
 
@@ -84,32 +85,62 @@ class Collector:
         ]
         return (stamps[complete], joints[complete]), positions
 
-    def reach(self, given: Slice) -> int:
+    def reach(self, given: Slice, calm: tuple[int, int]) -> int:
         """Return how many messages to take up to the next that requires work.
 
-        That is a joint sample at which a round is due, the last one with room in the buffer, or
-        one that is late, which is taken alone.
+        Rounds due before it are made up for with the last one if no message can tell the
+        difference: none is late for them, and there is room. It is the first joint sample beyond
+        the two stamps `calm`, between which nobody else has work.
         """
         if self.track.full:  # sample before the older half is dropped
             self._round(self._complete_ns)
         if self.track.full:
             self.notes['joint states dropped, the joint buffer was full'] += self.track.halve()
+        count = len(given)
         joints = given.where(JOINTS)
         stamps = given.times[joints]
         late = joints[stamps < self.track.horizon_ns]
-        ends = [len(given), *np.maximum(late[:1], 1)]
-        ends += [*joints[stamps - self._advanced_ns >= ADVANCE_NS][:1] + 1]
+        if len(late):  # handled one by one
+            count = max(int(late[0]), 1)
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
             room = self.track.room(columns)
             if room <= len(joints):
                 places = [each.places for each in given.pieces if each.key == columns]
-                ends += [*np.sort(np.concatenate(places))[room - 1 : room] - given.begin + 1]
-        return int(min(ends))
+                full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
+                count = int(min([count, *(full + 1).tolist()]))
+        rounds = joints[self._rounds(stamps, calm)]
+        if not len(rounds) or rounds[0] >= count:
+            return count
+        if len(rounds) > 1:
+            rounds = rounds[rounds < max(self._alike(given, int(rounds[0]) + 1, count), rounds[1])]
+        return int(rounds[-1]) + 1
 
-    def take(self, given: Slice) -> int | None:
-        """Take messages within `reach`; return the joint stamp of the round then due, if any."""
+    def _rounds(self, stamps: Stamps, calm: tuple[int, int]) -> list[int]:
+        """Return the joint samples at which a round is due, up to the first that is not calm."""
+        found, last = [], self._advanced_ns
+        first, end = (0, 0) if self.holding else calm
+        for k, stamp in enumerate(stamps.tolist()):
+            if stamp - last >= ADVANCE_NS:
+                found.append(k)
+                last = stamp
+                if not first <= stamp <= end:
+                    break
+        return found
+
+    def _alike(self, given: Slice, begin: int, end: int) -> int:
+        """Return the end of the messages that give the same before or after a round."""
+        times, joints = given.times[:end], given.joints[:end]
+        newest = np.maximum.accumulate(np.where(joints, times, self._newest_ns))
+        delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # beyond that of the slice
+        late = times - np.where(joints, 0, delay_ns) <= newest - self._late_ns
+        end = begin + int(np.argmax(np.append(late[begin:], True)))
+        room = self.waiting.room(given)
+        return begin if room is None else min(end, room)
+
+    def take(self, given: Slice) -> list[int]:
+        """Take messages up to one that gives something to do; return the stamps of its rounds."""
         joints = given.where(JOINTS)
-        due: int | None = None
+        rounds: list[int] = []
         last = np.maximum.accumulate(np.where(given.joints, np.arange(len(given)), -1))
         before = np.where(last < 0, self._newest_ns, given.times[last])
         if len(joints):
@@ -119,11 +150,11 @@ class Collector:
                 self._backwards += 1
                 if self._backwards < NO_ACCIDENT:
                     self.dropped['joints: later than lateness allows'] += 1
-                    return None
+                    return []
                 self.start_anew()
             self._backwards = 0
             self._newest_ns = newest
-            due = newest if newest - self._advanced_ns >= ADVANCE_NS else None
+            rounds = stamps[self._rounds(stamps, (0, newest))].tolist()
         for key, places, stamps, numbers in given.pieces:
             if isinstance(key, StreamKey):
                 after, at = self._settled_ns + self.delay_ns, before[places - given.begin]
@@ -131,13 +162,13 @@ class Collector:
                     self.waiting.apart[key].note(stamps - self.delay_ns, at, self._lateness_ns)
             else:
                 self.track.extend(key, stamps, numbers)
-        return due
+        return rounds
 
-    def round(self, now_ns: int) -> None:
-        """Make samples of what is complete at a joint stamp."""
-        self._advanced_ns = now_ns
+    def round(self, rounds: Sequence[int]) -> None:
+        """Make samples of what is complete, for rounds at joint stamps."""
+        self._advanced_ns = rounds[-1]
         if not self.holding:
-            self._round(self._complete_ns)
+            self._round(self._complete_ns, rounds)
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the joint states, given the number of measurements."""
@@ -233,16 +264,17 @@ class Collector:
         """Return the joint stamp up to which everything has arrived and stops are certain."""
         return self.track.newest_ns - self._late_ns
 
-    def _round(self, until: int, ends_here: bool = False) -> None:
+    def _round(self, until: int, rounds: Sequence[int] = (), ends_here: bool = False) -> None:
         """Make samples of everything up to a joint stamp; `ends_here` ends an ongoing stop."""
         self._sort()
         if until <= self._settled_ns:
             return
         plan = Schedule(self._settled_ns, self._sampled_ns)
         if self.settings.mode == 'continuous':
-            plan.add(until, '')
+            for end in (*(each - self._late_ns for each in rounds[:-1]), until):
+                plan.add(min(end, until), '')
         else:
-            self._plan_stops(plan, until, ends_here)
+            self._plan_stops(plan, until, rounds or (self.track.newest_ns,), ends_here)
         self._carry_out(plan)
         self._sampled_ns, self._settled_ns = plan.sampled_ns, plan.done_ns
         margin = round((REST_S + self.settings.max_gap) * 1e9)
@@ -259,12 +291,15 @@ class Collector:
                 if count:
                     self.dropped[f'{kind}: {cause}'] += count
 
-    def _plan_stops(self, plan: Schedule, until: int, ends_here: bool) -> None:
+    def _plan_stops(
+        self, plan: Schedule, until: int, rounds: Sequence[int], ends_here: bool
+    ) -> None:
         settings = self.settings
         stands = self.track.standing(settings.still, REST_S)
-        ongoing = stands[stands[:, 1] > self._settled_ns]
-        seen = np.diff(ongoing, axis=1) >= round(settings.shortest_stop * 1e9)
-        self.rests.note(None if seen.any() else self.track.noise_at_rest(ADVANCE_NS))
+        shortest = round(settings.shortest_stop * 1e9)
+        seen = seen_stops(stands, rounds, self._settled_ns, self._late_ns, shortest)
+        for found, now in zip(seen, rounds, strict=True):
+            self.rests.note(None if found else self.track.noise_at_rest(ADVANCE_NS, now))
         plan.of_stands(stands, until, None if ends_here else self.track.newest_ns, settings)
         if stops := plan.stops:
             spans = [(plan.begins[k], plan.ends[k]) for k in stops]

@@ -23,7 +23,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved, stuck
 from calib_ros.sampling.making import POSITION, QUAT
-from calib_ros.sampling.slices import Piece, Rows, Series, Stamps, StreamKey
+from calib_ros.sampling.slices import JOINTS, Piece, Rows, Series, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import NAMED
 from calib_ros.values import MOST_NAMES
@@ -237,6 +237,13 @@ class Clocks:
     @property
     def _begun_ns(self) -> int | None:
         return int(self._joints.stamps[0]) if self._joints.count else None
+
+    def calm(self, given: Slice) -> tuple[int, int]:
+        """Return joint stamps between which nothing needs to be evaluated."""
+        begun = self._begun_ns
+        if begun is None:
+            begun = int(given.times[given.where(JOINTS)[:1]].sum())
+        return begun - WATCH_NS, begun + WATCH_NS
 
     def look(self, now_ns: int) -> None:
         """Evaluate the motion if it is time to, and start again."""

@@ -189,7 +189,7 @@ class Pipeline:
         begin = 0
         while begin < len(given):
             left = given.between(begin, len(given))
-            count = self.collector.reach(left)
+            count = self.collector.reach(left, self.clocks.calm(left))
             yield left.between(0, count)
             begin += count
 
@@ -202,10 +202,10 @@ class Pipeline:
                 if back := int((times < newest).sum()):  # nothing is lost by it
                     self.notes[f'{kind} with a stamp older than the one before'] += back
         self.clocks.take(given.pieces)
-        due = self.collector.take(given)
-        if due is not None:
-            self.clocks.find(self.collector, due)
-            self.collector.round(due)
+        rounds = self.collector.take(given)
+        if rounds:
+            self.clocks.find(self.collector, rounds[-1])
+            self.collector.round(rounds)
         self.hand_over()
-        if due is not None:
-            self.clocks.look(due)
+        if rounds:
+            self.clocks.look(rounds[-1])

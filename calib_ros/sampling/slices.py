@@ -259,3 +259,15 @@ class Waiting(dict[StreamKey, Rows]):
             self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
         return True
+
+    def room(self, given: Slice) -> int | None:
+        """Return up to where messages fit; None if room must be made."""
+        streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
+        if len(self.keys() | {each.key for each in streams}) > MOST_NAMES:
+            return None
+        end = len(given)
+        for key, places, *_ in streams:
+            assert isinstance(key, StreamKey)
+            room = self._capacity - (self[key].count if key in self else 0)
+            end = int(min([end, *(places[room : room + 1] - given.begin).tolist()]))
+        return end

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -209,3 +210,17 @@ class Rests:
             return None
         needed = SPIKE * float(np.median(self._unseen))
         return needed if needed > still else None
+
+
+def seen_stops(
+    stands: Stamps, rounds: Sequence[int], settled_ns: int, late_ns: int, shortest_ns: int
+) -> list[bool]:
+    """Tell for each round whether it shows a stop that earlier ones have not settled.
+
+    Stands are (K, 2); each round settles what is older than its stamp by `late_ns`.
+    """
+    times = np.array(rounds)[:, np.newaxis]
+    settled = np.concatenate([[[settled_ns]], times[:-1] - late_ns])
+    lengths = np.minimum(stands[:, 1], times) - stands[:, 0]
+    found = ((lengths >= shortest_ns) & (stands[:, 1] > settled)).any(axis=1)
+    return [bool(each) for each in found]

@@ -237,16 +237,17 @@ class Track:
             common = found if common is None else intersection(common, found)
         return np.zeros((0, 2), dtype=np.int64) if common is None else common
 
-    def noise_at_rest(self, time_ns: int) -> float | None:
+    def noise_at_rest(self, time_ns: int, newest_ns: int) -> float | None:
         """Return the standard deviation [rad or m] of the noisiest joint, after `sort`.
 
-        From second differences of the samples of the latest time, free of motion (von Neumann
-        1941). None with too few samples, or more spread than that: the arm moves.
+        From second differences of the samples of some time before a stamp, free of motion (von
+        Neumann 1941). None with too few samples, or more spread than that: the arm moves.
         """
-        largest, newest = None, self.newest_ns
+        largest = None
         for columns, rows in self._parts.items():
-            first = int(np.searchsorted(rows.stamps, newest - time_ns))
-            values = rows.values[max(0, min(first, rows.count - TELLING)) :]
+            end = int(np.searchsorted(rows.stamps, newest_ns, 'right'))
+            first = int(np.searchsorted(rows.stamps, newest_ns - time_ns))
+            values = rows.values[max(0, min(first, end - TELLING)) : end]
             if len(values) < TELLING:
                 return None
             values = continuous(values, self._revolute[list(columns)])

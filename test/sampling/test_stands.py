@@ -88,3 +88,26 @@ def test_rests_unseen_count_once_each_up_to_a_capacity():
     assert rests.needed(0.0) == SPIKE * 2.0
     rests.sampled = 3
     assert rests.needed(0.0) is None
+
+
+def test_a_stop_shows_from_its_shortest_time_on_until_it_is_dealt_with():
+    stands = np.array([[10, 20]])
+    rounds = [13, 14, 19, 23, 24, 25]
+    found = seen_stops(stands, rounds, 9, 4, 4)
+    assert found == [False, True, True, True, True, False]
+    assert seen_stops(stands, [15], 20, 4, 4) == [False]
+    assert seen_stops(stands, [15], 19, 4, 4) == [True]
+
+
+def test_there_is_room_up_to_the_first_message_that_does_not_fit():
+    key = StreamKey('', '', False, False, False)
+    joints = Piece(('j',), np.array([0]), np.array([0]), np.zeros((1, 1)))
+    poses = Piece(key, np.array([1, 3, 4]), np.array([5, 6, 7]), np.zeros((3, 1)))
+    dropped = Counter()
+    waiting, given = Waiting(1, 3, dropped, lambda key: False), Slice.of([joints, poses])
+    assert waiting.room(given) == len(given) == 4
+    waiting.extend(key, np.array([1, 2]), np.zeros((2, 1)), 1)
+    assert (waiting.count, dropped.total()) == (1, 1)
+    assert waiting.room(given) == 3
+    waiting.extend(key, np.array([2, 3]), np.zeros((2, 1)), 1)
+    assert (waiting.count, waiting.room(given)) == (3, 1)
