@@ -18,21 +18,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import reduce
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.decision.lost_rows import lost
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import ORIENTATIONS, Sets, Suspect, dead, signs, suspects
-from calib_ros.estimation.identifiability import excited
-from calib_ros.estimation.leastsquares import System, factor_of, minimise
+from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
 from calib_ros.estimation.levels import (
     ALIKE,
-    CLEARLY,
     CONFIDENT,
     MOST_OUTLIERS,
     NEARER,
@@ -42,9 +39,7 @@ from calib_ros.estimation.levels import (
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
-from calib_ros.estimation.samples import Samples
-from calib_ros.estimation.start import closed_forms, flange, movable
-from calib_ros.kinematics import se3
+from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
@@ -56,12 +51,13 @@ from calib_ros.settings import LEVER
 class Explained:
     """The mistakes that explain the measurements, and typical errors [m] with and without them.
 
-    The latter is NaN if unknown.
+    The latter is NaN if unknown. `where` names the set if others fit the arm.
     """
 
     suspects: tuple[Suspect, ...]
     given: float
     corrected: float
+    where: str = ''
 
     @property
     def alone(self) -> bool:
@@ -71,9 +67,9 @@ class Explained:
     def __str__(self) -> str:
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
         if np.isnan(self.corrected):
-            return whats[0]
+            return f'{self.where}{whats[0]}'
         return (
-            f'{" -- or ".join(whats)} (the uncorrected arm is then typically '
+            f'{self.where}{" -- or ".join(whats)} (the uncorrected arm is then typically '
             f'{1e3 * self.corrected:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
 
@@ -119,17 +115,16 @@ def explained(problem: Problem) -> Explained | None:
     )
     if not sets or max(map(len, sets)) < IN_A_FRAME:
         return None  # base and tool alone explain nearly all of them
-    if not any(each.socket for each in sets):
-        sets = (max(sets, key=len),)
     base, tool = (
         frame if frame is not None and frame.fixed else None
         for frame in (problem.chain.base, problem.chain.tool)
     )
-    chain = replace(problem.chain, base=base, tool=tool)
-    given = _tried(chain, tuple(each.spread() for each in sets))
+    chain, where = replace(problem.chain, base=base, tool=tool), ''
+    if not any(each.socket for each in sets):
+        sets, where = _unlike(problem, chain, sets)
+    given = in_frames(problem, chain, sets)
     if given is None:
         return None
-    given = _polished(problem, given)
     found = (
         _of_a_dead_column(problem, chain, given)
         or _of_a_lost_row(problem, chain, sets, given)
@@ -137,32 +132,51 @@ def explained(problem: Problem) -> Explained | None:
         or _by_places(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
-    if found is None or not problem.of_messages:
-        return found
-    return replace(found, suspects=tuple(replace(e, remedy=e.published) for e in found.suspects))
+    if found is None:
+        return None
+    named = found.suspects
+    if problem.of_messages:
+        named = tuple(replace(each, remedy=each.published) for each in named)
+    return replace(found, suspects=named, where=where)
+
+
+def _unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
+    """Return the largest set that the arm does not explain, and its name if it explains others.
+
+    Another device or session may have other units or conventions.
+    """
+    trials = [in_frames(problem, chain, (each,)) for each in sets] if len(sets) > 1 else []
+    errors = np.array([np.inf if trial is None else trial.error for trial in trials])
+    wrong = np.flatnonzero(errors > _largest(problem)).tolist()
+    worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
+    if not 0 < len(wrong) < len(sets):
+        return (sets[worst],), ''
+    shared = set.intersection(*({each.base, each.tool} for each in sets))
+    own = ', '.join(sorted({sets[worst].base, sets[worst].tool} - shared))
+    return (sets[worst],), f'in the measurements with {own} alone, '
 
 
 def _of_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
 
 
-def _of_a_dead_column(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
+def _of_a_dead_column(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
     """Return a coordinate that was not measured: no change of the input restores it."""
     found = None if _of_images(problem) else dead(chain, given.sets)
     return None if found is None else Explained((found,), given.error, np.nan)
 
 
-def _named(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
-    rough, tried, bare = [], [], _Bare()
+def _named(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
+    rough, tried, bare = [], [], Bare()
     for each in suspects(chain, given.sets, _of_images(problem)):
         few = given.sets
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
-        found = _tried(each.chain or chain, each.undone(few), bare)
+        found = trial_of(each.chain or chain, each.undone(few), bare)
         if found is not None and found.share < given.share:
             rough.append((found, each))
     for found, each in sorted(rough, key=lambda one: one[0].share)[:TRIED]:
-        polished = _polished(problem, found)
+        polished = refined(problem, found)
         # an arm in mm fits places in mm, and is off by metres
         if polished.error <= _largest(problem):
             tried.append((polished.share, polished, each))
@@ -184,17 +198,17 @@ def _largest(problem: Problem) -> float:  # [m]
     return problem.largest_error + LEVER * problem.largest_angle / 3.0
 
 
-def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
     """Return a row missing in one of two tables side by side, if that explains all."""
     if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
         return None
 
     def framed(part: Observations) -> Chain | None:
-        found = _tried(chain, (part.spread(),))
-        return None if found is None else _polished(problem, found).chain
+        found = in_frames(problem, chain, (part,))
+        return None if found is None else found.chain
 
     def errors(arm: Chain, each: Observations) -> FloatArray:
-        return _away(arm, each, flange(arm, each))
+        return misses(arm, each, flange(arm, each))
 
     found = lost(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
     if found is None:
@@ -205,16 +219,15 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: _Trial) ->
     return Explained((Suspect(found.what, remedy),), given.error, corrected)
 
 
-def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Explained | None:
+def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
     """Return that the orientations are wrong, if the positions are explained."""
     whole = all(each.oriented.all() and not (each.socket or each.inverse) for each in sets)
     if _of_images(problem) or not whole:
         return None
     alone = tuple(replace(each, oriented=np.zeros(len(each), dtype=bool)) for each in sets)
-    start = _tried(chain, tuple(each.spread() for each in alone))
-    if start is None:
+    placed = in_frames(problem, chain, alone)
+    if placed is None:
         return None
-    placed = _polished(problem, start)
     if placed.error <= min(problem.largest_error, NEARER * given.error):
         known = placed.error + LEVER * problem.sigma_orientation
         enough = known < NEARER * given.error
@@ -226,7 +239,7 @@ def _by_places(problem: Problem, chain: Chain, sets: Sets, given: _Trial) -> Exp
     return replace(found, suspects=(replace(found.suspects[0], what=what),))
 
 
-def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
+def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
     """Return simultaneous mistakes, each of which explains part of the errors.
 
     Beam search: another mistake is added to each of the best few, until the arm explains the rest
@@ -241,19 +254,19 @@ def _several(problem: Problem, chain: Chain, given: _Trial) -> Explained | None:
     least = given.share
     kept: list[tuple[Suspect, ...]] = [()]
     for number in range(SEVERAL + 1):  # several of joints, one of the poses
-        found: dict[float, tuple[_Trial, tuple[Suspect, ...]]] = {}
+        found: dict[float, tuple[Trial, tuple[Suspect, ...]]] = {}
         together = [(*some, each) for some in kept for each in options]
         for some in together if number else [*together, *signs(chain)]:
             if len({one.part for one in some}) == len(some):
                 more = tuple(sorted(some, key=lambda one: one.part != 'measured'))
-                trial = _tried(chain, reduce(lambda sets, one: one.undone(sets), more, few))
+                trial = trial_of(chain, reduce(lambda sets, one: one.undone(sets), more, few))
                 if trial is not None:  # keeps the first of equivalent ones
                     found.setdefault(round(trial.share, 6), (trial, more))
         best = [found[key] for key in sorted(found)[:TRIED]]
         if not best or (number and best[0][0].share > CONFIDENT * least):
             return None
         least = best[0][0].share
-        polished = _polished(problem, best[0][0])
+        polished = refined(problem, best[0][0])
         kept = [some for _, some in best]
         if len(kept[0]) > 1 and polished.error <= largest and polished.share <= share:
             return Explained((_together(kept[0]),), given.error, polished.error)
@@ -275,108 +288,6 @@ def _as_poses(problem: Problem, each: Observations) -> Observations:
     if each.pixels is None:
         return each
     return board_poses(each, require_lens(problem.chain.frame(each.camera).lens, each.camera))
-
-
-@dataclass(frozen=True, eq=False)
-class _Trial:
-    """A chain with frames fitted to some samples, and the spread of positions [m].
-
-    The smaller of the spreads of flange and measured positions: if metres are taken for
-    millimetres, or radians for degrees, every error is small. `arms` are the poses (N, 4, 4) of
-    the bare arm.
-    """
-
-    chain: Chain
-    sets: Sets
-    arms: tuple[FloatArray, ...]
-    spread: float = 1.0
-
-    @cached_property
-    def error(self) -> float:
-        """Return the median error [m] of the samples."""
-        pairs = zip(self.sets, self.arms, strict=True)
-        sizes = [_away(self.chain, each, arm) for each, arm in pairs]
-        return float(np.median(np.concatenate(sizes)))
-
-    @property
-    def share(self) -> float:
-        """Return the error in units of the spread."""
-        return self.error / max(self.spread, 1e-9)
-
-
-def _tried(chain: Chain, sets: Sets, bare: _Bare | None = None) -> _Trial | None:
-    """Return the chain with frames for some samples in closed form, set by set.
-
-    `bare` caches the poses of arms tried before.
-    """
-    spreads, arms, bare = [], [], bare or _Bare()
-    for each in sets:
-        alone = replace(each, base='base', tool='tool')
-        arm = bare.poses(chain, alone)
-        best = _nearest(chain, alone, arm, np.ones(len(alone), dtype=bool))
-        if best is None:
-            return None
-        away = _away(best.chain, alone, arm)  # a gross error would hide a mistake
-        usual = away <= np.quantile(away, 1.0 - MOST_OUTLIERS)
-        if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
-            again = _nearest(chain, alone, arm, usual)
-            best = best if again is None or best.error <= again.error else again
-        places = arm[:, :3, 3]
-        seen = places if each.socket else each.positions  # sockets measure nothing
-        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
-        chain = chain.with_frame(each.base, best.chain.frame('base'))
-        chain = chain.with_frame(each.tool, best.chain.frame('tool'))
-        arms.append(arm)
-    return _Trial(chain, sets, tuple(arms), float(np.median(spreads)))
-
-
-def _nearest(
-    chain: Chain, each: Observations, arm: FloatArray, rows: NDArray[np.bool_]
-) -> _Trial | None:
-    """Return the best closed form of some rows (N,), judged by all of them; None if none is."""
-    starts = closed_forms(chain, each.select(rows), arm[rows])
-    found = [_Trial(start, (each,), (arm,)) for start in starts]
-    found = [one for one in found if np.isfinite(one.error)]
-    return min(found, key=lambda one: one.error, default=None)
-
-
-class _Bare:
-    """Cache of the poses of bare arms, which most suspects leave unchanged."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
-
-    def poses(self, chain: Chain, each: Observations) -> FloatArray:
-        """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
-        key = id(each.joints), id(chain.joints), chain.convention
-        if key not in self._known:  # cached objects keep their ids
-            self._known[key] = flange(chain, each), chain, each.joints
-        return self._known[key][0]
-
-
-def _polished(problem: Problem, trial: _Trial) -> _Trial:
-    chain, sets = trial.chain, trial.sets
-    sigmas = problem.sigma_position, problem.sigma_orientation
-    pairs = zip(sets, trial.arms, strict=True)
-    usual = [e.select(_away(chain, e, arm) <= CLEARLY * trial.error) for e, arm in pairs]
-    system = System(tuple(Samples(each, *sigmas) for each in usual))
-    sockets = {each.base for each in sets if each.socket}
-    every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
-    names = [name for name in every if name.is_length or name.owner not in sockets]
-    known = excited(factor_of(chain, names, system), names)
-    fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
-    polished = _Trial(fitted, sets, trial.arms, trial.spread)
-    return min(trial, polished, key=lambda one: one.error)
-
-
-def _away(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
-    """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
-    found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
-    away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
-    if each.oriented.any():
-        turns = se3.angles_between(found[:, :3, :3], each.rotations)
-        away = away + LEVER * np.where(each.oriented, turns, 0.0)
-    return np.asarray(away)
 
 
 def _moved(problem: Problem, each: Observations, rows: int) -> Observations:

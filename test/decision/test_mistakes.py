@@ -289,6 +289,15 @@ def test_another_robot_in_messages_is_named_as_the_chain_to_set():
     assert 'set chain (--chain) to ur10e (' in str(explained(problem))
 
 
+@pytest.mark.parametrize('held', [False, True])
+def test_a_mistake_of_one_of_two_devices_is_named_with_its_frame(held):
+    base = faulty(UR, Cell(), np.random.default_rng(1)).base  # that of `seen_of`
+    first, second = seen_of(), SPOILT['mm'][0](seen_of())
+    chain = replace(UR, base=replace(base, fixed=held), frames=(('base_2', None),))
+    found = explained(Problem(chain, first, more=[replace(second, base='base_2')]))
+    assert str(found).startswith('in the measurements with base_2 alone, the positions are in mm')
+
+
 def test_large_errors_of_an_arm_are_no_mistake():
     rng = np.random.default_rng(0)
     true = faulty(UR, Cell(5e-3, 1e-2), rng)

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An arm tried on some samples: base and tool in closed form, then refined by least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.decision.suspects import Sets
+from calib_ros.estimation.identifiability import excited
+from calib_ros.estimation.leastsquares import System, factor_of, minimise
+from calib_ros.estimation.levels import CLEARLY, MOST_OUTLIERS
+from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.start import closed_forms, flange, movable
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import IN_A_FRAME
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import LEVER
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A chain with frames fitted to some samples, and the spread of positions [m].
+
+    The smaller of the spreads of flange and measured positions: if metres are taken for
+    millimetres, or radians for degrees, every error is small. `arms` are the poses (N, 4, 4) of
+    the bare arm.
+    """
+
+    chain: Chain
+    sets: Sets
+    arms: tuple[FloatArray, ...]
+    spread: float = 1.0
+
+    @cached_property
+    def error(self) -> float:
+        """Return the median error [m] of the samples."""
+        pairs = zip(self.sets, self.arms, strict=True)
+        sizes = [misses(self.chain, each, arm) for each, arm in pairs]
+        return float(np.median(np.concatenate(sizes)))
+
+    @property
+    def share(self) -> float:
+        """Return the error in units of the spread."""
+        return self.error / max(self.spread, 1e-9)
+
+
+def trial_of(chain: Chain, sets: Sets, bare: Bare | None = None) -> Trial | None:
+    """Return the chain with frames for some samples in closed form, set by set.
+
+    `bare` caches the poses of arms tried before.
+    """
+    spreads, arms, bare = [], [], bare or Bare()
+    for each in sets:
+        alone = replace(each, base='base', tool='tool')
+        arm = bare.poses(chain, alone)
+        known = chain.all_frames  # other robots have only a base and a tool
+        own = replace(chain, base=known.get(each.base), tool=known.get(each.tool))
+        best = _nearest(own, alone, arm, np.ones(len(alone), dtype=bool))
+        if best is None:
+            return None
+        away = misses(best.chain, alone, arm)  # a gross error would hide a mistake
+        usual = away <= np.quantile(away, 1.0 - MOST_OUTLIERS)
+        if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
+            again = _nearest(own, alone, arm, usual)
+            best = best if again is None or best.error <= again.error else again
+        places = arm[:, :3, 3]
+        seen = places if each.socket else each.positions  # sockets measure nothing
+        spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))
+        chain = chain.with_frame(each.base, best.chain.frame('base'))
+        chain = chain.with_frame(each.tool, best.chain.frame('tool'))
+        arms.append(arm)
+    return Trial(chain, sets, tuple(arms), float(np.median(spreads)))
+
+
+def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial | None:
+    """Return the arm as given, in the frames that suit it best."""
+    given = trial_of(chain, tuple(each.spread() for each in sets))
+    return None if given is None else refined(problem, given)
+
+
+def _nearest(
+    chain: Chain, each: Observations, arm: FloatArray, rows: NDArray[np.bool_]
+) -> Trial | None:
+    """Return the best closed form of some rows (N,), judged by all of them; None if none is."""
+    starts = closed_forms(chain, each.select(rows), arm[rows])
+    found = [Trial(start, (each,), (arm,)) for start in starts]
+    found = [one for one in found if np.isfinite(one.error)]
+    return min(found, key=lambda one: one.error, default=None)
+
+
+class Bare:
+    """Cache of the poses of bare arms, which most suspects leave unchanged."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
+
+    def poses(self, chain: Chain, each: Observations) -> FloatArray:
+        """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
+        key = id(each.joints), id(chain.joints), chain.convention
+        if key not in self._known:  # cached objects keep their ids
+            self._known[key] = flange(chain, each), chain, each.joints
+        return self._known[key][0]
+
+
+def refined(problem: Problem, trial: Trial) -> Trial:
+    """Return the trial with frames refined by least squares on the samples near it."""
+    chain, sets = trial.chain, trial.sets
+    sigmas = problem.sigma_position, problem.sigma_orientation
+    pairs = zip(sets, trial.arms, strict=True)
+    usual = [e.select(misses(chain, e, arm) <= CLEARLY * trial.error) for e, arm in pairs]
+    system = System(tuple(Samples(each, *sigmas) for each in usual))
+    sockets = {each.base for each in sets if each.socket}
+    every = movable(chain, dict.fromkeys(name for each in sets for name in (each.base, each.tool)))
+    names = [name for name in every if name.is_length or name.owner not in sockets]
+    known = excited(factor_of(chain, names, system), names)
+    fitted = minimise(chain, known, system, tolerance=1e-2, iterations=12).chain
+    polished = Trial(fitted, sets, trial.arms, trial.spread)
+    return min(trial, polished, key=lambda one: one.error)
+
+
+def misses(chain: Chain, each: Observations, arm: FloatArray) -> FloatArray:
+    """Return the errors (N,) [m] of samples, given the poses (N, 4, 4) of the bare arm."""
+    found = chain.frame(each.base).matrix @ arm @ chain.frame(each.tool).matrix
+    away = np.linalg.norm(each.positions - found[:, :3, 3], axis=1)
+    if each.oriented.any():
+        turns = se3.angles_between(found[:, :3, :3], each.rotations)
+        away = away + LEVER * np.where(each.oriented, turns, 0.0)
+    return np.asarray(away)
