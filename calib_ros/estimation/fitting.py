@@ -27,13 +27,14 @@ from calib_ros.estimation.leastsquares import (
     triangular_factor,
 )
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.estimation.noise import Noise, noise_of
+from calib_ros.estimation.noise import Noise, noise_of, squares_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.robust import SUSPICIOUS, reweighted, thorough_fit
+from calib_ros.estimation.sizes import SETTLED, SPREAD
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import ROUNDS, FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
 
 SOME = 2 * SOME_POSES  # samples for a first fit or a linear model
 FOLLOWED = 2.0
@@ -105,6 +106,8 @@ def _fit_all(
         problem = guarded
         fitted = _fit(*_some(problem, simpler), rough, names)
     size, first = _noise_for_priors(fitted.noise, simpler), fitted.size
+    if simpler is None and (fitted.noise.consistent or size <= 1.0):
+        size = min(size, _likely_noise(fitted))
     posterior = posterior_of(fitted, size, judging=False)
     if not _priors_matter(problem, names, posterior):
         return fitted
@@ -166,6 +169,34 @@ def _noise_for_priors(noise: Noise, simpler: Simpler | None) -> float:
     if simpler is not None or noise.consistent:
         return noise.size
     return max(noise.size / (FOLLOWED * noise.widened), min(noise.size, 1.0))
+
+
+def _likely_noise(fitted: Fitted) -> float:
+    """Return the most probable size of the noise [sigma given], together with those of the errors.
+
+    Few poses leave least squares little to tell the noise by, and a test accepts sigmas that are
+    far too large. Priors leave more:
+
+        t^2 = |r|^2 / (R - gamma)
+
+    with R rows, residuals r of the posterior mean, and gamma the number of parameters that the
+    data determine (MacKay 1992). The hyperprior of t about the given sigmas is that of the errors.
+    """
+    products = fitted.robust.fit.normal.products.sum(axis=0)
+    sums, rows, shared, _ = squares_of(fitted.chain, fitted.system).sum(axis=1).tolist()
+    width, size = np.log(SPREAD) ** -2, 1.0
+    for _ in range(ROUNDS):
+        found = posterior_of(fitted, size, judging=False)
+        along = np.append(-found.shift, 1.0)
+        squares = float(along @ products @ along) / size**2
+        free = rows - float(np.sum(products[:-1, :-1] * found.covariance)) / size**2
+        step = (squares - free - width * np.log(size)) / (2.0 * max(free, 0.0) + width)
+        size *= float(np.exp(np.clip(step, -1.0, 1.0)))
+        if abs(step) < SETTLED:
+            break
+    together = shared / max(sums, ROUNDING)  # of the rows of one configuration
+    size *= fitted.noise.widened
+    return size * float(np.sqrt(together)) if together > SUSPICIOUS else size
 
 
 def _guarded(

@@ -57,7 +57,7 @@ def noise_of(
     """
     plain = identifiability.covariance(factor)
     taken = np.array([float(np.sum(plain * part)) for part in fit.normal.parts])
-    squares = _squares(fit.chain, system)
+    squares = squares_of(fit.chain, system)
     if not fit.normal.parts[1].any():  # whitened as a whole, or no orientation
         squares = np.column_stack([squares.sum(axis=1), np.zeros(4)])
     sums, counts, joint_sums, joint_counts = squares
@@ -86,7 +86,8 @@ def noise_of(
     seen = np.where(together > SUSPICIOUS, joint_counts, counts)
     freedom = np.maximum(seen - taken, 1.0)
     freedom = np.append(np.where(estimated, freedom, np.inf), np.inf)
-    if not estimated.any():
+    weighed = system.prior is not None and system.prior.noise != 1.0  # against other noise
+    if not (estimated.any() or weighed):
         return noise, Uncertainty(plain[np.newaxis], np.array([np.inf]))
 
     sources = [neighbours.middles.get(k, middle) for k, middle in enumerate(middles)]
@@ -98,10 +99,12 @@ def noise_of(
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
     size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))
-    return replace(noise, size=size), Uncertainty(covariance, freedom)
+    if estimated.any():
+        noise = replace(noise, size=size)
+    return noise, Uncertainty(covariance, freedom)
 
 
-def _squares(chain: Chain, system: System) -> FloatArray:
+def squares_of(chain: Chain, system: System) -> FloatArray:
     """Return by part (4, 2) sums and counts of squared residuals, alone and over configurations.
 
     If pairs of a configuration share no error, squares of their sums add up to the same.

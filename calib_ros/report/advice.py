@@ -15,6 +15,7 @@ from functools import cache
 from importlib import resources
 
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.estimation.levels import ALIKE
 from calib_ros.settings import EXCEPTION
 
 AGAIN = (
@@ -97,6 +98,11 @@ LEFT = (
     'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
     'sigma_position is {:.2g} mm.'
 )
+FINER = (
+    'If the device is accurate to less than {:.2g} mm by its data sheet, state that '
+    '(--sigma-position, in metres): the measurements scatter by only {:.2g} mm.'
+)
+"""First step if a correction is uncertain by the stated noise of the device alone."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,12 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         if situation.auto:
             steps = tuple(each for each in refusal.steps if 'model to auto' not in each)
             refusal = replace(refusal, steps=steps)
-        advised.append(situation.said_of(refusal) if rule in {Rule.GAIN, Rule.REGION} else refusal)
+        if rule in {Rule.GAIN, Rule.REGION}:
+            refusal = situation.said_of(refusal)
+        if rule is Rule.REGION and situation.sigma and situation.left * ALIKE < 1.0:
+            finer = FINER.format(1e3 * situation.sigma, 1e3 * situation.left * situation.sigma)
+            refusal = replace(refusal, steps=(finer, *refusal.steps))
+        advised.append(refusal)
     for cause, texts in following.items():
         heading = f'Likely consequences of "{rules()[cause].heading}"'
         advised.append(Advice(heading, '', (), '; '.join(texts)))

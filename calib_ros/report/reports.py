@@ -150,7 +150,7 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     held_out = () if judged is None or judged.repeated is None else (judged,)
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
     poses = sum(map(distinct, numbers))
-    sigma = result.noise.given.get('sigma_position')
+    sigma = None if result.images else result.noise.given.get('sigma_position')
     return advice(result.refusals, Situation(poses, noise, sigma, bool(result.verdicts)))
 
 

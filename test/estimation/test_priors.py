@@ -8,6 +8,7 @@ from fits import SIGMAS, UR10E, measured_arm, rms
 
 from calib_ros.apply.simulation import Cell
 from calib_ros.errors import TooFewObservationsError, UnknownNameError
+from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
@@ -89,3 +90,15 @@ def test_a_pattern_may_hold_what_only_other_arms_have(rng):
     for slip in ('*.betta', 'elbow.b'):
         with pytest.raises(UnknownNameError, match='unknown parameter'):
             Problem(UR10E, seen, fixed=(slip,))
+
+
+def test_sigmas_that_are_too_large_do_not_hold_few_poses_near_nominal():
+    """Least squares of six poses leaves 6 of 36 equations to tell the noise by."""
+    errors = []
+    for seed in range(8):
+        rng, true, seen = measured_arm(seed, 6)
+        unseen = UR10E.random_joints(100, rng)
+        told = [{name: times * sigma for name, sigma in SIGMAS.items()} for times in (1.0, 5.0)]
+        errors.append([rms(fit(Problem(UR10E, seen, **s))[2].chain, true, unseen) for s in told])
+    known, coarse = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert coarse < 1.15 * known

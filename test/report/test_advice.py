@@ -41,6 +41,18 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
 
 
+@pytest.mark.parametrize('poses', [14, 50])
+def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
+    """The stated sigma may alone make a correction uncertain that held-out poses confirm."""
+    refused = [Reason(Rule.REGION, 'uncertain')]
+    here = advice.Situation(poses, sigma=1e-4)
+    (finer,) = advice.advice(refused, replace(here, left=0.22))
+    (usual,) = advice.advice(refused, replace(here, left=0.8))
+    assert 'less than 0.1 mm' in finer.steps[0]
+    assert 'only 0.022 mm' in finer.steps[0]
+    assert finer.steps[1:] == usual.steps
+
+
 @pytest.mark.parametrize('rule', Rule)
 def test_nobody_is_sent_to_the_model_just_used(rule):
     (told,) = advice.advice([Reason(rule, 'something new')], advice.Situation(auto=True))
