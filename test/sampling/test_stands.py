@@ -6,7 +6,28 @@ import numpy as np
 import pytest
 
 from calib_ros.sampling.slices import Piece, Slice, StreamKey, Waiting
-from calib_ros.sampling.stops import SPIKE, Known, Rests, seen_stops
+from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
+from calib_ros.settings import Settings
+
+S = 10**9
+MOVING = 'the arm was moving'
+
+
+@pytest.mark.parametrize(
+    ('stand', 'until', 'newest', 'done', 'expected'),
+    [
+        ((2, 9), 10, 12, 0, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
+        ((2, 5), 5, 5, 0, [(2, MOVING, 0)]),  # one that goes on is waited for
+        ((2, 6), 4, 6, 0, [(2, MOVING, 0)]),
+        ((3, 8), 10, 12, 5, [(8, SAMPLED, 0), (10, MOVING, 0)]),  # of this one there is a sample
+    ],
+)
+def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(stand, until, newest, done, expected):
+    plan = Schedule(done * S, done * S)
+    stands, settings = S * np.array([stand]), Settings(shortest_stop=1.0, longest_stop=3.0)
+    plan.of_stands(stands, until * S, newest * S, settings)
+    found = zip(plan.ends, plan.why, plan.begins, strict=True)
+    assert [(end // S, why, begin // S) for end, why, begin in found] == expected
 
 
 def test_a_stop_seen_before_is_known_where_and_when_it_was():
