@@ -3,6 +3,7 @@
 """What is told of images of a board is told in images, corners and lines of the user's tables."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -35,19 +36,23 @@ def photographs(tmp_path_factory):
 def identified(photographs, run, monkeypatch, tmp_path):
     monkeypatch.chdir(photographs)
 
-    def identified(places):
+    def identified(places, *more):
         words = ['identify', '--chain', 'ur10e', '--eye-in-hand', '--sigma-pixel', '0.1']
         words += ['--detections', 'corners.csv', '--board', 'board.yaml', '--places', places]
-        status, out, _ = run(*words, '--intrinsics', 'camera.yaml', '--out', tmp_path / 'out')
+        status, out, _ = run(
+            *words, '--intrinsics', 'camera.yaml', '--out', tmp_path / 'out', *more
+        )
         return status, ' '.join(out.split()), tmp_path / 'out'
 
     return identified
 
 
 def test_a_result_counts_images_and_corners(identified):
-    status, told, out = identified('places.csv')
+    status, told, out = identified('places.csv', '--lens', 'fitted')
     assert status == 0
     assert 'fitted to 30 images with 720 corners position error' in told
+    found = re.search(r': fx (\S+), fy', told)
+    assert float(found.group(1)) == pytest.approx(CAMERA.lens.fx, rel=1e-3)
     page = Page((out / 'report.html').read_text())
     for text in ('Corners one by one', 'Share of corners within', 'Corners 720'):
         assert text in page.text

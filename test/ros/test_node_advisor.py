@@ -108,7 +108,8 @@ def test_errors_over_the_workspace_come_with_an_accepted_identification(cell, re
     cell.done('identify')
     cell.spin_until(lambda: heard)
     (message,) = heard
-    assert [field.name for field in message.fields] == ['x', 'y', 'z', 'error', 'sigma']
+    fields = [(field.name, field.offset) for field in message.fields]
+    assert fields == [('x', 0), ('y', 4), ('z', 8), ('error', 12), ('sigma', 16)]
     assert message.header.frame_id == 'tracker'
     assert message.is_dense
     assert (message.height, message.point_step) == (1, 20)
@@ -180,7 +181,7 @@ def corrected(cell):
     return corrections(cell)
 
 
-def test_a_trajectory_is_corrected(calibrated, corrected):
+def test_a_trajectory_is_corrected(calibrated, corrected, monkeypatch):
     q, velocities, accelerations, times = path()
     message = trajectory(q, velocities, accelerations, times)
     said = send(calibrated, message)
@@ -202,6 +203,11 @@ def test_a_trajectory_is_corrected(calibrated, corrected):
     assert 1e-4 < np.abs(rates - velocities).max() < 0.05
     bends = np.array([point.accelerations for point in answer.points])
     assert 1e-5 < np.abs(bends - accelerations).max() < 0.05
+    told = calibrated.log()
+    monkeypatch.setattr(Calibration, 'knowledge', lambda *_: ('', 'too little'))
+    known, _, _ = said.partition('; uncertainty of')
+    assert send(calibrated, message) == f'{known}; too little'
+    calibrated.spin_until(lambda: any('trajectory: too little' in each.msg for each in told))
 
 
 def test_other_joints_and_names_of_the_robot(tmp_path):

@@ -38,6 +38,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
     """It is told at level ERROR, and everything is as before when it works again."""
     diagnostics = cell.listen(DiagnosticArray, '/diagnostics', 10)
     status = cell.listen(String, '/calibration_node/status')
+    logged = cell.log()
     cell.play(part(recording, 0, 10))
     for k, (what, part_of_it) in enumerate(BROKEN.items()):
 
@@ -51,6 +52,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
             found = diagnostics[-1].status[0]
             assert found.level == DiagnosticStatus.ERROR
             assert f'{what} is broken' in found.message
+            cell.spin_until(lambda s=f'{what} is broken': any(s in m.msg for m in logged))
             assert (what != 'the status') == ('poses' in found.message)
             assert (what in ('the account', 'the figures')) == (not found.values)
             if what not in ('taking messages', 'the status'):
@@ -206,6 +208,8 @@ def test_what_comes_out_after_the_end_is_no_error(tmp_path, capfd):
         node = cell.node
     node._boundary.guarded(node._status.publish)(String())
     assert 'internal error' not in capfd.readouterr().err
+    node._boundary.guarded(int)('x')
+    assert 'internal error' in capfd.readouterr().err
 
 
 def test_heavy_losses_are_refused_as_in_a_bag_unless_they_are_allowed(cell, recording):

@@ -96,6 +96,10 @@ def test_residuals_of_all_devices_are_drawn_in_one_frame(tmp_path, recording, tr
         measured = cell.node.session.problem().observations
         np.testing.assert_allclose(begins[0], measured.positions, atol=1e-12)
         predicted = cell.node.session.calibration.chain.forward(measured.joints)[:, :3, 3]
-        longer = 200.0 * (predicted - measured.positions)
-        np.testing.assert_allclose(ends[0] - begins[0], longer, atol=1e-9)
+        left = predicted - measured.positions
+        np.testing.assert_allclose(ends[0] - begins[0], 200.0 * left, atol=1e-9)
+        sizes = np.linalg.norm(left, axis=1)
+        red = np.minimum(sizes / (3.0 * np.sqrt(np.mean(sizes**2))), 1.0)
+        shown = [(color.r, color.g) for color in lines.colors[: 2 * STOPS : 2]]
+        np.testing.assert_allclose(shown, np.column_stack([red, 1.0 - red]), atol=1e-6)
         np.testing.assert_allclose(begins[1], begins[0], atol=5e-4)

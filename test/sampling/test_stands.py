@@ -1,7 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,43 +10,22 @@ from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, see
 from calib_ros.settings import Settings
 
 S = 10**9
-MOVING, SHORT = 'the arm was moving', 'the stop was too short'
+MOVING = 'the arm was moving'
 
 
 @pytest.mark.parametrize(
-    ('stands', 'until', 'newest', 'expected', 'more'),
+    ('stand', 'until', 'newest', 'done', 'expected'),
     [
-        ([], 10, 12, [(10, MOVING, 0)], {}),
-        # A stop of just the shortest time is one; what is left of a longer one is not used.
-        ([(2, 3)], 10, 12, [(2, MOVING, 0), (3, '', 2), (10, MOVING, 0)], {}),
-        ([(2, 9)], 10, 12, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)], {}),
-        # One that goes on is waited for, unless it has the longest time already.
-        ([(2, 4)], 4, 4, [(2, MOVING, 0)], {}),
-        ([(2, 5)], 5, 5, [(2, MOVING, 0)], {}),
-        ([(2, 6)], 5, 6, [(2, MOVING, 0), (5, '', 2)], {}),
-        ([(2, 6)], 4, 6, [(2, MOVING, 0)], {}),
-        # Without a newest stamp everything ends.
-        ([(2, 6)], 4, None, [(2, MOVING, 0), (4, '', 2)], {}),
-        ([(12, 16)], 10, 16, [(10, MOVING, 0)], {}),
-        # A short one is none.
-        (
-            *([(2, 3), (5, 7)], 10, 12),
-            [(2, MOVING, 0), (3, SHORT, 0), (5, MOVING, 0), (7, '', 5), (10, MOVING, 0)],
-            {'shortest': 2.0},
-        ),
-        # Of one that was sampled nothing more is used, nor again what was dealt with.
-        ([(3, 8)], 10, 12, [(8, SAMPLED, 0), (10, MOVING, 0)], {'done': 5, 'sampled': 5}),
-        ([(5, 8)], 10, 12, [(8, SAMPLED, 0), (10, MOVING, 0)], {'done': 5, 'sampled': 5}),
-        (*([(1, 5), (6, 8)], 10, 12), [(6, MOVING, 0), (8, '', 6), (10, MOVING, 0)], {'done': 5}),
+        ((2, 9), 10, 12, 0, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
+        ((2, 5), 5, 5, 0, [(2, MOVING, 0)]),  # one that goes on is waited for
+        ((2, 6), 4, 6, 0, [(2, MOVING, 0)]),
+        ((3, 8), 10, 12, 5, [(8, SAMPLED, 0), (10, MOVING, 0)]),  # of this one there is a sample
     ],
 )
-def test_stands_become_stops(stands, until, newest, expected, more):
-    done, settings = more.get('done', 0), Settings(longest_stop=3.0)
-    settings = replace(settings, shortest_stop=more.get('shortest', 1.0))
-    plan = Schedule(done * S, more.get('sampled', 0) * S)
-    stands = np.array(stands, dtype=np.int64).reshape(-1, 2) * S
-    plan.of_stands(stands, until * S, None if newest is None else newest * S, settings)
-    assert plan.done_ns == (plan.ends[-1] if plan.ends else done * S)
+def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(stand, until, newest, done, expected):
+    plan = Schedule(done * S, done * S)
+    stands, settings = S * np.array([stand]), Settings(shortest_stop=1.0, longest_stop=3.0)
+    plan.of_stands(stands, until * S, newest * S, settings)
     found = zip(plan.ends, plan.why, plan.begins, strict=True)
     assert [(end // S, why, begin // S) for end, why, begin in found] == expected
 
