@@ -142,8 +142,7 @@ def ended(seconds: float) -> Hint:
     words = f'measurements go on for {seconds:.0f} s without joint states'
     return Hint(
         f'{words}: does the driver run?',
-        f"{words}: does the robot's driver still run, and name the joints as before? Repeat the "
-        'poses of that time',
+        f'{words}: does the driver run, and name the joints as before? Repeat these poses',
     )
 
 

@@ -179,7 +179,7 @@ def test_joint_stamps_of_whole_seconds_are_told_rather_than_rare_joint_states():
 def test_measurements_that_go_on_without_joint_states_are_told(seconds):
     made = heard(tour(15), 29.5, late=lambda times: seconds)
     found = re.match(
-        r"measurements go on for (\d+) s without joint states: does the robot's", *told(made)
+        r'measurements go on for (\d+) s without joint states: does the driver', *told(made)
     )
     assert int(found[1]) == pytest.approx(seconds, abs=0.5)
     assert f'{found[1]} s without joint states: does the driver run?' in made.status()
