@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.hints import Hint, apart, restless, sparse
+from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Found, Maker, Numbered
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import (
@@ -175,14 +175,17 @@ class Collector:
         needed = self.rests.needed(self.settings.still)
         between = self.dropped[f'measurements: {APART}']
         found = [] if needed is None else [restless(needed, self.settings.still)]
-        return found + sparse(between, measurements, self.settings.max_gap)
+        shared = self.dropped[f'{JOINTS}: {CONTRARY}']
+        return found + sparse(between, measurements, self.settings.max_gap, shared)
 
     def astray(self) -> list[Hint]:
-        """Report that the clock of a stream differs or differed from the joints' by too much."""
+        """Report clocks that differ or differed by too much, or joint states that have ended."""
+        found = self.waiting.apart.values()
+        if seconds := max((each.seconds for each in found), key=abs, default=0.0):
+            return [apart(seconds)]
         now = self._newest_ns, self._lateness_ns
-        found = [each.seconds(*now) for each in self.waiting.apart.values()]
-        seconds = max(found, key=abs, default=0.0)
-        return [apart(seconds)] if seconds else []
+        seconds = max((each.alone(*now) for each in found), default=0.0)
+        return [ended(seconds)] if seconds else []
 
     def flush(self) -> None:
         """Make samples of everything that has arrived, as if nothing were late."""

@@ -110,8 +110,8 @@ def restless(needed: float, still: float) -> Hint:
     )
 
 
-def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
-    """Report measurements `between` joint states too far apart, if many."""
+def sparse(between: int, measurements: int, max_gap: float, shared: int) -> list[Hint]:
+    """Report measurements `between` joint states too far apart, if many; some `shared` stamps."""
     if between < NO_ACCIDENT or between <= EXCEPTION * measurements:
         return []
     rate = f'{2.0 / max_gap:g} Hz or more of every joint'
@@ -119,19 +119,31 @@ def sparse(between: int, measurements: int, max_gap: float) -> list[Hint]:
         f'{between} of {measurements} measurements lie between joint states further apart than '
         f'max_gap ({max_gap:g} s): {rate} are needed'
     )
+    if shared > EXCEPTION * between:
+        why = 'joint states share stamps: two publishers, or stamps too coarse?'
+        return [Hint(why, f'{words}. {shared} {why}')]
     return [Hint(f'joint states were missing or too rare: {rate} are needed', words)]
 
 
 def apart(ahead: float) -> Hint:
     """Report clocks too far apart: measurements are `ahead` of the joint states [s]."""
-    when, other = ('after', 'do joint states still arrive?')
+    when, late = 'after', ''
     if ahead < 0.0:
-        when, other = ('before', 'if the device sends late, raise lateness')
+        when, late = 'before', ' (if the device sends late, raise lateness)'
     words = (
-        f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state ({other}): '
+        f'measurements were stamped {abs(ahead):.1f} s {when} the newest joint state{late}: '
         'synchronise the clocks (NTP, PTP) and repeat the poses of that time'
     )
     return Hint(f'stamps disagree by {abs(ahead):.1f} s: synchronise the clocks', words)
+
+
+def ended(seconds: float) -> Hint:
+    """Report measurements without joint states for some time [s]."""
+    words = f'measurements go on for {seconds:.0f} s without joint states'
+    return Hint(
+        f'{words}: does the driver run?',
+        f'{words}: does the driver run, and name the joints as before? Repeat these poses',
+    )
 
 
 def unsettled(refused: int, stops: int) -> list[Hint]:

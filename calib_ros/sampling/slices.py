@@ -203,11 +203,15 @@ class Apart:
             self._row = self._live = 0
         self._newest_ns, self._last_ns = int(newest[-1]), int(stamps[-1])
 
-    def seconds(self, newest_ns: int, far_ns: int) -> float:
-        """Return by how much the clocks differed, or how long ago joint states ended [s]."""
+    @property
+    def seconds(self) -> float:
+        """Return by how much the clocks differed while joint states came [s]."""
+        return 1e-9 * self._moved_ns
+
+    def alone(self, newest_ns: int, far_ns: int) -> float:
+        """Return for how long measurements have come without joint states [s]."""
         ahead = self._last_ns - newest_ns
-        ended = self._row >= NO_ACCIDENT and abs(ahead) > far_ns
-        return 1e-9 * (self._moved_ns or (ahead if ended else 0))
+        return 1e-9 * ahead if self._row >= NO_ACCIDENT and ahead > far_ns else 0.0
 
 
 class Waiting(dict[StreamKey, Rows]):
