@@ -105,6 +105,7 @@ class LinearModel:
         every = list(dict.fromkeys(name for names in groups.values() for name in names))
         which = self._columns_of([*known, *every])
         factor = np.asarray(np.linalg.qr(self._columns[which].T, mode='r'))
+        factor = factor / np.maximum(np.linalg.norm(factor, axis=0), 1e-300)  # in any unit
         number = {name: k for k, name in enumerate([*known, *every])}
         found: dict[str, list[str]] = {}
         for group, names in groups.items():
