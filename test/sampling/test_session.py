@@ -218,7 +218,7 @@ def test_samples_that_were_fitted_are_known_again():
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
     assert made.reused() == 1.0
     words = verdict(made.calibration, made.validate(), made.reused())[1]
-    assert 'these are measurements to which the calibration was fitted' in words
+    assert 'the calibration was fitted to these measurements' in words
 
 
 def test_what_was_there_before_does_not_judge():
