@@ -152,8 +152,8 @@ def in_words(compensator: Compensator, result: Compensation) -> str:
     if not compensator.follower.complete and turn > turned:
         x, y, z = compensator.tool
         text += (
-            '; this arm cannot keep every orientation: the corrected position is that of the '
-            f'point {x:g} {y:g} {z:g} m in the flange (--tool), a point {BESIDE:g} m away may be '
+            '; this arm cannot keep every orientation: the position is corrected at the '
+            f'point {x:g} {y:g} {z:g} m in the flange (--tool); {BESIDE:g} m away it may be '
             f'{1e3 * BESIDE * turn:.3f} mm off, {1e3 * BESIDE * turned:.3f} mm before'
         )
     if not compensator.follower.anywhere:

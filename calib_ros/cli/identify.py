@@ -233,7 +233,7 @@ def _detected(
     if posed:
         chosen['fixed'] = (*chosen['fixed'], *(f'{name}.*' for name in chain.joint_names))
     problem = Problem(chain, seen, held_out, more=more, **chosen)
-    reason = 'joint values are not known, so nothing of the arm was fitted: only what follows'
+    reason = 'joint values are not known, so the arm was not fitted: only what follows'
     refusals = (Reason(Rule.POSED, reason),) if posed else ()
     count = sum(map(len, problem.sets))
     samples = {'samples': count, 'images': len(found.names), 'sets': len(problem.sets)}
@@ -297,7 +297,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
 def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
     judged = result.validation or result.fitted
     before, after = judged.figures
-    proof = '' if result.validation else '; on the poses fitted, which proves nothing'
+    proof = '' if result.validation else '; on the poses fitted: no proof'
     measured = words.measured(result)
     if result.outliers:
         measured += f', {of_them(len(result.outliers), "outlier")} with little or no weight'

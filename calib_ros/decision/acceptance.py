@@ -142,10 +142,7 @@ def _of_the_gain(
     elif scaled:
         yield Reason(Rule.SCALE, out_of_scale(scaled))
     elif result.region is None:
-        text = (
-            'what the correction removes is not larger than its own uncertainty, even at the '
-            'poses measured'
-        )
+        text = 'the correction is not larger than its own uncertainty, even at the poses measured'
         if not sized:
             text += (
                 '; measure something that fixes the size and shape of the arm: positions, or two '

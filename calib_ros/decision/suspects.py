@@ -173,7 +173,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             '',
         ),
         (
-            'the rotations are transposed, those of the device in the target',
+            'the rotations are transposed (of the device in the target)',
             '--columns qx=-qx,qy=-qy,qz=-qz',
             (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
             '',
@@ -182,7 +182,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     if seen.inverse:
         ways.append((*NOT_ON_FLANGE, (), _in_sources(False)))
     elif seen.oriented.all():
-        what = 'the poses are those of the world in the target, as by a camera on the flange'
+        what = 'the poses are of the world in the target, as by a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
         ways.append((what, remedy, (Observations.inverted,), _in_sources(True)))
     in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))
@@ -354,7 +354,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
         if ours.columns != chain.columns or not np.allclose(ours.table, chain.table, atol=1e-6):
             what, remedy = f'the arm is a {ours.name}, not a {chain.name}', f'--chain {ours.name}'
             if ours.name == chain.name:
-                what = f'the DH table is not that of a {ours.name}'
+                what = f'this is not the DH table of a {ours.name}'
             published = f'set chain (--chain) to {ours.name}'
             arm = replace(ours, base=chain.base, tool=chain.tool)
             yield Suspect(what, remedy, rank=2, chain=arm, published=published)

@@ -248,7 +248,7 @@ def _size_of(found: Columns) -> tuple[int, int] | None:
     if others:
         sizes = ' and '.join(f'{w} x {h}' for w, h in (first, others[0]))
         raise InputError(
-            f'{found.path} has corners of images of {sizes} px: give those of one size, as each '
+            f'{found.path} has corners of images of {sizes} px: give one size only, as each '
             'has its own intrinsics'
         )
     return first

@@ -45,7 +45,7 @@ class History:
             raise ConfigError(f'a history cannot be at {place}: {err}') from err
         self._local = is_local(self._files)
         if self._local and Path(self._root).exists() and not Path(self._root).is_dir():
-            raise ConfigError(f'a history cannot be at {place}: that is no folder')
+            raise ConfigError(f'a history must be a folder: {place} is none')
 
     def file(self, row: Row) -> bool:
         """Add a row; return False if it exists."""
@@ -187,7 +187,7 @@ def _rows_of(table: Any) -> list[Row]:
         fits = (square.size, offsets.size, tilts.size % max(size, 1)) == (size**2, size, 0)
         if not (fits and np.isfinite(numbers).all()):
             raise InputError(
-                f'the offsets or covariance of {key}{ENDING} in the history are not those of '
+                f'the offsets or covariance of {key}{ENDING} in the history do not match its '
                 f'{size} names: {AWAY}'
             )
         record['covariance'] = square.reshape(size, size)

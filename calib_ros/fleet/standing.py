@@ -140,7 +140,7 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
         yield (
             f'{len(ahead)} result{"s" * (len(ahead) > 1)} with stamps later than the filing, on '
             f'{row.filed:%Y-%m-%d} of {row.time:%Y-%m-%d} ({row.source or row.kind}): set the '
-            'clock of what records them'
+            'clock of the recorder'
         )
     if not own:
         return
@@ -148,7 +148,7 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
     if newest.time < own[-1].time and newest.filed.date() > own[-1].filed.date():
         yield (
             f'{newest.source} was filed last, and its stamps are of {newest.time:%Y-%m-%d}, '
-            'before those of other nights: unless it is an old one, a clock was set back'
+            'before other nights: unless it is an old one, a clock was set back'
         )
 
 

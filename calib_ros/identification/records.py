@@ -339,6 +339,6 @@ def reused_in_words(share: float) -> str:
         return ''
     which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'
     return (
-        f'{which} are measurements to which the calibration was fitted, so they prove nothing '
-        'about other poses: measure new ones'
+        f'the calibration was fitted to {which} measurements, so they prove nothing about other '
+        'poses: measure new ones'
     )

@@ -34,8 +34,8 @@ def workspace_report(
     rest = 'The remaining error is unknown: the file has no uncertainties.'
     if len(spreads) > 1:
         text.append(f'Expected to remain: {_sizes(last)}.')
-        rest = 'Expected to remain: its uncertainty and the RMS error on poses not fitted, which '
-        rest += 'includes the noise of the measuring device.'
+        rest = 'Expected to remain: its uncertainty and the RMS error on poses not fitted, '
+        rest += 'noise of the measuring device included.'
     if arm.region is not None:
         text.append(f'The calibration is {arm.region.in_words()}.')
     about = 'Radius: distance from the axis of the base. Height: above its origin.'

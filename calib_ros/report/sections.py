@@ -26,12 +26,10 @@ BOTH = (
     'measurement counts by itself. Sigma: standard deviation of the errors.'
 )
 ERROR = (
-    'Error: distance between the target measured and where the model puts it. With this model in '
-    f'the controller {BOTH}'
+    'Error: distance from the measured target to its place in the model. With this model in the '
+    f'controller {BOTH}'
 )
-OF_THE_PROGRAM = (
-    f'Error: distance between the target measured and where the program intends it; {BOTH}'
-)
+OF_THE_PROGRAM = f'Error: distance from the measured target to its place in the program; {BOTH}'
 LABELS = (
     *('RMS [mm]', '95 % interval [mm]', 'mean [mm]', 'largest [mm]', 'mean + 3 sigma [mm]'),
     *('RMS orientation [mrad]', 'RMS [px]'),

@@ -147,9 +147,9 @@ def hints(found: Verification) -> list[str]:
         )
     elif found.common < NEARER:
         lines.append(
-            'without one common shift and turn of all positions, only '
-            f'{100.0 * found.common:.2g} % of the error would remain: was the measuring device '
-            'moved? If on purpose, --new-base fits its frame, and --new-tool that of a new target'
+            'one common shift and turn of all positions explains the error, except '
+            f'{100.0 * found.common:.2g} % of it: was the measuring device moved? If on purpose, '
+            'give --new-base, and --new-tool for a new target'
         )
     return lines
 

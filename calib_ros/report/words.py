@@ -245,7 +245,7 @@ def neighbours_in_words(noise: Noise) -> str:
         'the device drifts, or the arm has errors that this model lacks.'
     )
     if (times := f'{noise.widened:.2f}') != '1.00':
-        text += f' So standard deviations are {times} times those of independent errors.'
+        text += f' This makes the standard deviations {times} times as large.'
     return text
 
 

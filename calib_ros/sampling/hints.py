@@ -100,8 +100,8 @@ def restless(needed: float, still: float) -> Hint:
         return Hint(
             'joint values jump back and forth: do two robots publish them?',
             f'the joint values jump back and forth by {needed:.2g}: do two robots publish the '
-            'same joint names? Give each its own topic, and set joint_topics to that of this '
-            'robot',
+            'same joint names? Give each its own topic, and set joint_topics to the '
+            'one of this robot',
         )
     return Hint(
         f'joints hardly ever rest within still: set still to {needed:.2g}',

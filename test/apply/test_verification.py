@@ -210,7 +210,7 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
         assert ('AP after [mm]' in str(_by_configuration(each))) is each.by_program
         poses = poses_to_verify(arm.chain, [seen], each.comparison)
         page = verification_report(UR, each, poses, Origin())
-        assert ('where the program intends it' in str(page.accuracy)) is each.by_program
+        assert ('its place in the program' in str(page.accuracy)) is each.by_program
 
 
 @pytest.mark.parametrize(('scale', 'told'), [(1.0, False), (1e3, True)])

@@ -213,7 +213,7 @@ def test_what_cannot_be_asked_for(folder, capsys):
         (['--years', '0'], '--years must be positive'),
         (['--workers', '-1'], '--workers must be'),
         (['--history', 'nowhere://x'], 'a history cannot be at nowhere'),
-        (['--history', 'plant.yaml'], 'a history cannot be at plant.yaml: that is no folder'),
+        (['--history', 'plant.yaml'], 'a history must be a folder: plant.yaml is none'),
     ):
         assert main(['fleet', 'plant.yaml', '--history', 'history', *more]) == 1
         assert words in capsys.readouterr().err

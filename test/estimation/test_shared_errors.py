@@ -103,7 +103,7 @@ def test_the_report_says_what_is_shared_and_what_follows():
     _, drifting = run(9, drift=10.0, amplitude=3e-4, identified=identify)
     text = neighbours_in_words(drifting.noise)
     assert 'measured in succession (0.' in text
-    assert f'{drifting.noise.widened:.2f} times those of independent errors' in text
+    assert f'{drifting.noise.widened:.2f} times as large' in text
     document = as_document(drifting, {})
     assert document['noise_in_sigma']['shared'][0] == 'successive'
     for parameter in document['parameters'].values():

@@ -159,13 +159,13 @@ def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
     assert standing.state == 'refused'
     assert standing.remarks == (
         '1 result with stamps later than the filing, on 2025-10-11 of 2031-04-01 (b.csv): set the '
-        'clock of what records them',
+        'clock of the recorder',
     )
     back = {'time': plants.when(-900), 'filed': plants.when(4), 'source': 'c.csv'}
     history.file(replace(row, verdict='refused', inputs='4', **back))
     (standing,) = standings(plant[:1], history, Run(), 100.0)
     assert standing.remarks[1] == (
-        'c.csv was filed last, and its stamps are of 2023-04-23, before those of other nights: '
+        'c.csv was filed last, and its stamps are of 2023-04-23, before other nights: '
         'unless it is an old one, a clock was set back'
     )
 

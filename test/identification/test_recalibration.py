@@ -275,7 +275,7 @@ def test_the_command_writes_the_calibration_brought_up_to_date(earlier, run, tmp
     )
     status, said, _ = run(*given, 'out', '--out', 'again')
     assert status == 3
-    assert 'these are measurements to which the calibration was fitted' in ' '.join(said.split())
+    assert 'the calibration was fitted to these measurements' in ' '.join(said.split())
     assert not (tmp_path / 'again' / 'calibration.yaml').exists()
     # over what it brings up to date
     assert run(*given, 'out', '--out', 'out', '--force')[0] == 3

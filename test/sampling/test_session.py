@@ -265,7 +265,7 @@ def test_samples_that_were_fitted_are_known_again():
     assert made.reused() == 1.0
     found, words = verdict(made.calibration, made.validate(), made.reused())
     assert found == 'no verdict'
-    assert 'these are measurements to which the calibration was fitted' in words
+    assert 'the calibration was fitted to these measurements' in words
 
 
 def test_what_was_there_before_does_not_judge():
