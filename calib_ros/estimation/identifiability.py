@@ -21,6 +21,7 @@ from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.settings import EXCEPTION
 from calib_ros.shown import Shown
 
 DEGENERATE = TYPICAL['angle']
@@ -30,18 +31,21 @@ errors would put a tool anywhere, even kilometres away."""
 
 
 def independent(
-    factor: FloatArray, names: Sequence[str], frame_tolerance: float = HALF_THE_DIGITS
+    factor: FloatArray,
+    names: Sequence[str],
+    frame_tolerance: float = HALF_THE_DIGITS,
+    tolerance: float = HALF_THE_DIGITS,
 ) -> tuple[str, ...]:
     """Return the parameters whose columns are independent of those before them.
 
     `factor` (P, P) is the upper triangular factor of the weighted Jacobian, columns in the order
     of the names: of parameters that trade against each other, the last are left out and stay
     nominal. At least this share of a column must be left by those before it: `frame_tolerance` for
-    frames, HALF_THE_DIGITS for others; and of the largest column more than rounding.
+    frames, `tolerance` for others; and of the largest column more than rounding.
     """
     frames = [Parameter(name).kind in FRAME_KINDS for name in names]
     sizes = np.linalg.norm(factor, axis=0)
-    least = np.where(frames, frame_tolerance, HALF_THE_DIGITS) * sizes
+    least = np.where(frames, frame_tolerance, tolerance) * sizes
     least = np.maximum(least, ROUNDING * sizes.max(initial=0.0))  # less shows nowhere
     if len(factor) == len(names) and (np.abs(np.diag(factor)) > least).all():
         return tuple(names)  # the diagonal holds the rest of each column
@@ -96,6 +100,9 @@ def structurally_independent(
     poses: turning the whole cell about it only shows in residuals. So does the size of a cell that
     touches only planes. A board gives its pose in a camera, and images from anywhere give the
     camera's lens (Zhang 2000). `extra` returns further equations at a chain.
+
+    Parameters of which those before them leave little come last: with a known tool near the last
+    axis a turn would else imitate a length, and end far away.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -126,7 +133,13 @@ def structurally_independent(
         rows.append(extra(anywhere, names)[0])
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     rows.append(np.eye(len(names))[lens])
-    return independent(np.asarray(np.linalg.qr(np.concatenate(rows), mode='r')), names)
+    every = np.concatenate(rows)
+    first = np.asarray(np.linalg.qr(every, mode='r'))
+    strong = independent(first, names, tolerance=EXCEPTION)
+    order = sorted(range(len(names)), key=lambda k: names[k] not in strong)
+    factor = np.asarray(np.linalg.qr(every[:, order], mode='r'))
+    found = independent(factor, [names[k] for k in order])
+    return tuple(name for name in names if name in found)
 
 
 def identifiable_and_held(
