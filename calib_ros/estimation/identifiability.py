@@ -21,6 +21,7 @@ from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.settings import EXCEPTION
 from calib_ros.shown import Shown
 
 DEGENERATE = TYPICAL['angle']
@@ -95,6 +96,9 @@ def structurally_independent(
     poses: turning the whole cell about it only shows in residuals. So does the size of a cell that
     touches only planes. A board gives its pose in a camera, and images from anywhere give the
     camera's lens (Zhang 2000). `extra` returns further equations at a chain.
+
+    Parameters of which those before them leave little come last: with a known tool near the last
+    axis a turn would else imitate a length, and end far away.
     """
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
@@ -125,7 +129,14 @@ def structurally_independent(
         rows.append(extra(anywhere, names)[0])
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     rows.append(np.eye(len(names))[lens])
-    return independent(np.asarray(np.linalg.qr(np.concatenate(rows), mode='r')), names)
+    every = np.concatenate(rows)
+    first = np.asarray(np.linalg.qr(every, mode='r'))
+    least = [HALF_THE_DIGITS if Parameter(n).kind in FRAME_KINDS else EXCEPTION for n in names]
+    strong = independent(first, names, np.array(least))
+    order = sorted(range(len(names)), key=lambda k: names[k] not in strong)
+    factor = np.asarray(np.linalg.qr(every[:, order], mode='r'))
+    found = independent(factor, [names[k] for k in order])
+    return tuple(name for name in names if name in found)
 
 
 def identifiable_and_held(

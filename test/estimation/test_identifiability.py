@@ -19,6 +19,8 @@ from calib_ros.estimation.identifiability import (
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.inverse import solve
 from calib_ros.kinematics.jacobian import ErrorModel
 
@@ -119,6 +121,19 @@ def test_a_fixed_partner_makes_its_trade_identifiable(rng):
     result = identify(Problem(nominal, measure(true, UR10E.random_joints(60, rng), rng)))
     assert 'wrist_3_joint.d' in result.names
     assert not {name for name in result.gauges if name.startswith('wrist_3')}
+
+
+def test_a_known_target_near_the_last_axis_leaves_its_length_free(rng):
+    """Else a turn and a tilt imitate it by a lever of 2 mm."""
+    tool = Frame(se3.transform(np.eye(3), np.array([0.08, 0.002, 0.165])), fixed=True)
+    nominal = replace(UR10E, tool=tool)
+    true = replace(faulty(UR10E, Cell(), rng), tool=tool).with_offsets({'wrist_3_joint.d': 2e-3})
+    q = nominal.random_joints(60, rng)
+    result = identify(Problem(nominal, measure(true, q, rng, *NOISE, False), **SIGMAS))
+    assert result.accepted
+    offset = result.chain.offset('wrist_3_joint.d', nominal)
+    assert abs(offset - 2e-3) < 2e-4
+    assert 'wrist_3_joint.theta' in result.unidentifiable
 
 
 @pytest.mark.parametrize('rounded', [0.0, 1e-16])

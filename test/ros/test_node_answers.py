@@ -220,7 +220,7 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
         np.testing.assert_array_equal(parse_chain(texts[0].data).table, chain.table)
         cell.play(topics(recording))
         again = cell.refused('validate')
-        assert again.message.startswith('no verdict: these are measurements to which')
+        assert again.message.startswith('no verdict: the calibration was fitted to')
         cell.call('clear')
         fresh = pose_messages(recording.poses)
         for message in fresh:
