@@ -184,7 +184,8 @@ def verdict(
         return 'does not hold', _lost(calibration, text)
     text += f'; it had {1e3 * calibration.residual:.3f} mm'
     if warning := reused_in_words(reused):
-        return 'no verdict', f'no verdict: {warning}; RMS {now.rms_mm:.3f} mm'
+        text = f'RMS {now.rms_mm:.3f} mm on {now.count} poses measured since'
+        return 'no verdict', f'no verdict: {warning}; {text}'
     if not calibration.holds(most):
         text = f'too few poses to tell whether the calibration holds: {text}; measure more'
         return 'UNDECIDED', text
