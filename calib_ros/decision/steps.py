@@ -63,6 +63,8 @@ class Step:
     unused: str
     image: int | None = None
     apart: bool = False
+    held: bool = False
+    """Whether a frame that the chain file holds is wrong from the first pose on."""
 
     @property
     def harmful(self) -> bool:
@@ -72,7 +74,8 @@ class Step:
     @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
-        return Reason(Rule.ENCODER if self.kind == 'joint' else Rule.MOVED, str(self))
+        rule = Rule.MISTAKE if self.held else Rule.MOVED
+        return Reason(Rule.ENCODER if self.kind == 'joint' else rule, str(self))
 
     def __str__(self) -> str:
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
@@ -83,6 +86,9 @@ class Step:
             where = f'line {line}' if self.image is None else f'{where}, line {line}'
             when = 'if rows are in the order of measurement'
         size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
+        if self.held:
+            off = f'the {self.what} held by the chain file is off {size}'
+            return f'{off}: correct it, or remove fixed: true there'
         thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':
             thing, of = f'the zero of {self.what}', ''
@@ -127,6 +133,7 @@ class _Group:
     kind: str
     names: tuple[str, ...]
     sets: tuple[int, ...]
+    held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +194,11 @@ class _Scan:
     def best(self) -> _Found | None:
         """Return the best step, if it explains most of the squares."""
         some = _some_places(self._stops)
+        if any(group.held for group in self._groups):
+            some = np.concatenate([[0], some])
         near = self._best_of(some, 0.5 * EXPLAINED) if len(some) else None
-        if near is None:
-            return None
+        if near is None or near.stop == 0:
+            return near if near is not None and near.share > EXPLAINED else None
         before, after = some[some < near.stop], some[some > near.stop]
         first = before.max(initial=LEAST_ASIDE)
         last = after.min(initial=self._stops - LEAST_ASIDE)
@@ -217,7 +226,7 @@ class _Scan:
             equations, freedom, left = self._budget(group)
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
-            gain = (along**2 * inverse).sum(axis=1)
+            gain = (along**2 * inverse).sum(axis=1) * ((places > 0) | group.held)
             share = np.minimum(gain / left, 1.0 - 1e-12)
             k = int(np.argmax(share))
             rest = (1.0 - share[k]) / (freedom - rank[k])
@@ -308,13 +317,15 @@ class _Scan:
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'
         sides = zip(('before that', 'from there on'), weights, strict=True)
-        unused = [where for where, side in sides if not np.concatenate(side).any()]
+        unused = [where for where, side in sides if found.stop and not np.concatenate(side).any()]
         seen = problem.sets[of_set]
         image = None if seen.pixels is None else int(seen.images[sample])
         where = (of_set, sample, stamp)
         named = group.what, group.kind, _thing(group.kind, seen)
         apart = _apart(*map(np.concatenate, zip(*places, strict=True)))
-        return Step(*named, *where, size, unit, found.share, ''.join(unused), image, apart)
+        return Step(
+            *named, *where, size, unit, found.share, ''.join(unused), image, apart, not found.stop
+        )
 
 
 def _apart(joints: FloatArray, after: Flags) -> bool:
@@ -343,7 +354,8 @@ def _groups(problem: Problem) -> list[_Group]:
             sets = [k for k, each in enumerate(problem.sets) if getattr(each, kind) == frame]
             socket = kind == 'base' and problem.sets[sets[0]].socket  # the ball turns in it
             names = parameters_of(frame)[: 3 if socket else 6]
-            found.append(_Group(frame, kind, names, tuple(sets)))
+            fixed = problem.model.frame(frame).fixed
+            found.append(_Group(frame, kind, names, tuple(sets), fixed))
     everywhere = tuple(range(len(problem.sets)))
     for joint in problem.chain.joints:
         found.append(_Group(joint.name, 'joint', (joint.driven,), everywhere))

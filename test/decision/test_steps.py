@@ -272,3 +272,14 @@ def test_a_gross_error_at_the_begin_or_end_is_no_step(seed, row):
     assert result.step is None
     assert [outlier.sample for outlier in result.outliers] == [row % 40]
     assert result.accepted
+
+
+def test_a_base_held_in_a_wrong_place_is_no_step(rng):
+    true = arm(rng)
+    seen = measure(true, poses('random', rng), rng, *NOISE)
+    held = true.base.matrix.copy()
+    held[:3, 3] += [0.003, 0.0, 0.004]
+    chain = replace(UR10E, base=replace(true.base, matrix=held, fixed=True))
+    result = identify(Problem(chain, seen, **SIGMAS))
+    assert result.refusals[0].rule is Rule.MISTAKE
+    assert 'the base held by the chain file is off by' in result.refusals[0]
