@@ -31,7 +31,7 @@ from calib_ros.estimation.noise import Noise, noise_of, squares_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.robust import SUSPICIOUS, reweighted, thorough_fit
-from calib_ros.estimation.sizes import SETTLED, SPREAD
+from calib_ros.estimation.sizes import LEAST_SIZE, SETTLED, SPREAD
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray
@@ -191,8 +191,8 @@ def _likely_noise(fitted: Fitted) -> float:
         squares = float(along @ products @ along) / size**2
         free = rows - float(np.sum(products[:-1, :-1] * found.covariance)) / size**2
         step = (squares - free - width * np.log(size)) / (2.0 * max(free, 0.0) + width)
-        size *= float(np.exp(np.clip(step, -1.0, 1.0)))
-        if abs(step) < SETTLED:
+        last, size = size, max(size * float(np.exp(np.clip(step, -1.0, 1.0))), LEAST_SIZE)
+        if abs(np.log(size / last)) < SETTLED:
             break
     together = shared / max(sums, ROUNDING)  # of the rows of one configuration
     size *= fitted.noise.widened

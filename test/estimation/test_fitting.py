@@ -17,6 +17,7 @@ from calib_ros.estimation.fitting import SOME
 from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.sizes import LEAST_SIZE
 from calib_ros.kinematics import se3
 
 
@@ -213,3 +214,10 @@ def test_what_other_kinds_of_measurement_would_tell_is_held(held, monkeypatch):
     monkeypatch.setattr(fitting, '_widened', lambda fitted, names: (fitted, names))
     found = ('fitted', held[:1]) if len(held) == 2 else 'fitted'
     assert fitting.fit(Problem(UR10E, seen())) == (told, 'start', found)
+
+
+def test_noise_is_searched_as_far_as_the_sizes_of_errors():
+    """Measurements without noise, at rounding, leave nothing to find."""
+    _, _, exact = measured_arm(0, 8, noise=(0.0, 0.0))
+    _, _, found = fitting.fit(Problem(UR10E, exact, priors={'*_joint.*': 1e-2}))
+    assert fitting._likely_noise(found) == LEAST_SIZE
