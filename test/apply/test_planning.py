@@ -47,6 +47,11 @@ def test_the_choice_is_close_to_the_best_of_all_choices(seed):
     share = best / predicted_square(design, q[chosen], task)
     assert 0.8 < share < 1.0 + 1e-6
     assert planning.efficiency(design, q, chosen, task) <= share + 1e-6
+
+
+def test_no_choice_is_better_than_all():
+    design = design_of(POSITIONER)
+    q, task = some(POSITIONER, 9), some(POSITIONER, 30, 7)
     assert planning.efficiency(design, q, np.arange(9), task) == pytest.approx(1.0)
 
 
