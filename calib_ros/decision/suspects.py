@@ -173,7 +173,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             '',
         ),
         (
-            'the rotations are transposed (of the device in the target)',
+            'the rotations are transposed: they are of the device in the target',
             '--columns qx=-qx,qy=-qy,qz=-qz',
             (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
             '',
@@ -182,7 +182,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     if seen.inverse:
         ways.append((*NOT_ON_FLANGE, (), _in_sources(False)))
     elif seen.oriented.all():
-        what = 'the poses are of the world in the target, as by a camera on the flange'
+        what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
         ways.append((what, remedy, (Observations.inverted,), _in_sources(True)))
     in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))

@@ -118,18 +118,15 @@ class Evidence:
         return size, 2.0 * np.maximum(gamma, 0.0) + width
 
     def rival(
-        self, group: str, std: float, size: FloatArray, considered: set[str | None]
+        self, group: str, typical: float, size: FloatArray, considered: set[str | None]
     ) -> tuple[float, FloatArray]:
-        """Return the log odds of a group having size `std`, and the precision (P,) then.
+        """Return the log odds of a group being of another `typical` size, and the precision (P,).
 
-        Against the most probable log sizes (G,); the other groups are searched again.
+        Against the most probable log sizes (G,); all are searched again.
         """
-        own = self._names.index(group)
-        rest = [k for k in range(len(self._names)) if k != own]
         other = copy.copy(self)
-        other._given = np.where(self._member[own] > 0.0, std**-2, self._given)
-        other._names = [self._names[k] for k in rest]
-        other._member, other._typical = self._member[rest], self._typical[rest]
+        other._typical = self._typical.copy()
+        other._typical[self._names.index(group)] = np.log(typical)
         found, _ = other.most_probable(considered - {group})
         more = other._probable(found) - self._probable(size)
         other.widen(found)

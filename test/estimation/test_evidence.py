@@ -125,16 +125,19 @@ def test_sizes_beside_the_likely_ones_are_weighed_by_evidence_and_by_how_unusual
         assert more + less == pytest.approx(0.5)
 
 
-def test_a_rival_has_the_size_that_is_asked_for(rng):
-    root, vector = rng.normal(size=(9, 5)), rng.normal(size=5)
-    groups, typical = [None, 'length', 'length', 'angle', 'scale'], [1.0, 2.0, 0.5]
-    names = ('length', 'angle', 'scale')
-    found = Evidence(
-        root.T @ root, vector, np.zeros(5), groups, dict(zip(names, typical, strict=True))
-    )
-    _, precision = found.rival('scale', 0.25, np.log(typical), set())
-    assert precision[[0, 4]].tolist() == [0.0, 16.0]
-    assert (precision[1:4] > 0.0).all()
+@pytest.mark.parametrize('scale', [0.0, 0.25, 2.5])
+def test_a_rival_is_of_the_size_that_the_data_tell(scale):
+    matrix = np.diag([1.0, 1e2, 1e2, 1e2, 1e6])
+    mean = np.array([0.3, 1.0, -1.5, 0.4, scale])
+    groups = [None, 'length', 'length', 'angle', 'scale']
+    typical = {'length': 1.0, 'angle': 0.5, 'scale': 1e-2}
+    found = Evidence(matrix, matrix @ mean, np.zeros(5), groups, typical)
+    size, _ = found.most_probable(set())
+    odds, precision = found.rival('scale', 0.25, size, set())
+    assert precision[0] == 0.0
+    assert odds > 1.0 if scale > 1.0 else odds < 1.0
+    size = precision[4] ** -0.5
+    assert (size < 0.1, 0.1 < size < 0.5, size > 0.5) == (scale == 0.0, scale == 0.25, scale > 1.0)
 
 
 def told(rng, size=3):
