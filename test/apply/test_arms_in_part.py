@@ -163,7 +163,7 @@ def test_an_arm_of_five_joints_says_what_its_tool_loses():
     turn, turned = result.orientation[kept].max(), result.orientation_before[kept].max()
     assert turn > turned
     words = in_words(compensator, result)
-    assert 'that of the point 0 0 0 m in the flange (--tool)' in words
+    assert 'at the point 0 0 0 m in the flange (--tool)' in words
     assert f'{100.0 * turn:.3f} mm off, {100.0 * turned:.3f} mm before' in words
     compensator = Compensator(UR, UR_TRUE)
     assert '--tool' not in in_words(compensator, compensate(compensator, regular(UR, 10)))

@@ -49,7 +49,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
         assert ('no longer holds: RMS 0.300 mm' in text) == (says == 'does not hold')
     for of, share, why in (
         (replace(previous, residual=None), 0.0, 'no former error'),
-        (previous, 0.3, '30 % of these are measurements'),
+        (previous, 0.3, 'fitted to 30 % of these measurements'),
     ):  # as in `verify`
         proves_nothing = 'does not hold' if says == 'does not hold' and share else 'no verdict'
         found, text = verdict(of, both, share)
@@ -121,7 +121,7 @@ def test_drift_is_errors_shared_in_succession_only():
         assert bool(words.drift_in_words(noise)) == (shared == ('successive',))
     said = words.neighbours_in_words(noise)
     assert 'measured in succession (0.30) and near each other in joint space (0.20)' in said
-    assert 'standard deviations are 1.50 times' in said
+    assert 'standard deviations 1.50 times as large' in said
     for chance, share in ((0.053, '5.3 %'), (1e-4, 'less than 0.1 %')):
         assert f'well in {share} of cases: above 5 %' in words.chance_in_words(chance)
 
