@@ -203,8 +203,8 @@ def place(
     by a `model`, reaches. The grid has `cells` along each axis and `turns` about the vertical, and
     is halved `refinements` times about the best placement. The first pose is solved from the
     nearest `starts` of `drawn` random joint values, since an arm reaches it in several postures
-    with other errors. An arm with fewer than six freedoms reaches a
-    pose at its position, with the orientation to 0.02 rad.
+    with other errors. An arm with fewer than six freedoms reaches a pose at its position, with the
+    orientation to 0.02 rad.
     """
     search = _Search(arm, task, aim, model, starts, drawn, progress)
     corners = search.reach if region is None else region

@@ -24,11 +24,12 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import SOME
-from calib_ros.estimation.leastsquares import STEP_TOLERANCE, gram
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import weights_of
+from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray, Index

@@ -22,10 +22,10 @@ from scipy import linalg
 
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
-from calib_ros.estimation.leastsquares import System, gram, normal_equations
+from calib_ros.estimation.leastsquares import System, normal_equations
 from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.samples import Samples, gram
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from calib_ros.estimation.levels import SEVERAL
-from calib_ros.estimation.samples import Samples, gram as gram
+from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, FloatArray, Index

@@ -31,9 +31,10 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from calib_ros.estimation.leastsquares import Fit, System, gram
+from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST

@@ -40,9 +40,10 @@ from scipy import special
 from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.joint_errors import Unmodelled, moved, moving, waved
-from calib_ros.estimation.leastsquares import System, gram
+from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
+from calib_ros.estimation.samples import gram
 from calib_ros.estimation.shared_errors import gathered, nonnegative
 from calib_ros.estimation.sizes import LEAST_SIZE, REFUTED, SHOWN, SPREAD, TYPICAL, solved
 from calib_ros.kinematics.se3 import FloatArray, Index

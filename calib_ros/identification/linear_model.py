@@ -21,10 +21,11 @@ from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import group_of
 from calib_ros.estimation.identifiability import independent
-from calib_ros.estimation.leastsquares import Folds, System, gram, owners, products_of, stacked
+from calib_ros.estimation.leastsquares import Folds, System, owners, products_of, stacked
 from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
+from calib_ros.estimation.samples import gram
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
