@@ -335,7 +335,6 @@ def test_work_tells_the_time_left(monkeypatch):
     [
         (('identify', 'measured.csv', '--model', 'auto'), 7),
         (('csv2bag', 'measured.csv', 'NEW/bag'), 100),
-        (('identify', 'measured.csv'), 3),
     ],
 )
 @pytest.mark.usefixtures('new')
