@@ -335,11 +335,13 @@ def _successive(
                 if part >= len(sums):
                     continue
                 rows = sums[part][:-1]
+                together = np.zeros_like(rows)
                 for length, weight in own:
                     faded = _faded_sums(rows, length, before.get((part, length), 0.0))
                     before[part, length] = faded[..., -1]
-                    cross = rows.reshape(size, -1) @ faded.reshape(size, -1).T
-                    found[part] += weight * (cross + cross.T - gram(rows))
+                    together += weight * (faded - 0.5 * rows)
+                cross = rows.reshape(size, -1) @ together.reshape(size, -1).T
+                found[part] += cross + cross.T
     return found
 
 
