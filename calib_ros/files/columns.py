@@ -143,6 +143,8 @@ def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] =
         cells = zip_longest(*(cells for _, cells in block), fillvalue='')
         columns.append([BETWEEN.join(column) for column in cells])
         blank.append(BETWEEN * (len(block) - 1))
+        if any(column.count(BETWEEN) != len(block) - 1 for column in columns[-1]):
+            raise _with_zeros(path, next(n for n, row in block if BETWEEN in ''.join(row)))
     width = max([len(header), *map(len, columns)])
     names = [*header, *(f'#{k + 1}' for k in range(len(header), width))]
     words = {}
@@ -150,6 +152,13 @@ def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] =
         parts = zip(columns, blank, strict=True)
         words[name] = BETWEEN.join(part[k] if k < len(part) else no for part, no in parts)
     return Columns(path, np.array(lines, dtype=np.intp), words)
+
+
+def _with_zeros(path: Path, line: int) -> ColumnsError:
+    return ColumnsError(
+        f'{path} is not UTF-8 text, line {line} has zero bytes: is it a workbook, or damaged? '
+        'Save it as CSV in UTF-8'
+    )
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
@@ -170,11 +179,7 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
     `above` is the number of lines of the file before it.
     """
     if (place := data.find(b'\0')) >= 0:
-        line = above + 1 + data.count(b'\n', 0, place)
-        raise ColumnsError(
-            f'{path} is not UTF-8 text, line {line} has zero bytes: is it a workbook, or damaged? '
-            'Save it as CSV in UTF-8'
-        )
+        raise _with_zeros(path, above + 1 + data.count(b'\n', 0, place))
     text = decoded(data, str(path), ColumnsError)
     blocks = csv_blocks(path, text, strict=True, above=above)
     first: list[Row] = next(blocks, [(above, [])])

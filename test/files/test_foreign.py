@@ -295,6 +295,7 @@ def test_joint_values_that_stand_a_row_below(read):
           ({'euler': 'XYZ'}, {'rotation_vector': True})),
         (b'\xff\xfe\0\xd8', {}, 'cannot read .*: unexpected end of data'),
         (b'PK\xff\0', {}, 'it is not text, and not a workbook by its name'),
+        ('q1,x\n1,2\n1,2\0'.encode('utf-16'), {}, 'line 3 '),  # csv of Python 3.10 says it
     ],
 )  # fmt: skip
 def test_faults_are_named(read, text, layout, said):
