@@ -8,26 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
 
-from calib_ros.decision.drift import chance
 from calib_ros.decision.steps import EXPLAINED
-from calib_ros.estimation.configurations import STILL, stops
+from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import stacked
-from calib_ros.estimation.levels import CERTAIN, FEW, SURE
-from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS, Robust
-from calib_ros.estimation.samples import residual_arrays
+from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
 
-LEAST_STOPS = SOME_POSES // 4
-"""Stops needed to compare outliers with joint values: along a path half as many double the false
-alarms, from 0.7 to 1.5 %."""
 ADVICE = (
     'device errors do not depend on joint values, so the arm has an effect that the model lacks. '
     'Look for effects (model auto), or fit these poses too (loss none)'
@@ -57,75 +48,17 @@ def outliers_of(fitted: Fitted) -> tuple[Outlier, ...]:
 
 
 def arms_own(fitted: Fitted) -> str | None:
-    """Return why outliers look like the arm's own behaviour, or None."""
-    problem, robust = fitted.problem, fitted.robust
-    if not robust.outliers.any() or any(each.socket for each in problem.sets):
+    """Return which joint moves in outliers only, so that these are the arm's own, or None."""
+    problem, kept = fitted.problem, ~fitted.robust.outliers
+    if kept.all() or any(each.socket for each in problem.sets):
         return None
-    joints, kept = np.concatenate([each.joints for each in problem.sets]), ~robust.outliers
+    joints = np.concatenate([each.joints for each in problem.sets])
     whole = np.ptp(joints, axis=0)
     left = np.ptp(joints[kept], axis=0) if kept.any() else 0.0 * whole
     for name, part, all_of_it in zip(problem.chain.joint_names, left, whole, strict=True):
         if all_of_it > 10.0 * STILL and part < EXCEPTION * all_of_it:
             return f'{name} moves only in poses set aside as gross errors: {ADVICE}'
-    shared, by_chance = _shared(problem, robust)
-    if shared > 1 and by_chance < 1.0 - CERTAIN:
-        return f'at {shared} stops all targets were set aside as gross errors: {ADVICE}'
-    order = np.argsort(np.concatenate([each.stamps_ns for each in problem.sets]), kind='stable')
-    joint, by_chance = _with_a_joint(problem, joints[order], robust.outliers[order])
-    if by_chance < 1.0 - SURE:
-        return f'the poses set aside as gross errors depend on {joint}: {ADVICE}'
     return None
-
-
-def _shared(problem: Problem, robust: Robust) -> tuple[int, float]:
-    """Return at how many configurations all of several targets are off, and its probability.
-
-    To one device, an arm's own errors move all targets alike; exchanged ones are off in opposite
-    directions.
-    """
-    count = 1 + max(int(each.max()) for each in problem.configurations)
-    targets = dict.fromkeys(each.tool for each in problem.sets)
-    seen, off = np.zeros((2, len(targets), count))
-    away = np.zeros((len(targets), count, 3))
-    one = len({each.base for each in problem.sets}) == 1
-    sets = zip(problem.sets, problem.configurations, robust.distances, strict=True)
-    for each, numbers, far in sets:
-        row = list(targets).index(each.tool)
-        seen[row] += np.bincount(numbers, minlength=count)
-        off[row] += np.bincount(numbers, far > OUTLIER, count)
-        if one and each.distances is None and each.pixels is None:
-            errors, _ = residual_arrays(robust.fit.chain, each)
-            np.add.at(away[row], numbers[far > OUTLIER], errors[far > OUTLIER])
-    alike = (away.sum(axis=0) ** 2).sum(axis=1) >= (away**2).sum(axis=(0, 2))
-    present, wrong = seen > 0, (off > 0.5 * seen) & alike
-    several = present.sum(axis=0) > 1
-    both = several & (wrong == present).all(axis=0)
-    rates = wrong.sum(axis=1) / np.maximum(present.sum(axis=1), 1)
-    expected = np.prod(np.where(present, rates[:, np.newaxis], 1.0), axis=0)[several].sum()
-    found = int(both.sum())
-    return found, float(special.gammainc(found, expected)) if found else 1.0
-
-
-def _with_a_joint(problem: Problem, joints: FloatArray, outliers: Flags) -> tuple[str, float]:
-    """Return the joint whose values (N, n) best explain outliers (N,), and the chance of that."""
-    number = stops(joints)
-    begins = np.flatnonzero(np.diff(number, prepend=-1))
-    off = np.bincount(number, outliers) > 0.5 * np.bincount(number)
-    names = problem.chain.joint_names
-    if len(begins) < LEAST_STOPS or not FEW <= off.sum() <= len(off) - FEW:
-        return '', 1.0
-    turning = np.array([joint.type == 'revolute' for joint in problem.chain.joints])
-    angle = joints[begins]
-    waves = np.stack([np.where(turning, np.cos(angle), angle), np.sin(angle) * turning])
-    waves -= waves.mean(axis=1, keepdims=True)
-    spread = waves.std(axis=1, keepdims=True)
-    waves = np.where(spread > STILL, waves / np.maximum(spread, STILL), 0.0)
-    spectrum = np.conj(np.fft.rfft(waves, axis=1)) * np.fft.rfft(off)[:, np.newaxis]
-    shifted = (np.fft.irfft(spectrum, len(off), axis=1) ** 2).sum(axis=0).T  # joint, shift
-    most = int(np.argmax(shifted[:, 0]))
-    variance = off.sum() * (1.0 - off.mean())  # of each wave for random outliers
-    anywhere = len(names) * float(np.exp(-0.5 * shifted[most, 0] / variance))
-    return names[most], max(anywhere, chance(shifted.max(axis=0)))
 
 
 def lacking(fitted: Fitted) -> float:

@@ -156,39 +156,3 @@ def test_a_joint_that_moves_in_outliers_only_is_named(rng):
     result = identify(Problem(UR10E, seen, **SIGMAS))
     assert {outlier.sample for outlier in result.outliers} == {17, 41}
     assert result.refusals[0].startswith('shoulder_lift_joint moves only in poses set aside')
-
-
-@pytest.mark.parametrize('count', [3, 30])
-def test_outliers_that_go_with_a_joint_are_the_arms(rng, count):
-    """Unless they are too few to tell."""
-    true = arm(rng)
-    q = UR10E.random_joints(120, rng)
-    q[:, 3] *= 0.1
-    far = np.isin(np.arange(120), rng.permutation(120)[:count])
-    q[far, 3] = 2.0 + q[far, 3]
-    driven = q.copy()
-    driven[far, 4] += 0.01  # something jams there
-    seen = replace(measure(true, driven, rng, *NOISE), joints=q)
-    result = identify(Problem(UR10E, seen, **SIGMAS))
-    assert {outlier.sample for outlier in result.outliers} == set(np.flatnonzero(far))
-    assert ('depend on wrist_1_joint' in ' '.join(result.refusals)) == (count > 3)
-
-
-@pytest.mark.parametrize('exchanged', [0, 6])
-def test_stops_at_which_all_targets_are_off_are_the_arms(rng, exchanged):
-    """Unless the targets were mistaken for each other, as markers are."""
-    true = arm(rng)
-    true = replace(true, frames=(*true.frames, ('tool_B', random_frame(rng, 0.2))))
-    q = UR10E.random_joints(40, rng)
-    driven = q.copy()
-    driven[[5, 11, 30], 2] += 0.01
-    first = replace(measure(true, driven, rng, *NOISE), joints=q)
-    other = replace(true, tool=true.frame('tool_B'))
-    second = replace(measure(other, driven, rng, *NOISE), joints=q, tool='tool_B')
-    mixed = [2, 8, 15, 21, 27, 36][:exchanged]
-    for part in ('positions', 'rotations'):
-        one, other = getattr(first, part), getattr(second, part)
-        one[mixed], other[mixed] = other[mixed], one[mixed]
-    result = identify(Problem(UR10E, first, more=(second,), **SIGMAS))
-    assert len(result.outliers) == 6 + 2 * exchanged
-    assert 'at 3 stops all targets were set aside as gross errors' in result.refusals[0]
