@@ -153,17 +153,12 @@ def _of_the_gain(
 
 def out_of_scale(scale: float) -> str:
     """Return that a scale of the device, given minus one, may make the calibrated arm worse."""
-    return (
-        f'{grown(scale)}, as if the measuring device were out of scale; then the correction '
-        'would make the arm worse. If a known length shows that its scale is right, set '
-        'sigma_scale'
-    )
-
-
-def grown(scale: float) -> str:
-    """Return how the lengths of the arm change with the scale of the device, given minus one."""
     way = 'grow' if scale > 0.0 else 'shrink'
-    return f'all lengths of the arm {way} alike, by {percent(abs(scale))} %'
+    return (
+        f'all lengths of the arm {way} alike, by {percent(abs(scale))} %, as if the measuring '
+        'device were out of scale; then the correction would make the arm worse. If a known '
+        'length shows that its scale is right, set sigma_scale'
+    )
 
 
 def percent(share: float) -> str:

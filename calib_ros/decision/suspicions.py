@@ -2,10 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Suspicious results with good figures: one sentence each, and what to do (docs/model.md).
 
-Scale. With L the derivative of the fitted lengths by the scale s of the device (the frames take
-their share), x their offsets and C their covariance, x = s L + noise of C + tau^2 is solved for s;
-tau is estimated from the scatter about the line (Paule and Mandel 1982).
-
 Lens. If other intrinsics of a camera explain most of the residuals, the given ones belong to
 another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
 the lens it would be another arm, not just a more accurate one.
@@ -35,7 +31,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.acceptance import grown, out_of_scale, percent
+from calib_ros.decision.acceptance import out_of_scale, percent
 from calib_ros.decision.misfits import explained
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
@@ -44,7 +40,6 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.identifiability import followed
 from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
@@ -59,8 +54,6 @@ from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parame
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
 
-LEAST_SCALE = 0.5 * SCALE
-"""Scale of a device that is remarked: half the scatter of good ones."""
 LARGEST_SCALE = 10.0 * SCALE
 """More than any arm grows: by 40 degrees, if all aluminium (23 ppm a degree)."""
 HARMFUL = 0.15
@@ -75,8 +68,6 @@ COUPLED = (
     'couplings of the last joints explain most of the residuals: are the joint values those '
     'of the motors? If so, add the effects "coupling"'
 )
-SCATTERS = np.concatenate([[0.0], np.geomspace(1e-6, 1.0, 241)])
-"""Candidate standard deviations [m] of an arm's own length offsets."""
 
 
 def remarked(problem: Problem, result: Identification, another: bool = True) -> Identification:
@@ -87,16 +78,12 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     if any(each.socket or each.plane for each in problem.sets):
         return result  # one place shows none of these
     sister = _sister(problem, result) if another else ''
-    scale, certain = ('', False) if sister else _scale(problem, result)
+    scale = None if sister else _scale(result)
     lens, imitated = _lens(problem, result) if another else ('', False)
     board = '' if lens else _board(problem, result)
     gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
     refusals = list(result.refusals)
-    if certain:
-        refusals = [each for each in refusals if each.rule is not Rule.SCALE]
-        refusals.append(Reason(Rule.SCALE, scale))
-    if any(each.rule is Rule.SCALE for each in refusals):
-        scale = ''
+    refusals += [] if scale is None else [scale]
     imitated = imitated or bool(lens and refusals)
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))
@@ -106,60 +93,17 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    found = (scale, sister, lens, board, gravity, coupled, motion, _order(problem), sigmas)
+    found = (sister, lens, board, gravity, coupled, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
 
-def scale_of(problem: Problem, result: Identification) -> tuple[float, float, float]:
-    """Return the common scale of all lengths, its standard deviation and degrees of freedom.
-
-    Zero degrees of freedom with fewer than three lengths.
-    """
-    chain, first = result.chain, problem.sets[0]
-    arm = [n for n in chain.parameter_names if n.is_length and n.of_dh]
-    lengths: dict[str, float] = {n: problem.model.value(n) for n in arm if chain.value(n) != 0.0}
-    fitted = [i for i, n in enumerate(result.names) if n in arm]
-    if len(fitted) < 3 or not lengths:
-        return 0.0, np.inf, 0.0
-    ends, joints = (first.base, first.tool), first.spread().joints
-    lever = float(first.oriented.any())  # rotations count if they were measured
-    changes, _, _ = followed(chain, result.names, [*lengths], joints, lever, ends)
-    growth = changes @ [*lengths.values()]
-    offsets = np.array([chain.offset(result.names[i], problem.model) for i in fitted])
-    return _common(offsets, growth[fitted], result.covariance[np.ix_(fitted, fitted)])
-
-
-def _common(
-    offsets: FloatArray, growth: FloatArray, covariance: FloatArray
-) -> tuple[float, float, float]:
-    """Return s, its standard deviation and freedom, for offsets (P,) = s growth (P,) + noise."""
-    freedom = len(offsets) - 1
-    variances, axes = np.linalg.eigh(covariance)
-    offsets, growth = axes.T @ offsets, axes.T @ growth
-    weights = 1.0 / (np.maximum(variances, 1e-16) + SCATTERS[:, np.newaxis] ** 2)
-    weight = weights @ growth**2
-    scale = (weights @ (growth * offsets)) / np.maximum(weight, 1e-300)
-    left = (weights * (offsets - scale[:, np.newaxis] * growth) ** 2).sum(axis=1)
-    k = int(np.argmax(left <= freedom))  # the smallest tau that explains the scatter
-    return float(scale[k]), float(max(weight[k], 1e-300) ** -0.5), float(freedom)
-
-
-def _scale(problem: Problem, result: Identification) -> tuple[str, bool]:
-    """Return the suspicion of a common scale in words, and whether it refuses."""
-    risk = result.region.by_scale if result.region is not None else 0.0
-    if not result.refusals and result.posterior.rival is not None and risk >= HARMFUL:
-        return out_of_scale(result.posterior.rival[1]), True
-    scale, std, freedom = scale_of(problem, result)
-    if freedom < 2.0 or abs(scale) < LEAST_SCALE:
-        return '', False
-    limit = special.stdtrit(freedom, 0.5 + 0.5 * SURE) * std
-    if abs(scale) < limit:
-        return '', False
-    certain = abs(scale) - limit > LARGEST_SCALE and not problem.sigma_scale
-    text = f'{grown(scale)} (sigma {percent(std)} %): '
-    advice = 'check the scale of the measuring device, and the temperature'
-    return text + ('no arm does' if certain else advice), certain
+def _scale(result: Identification) -> Reason | None:
+    """Return that harm by a device out of scale is too likely, if nothing else refuses."""
+    rival, region = result.posterior.rival, result.region
+    if result.refusals or rival is None or region is None or region.by_scale < HARMFUL:
+        return None
+    return Reason(Rule.SCALE, out_of_scale(rival[1]))
 
 
 def _sister(problem: Problem, result: Identification) -> str:

@@ -11,10 +11,8 @@ from fits import SIGMAS, rms
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.suspicions import _common, _motion, scale_of
+from calib_ros.decision.suspicions import _motion
 from calib_ros.kinematics.chain import Frame, Joint
-from calib_ros.report.documents import as_document
-from calib_ros.report.words import summary
 
 UR = load_chain('ur10e')
 GRAVITY = {
@@ -39,31 +37,11 @@ def arm(seed=0, errors=1.0, chain=UR):
 
 @pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14'])
 @pytest.mark.parametrize('oriented', [True, False])
-def test_the_scale_of_a_device_is_found(name, oriented):
+def test_a_device_out_of_scale_is_named(name, oriented):
     chain = load_chain(name)
     seen = seen_of(arm(0, 0.0, chain), oriented=oriented)
-    problem = Problem(chain, scaled(seen, 3000.0))
-    result = identify(problem)
-    scale, std, freedom = scale_of(problem, result)
-    assert abs(scale - 3e-3) < 4.0 * std
-    assert std < 7e-5
-    assert freedom >= 4
-    assert not result.accepted
+    result = identify(Problem(chain, scaled(seen, 3000.0)))
     assert any('alike, by 0.3 %' in each for each in result.refusals)
-
-
-def test_growth_that_arms_have_is_said_and_not_refused():
-    """An arm 10 degrees warmer has the same 230 ppm as a device's wrong metre.
-
-    Where it has no other errors nothing is gained for sure (`region.py`).
-    """
-    result = identify(Problem(UR, scaled(seen_of(arm(errors=0.0)), 230.0)))
-    assert result.region is None
-    assert not any('alike' in each for each in result.refusals)
-    (remark,) = result.remarks
-    assert 'grow alike' in remark
-    assert remark in summary(result)
-    assert as_document(result, {})['remarks'] == [remark]
 
 
 def test_a_joint_that_only_goes_one_way_is_named():
@@ -80,18 +58,6 @@ def test_a_joint_that_only_goes_one_way_is_named():
         said = [each for each in identify(Problem(UR, one)).remarks if 'mix' in each]
         assert len(said) == bool(named)
         assert all(f'an error of {named}, moved in one direction' in each for each in said)
-
-
-def test_offsets_that_scatter_hide_a_scale():
-    """The scale is as uncertain as the arm's own offsets make it, and honestly so."""
-    rng, held = np.random.default_rng(0), []
-    growth = rng.uniform(0.1, 0.6, 9)
-    for _ in range(2000):
-        offsets = 1e-3 * growth + rng.normal(scale=5e-4, size=9)
-        scale, std, freedom = _common(offsets, growth, 1e-10 * np.eye(9))
-        held.append(abs(scale - 1e-3) < 2.306 * std)
-        assert freedom == 8
-    assert np.mean(held) == pytest.approx(0.95, abs=0.015)
 
 
 @pytest.mark.parametrize('errors', [0.1, 1.0, 3.0])
