@@ -4,12 +4,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
-
-import numpy as np
 
 from calib_ros.errors import InputError
 from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
@@ -25,10 +21,8 @@ from calib_ros.sampling.messages import (
     parse_sources,
     short_type,
 )
-from calib_ros.sampling.slices import Series
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
-from calib_ros.values import SAME
 
 Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 """Returns the messages of a recording on some topics."""
@@ -114,63 +108,21 @@ def outputs(available: Mapping[str, str]) -> set[str]:
 def check_joints(
     recorded: Recorded, streams: Mapping[str, Stream], joint_names: Sequence[str]
 ) -> None:
-    """Refuse joint states if several topics name the same joints.
-
-    The InputError names the topics, and how far their values differ.
-    """
-    series: dict[str, dict[str, Series]] = defaultdict(dict)
-    for (topic, name), parts in _joint_values(recorded, streams).items():
-        if name in joint_names:
-            stamps = np.concatenate([each for each, _ in parts])
-            values = np.concatenate([each for _, each in parts])
-            order = np.argsort(stamps, kind='stable')
-            series[topic][name] = stamps[order], values[order]
-    twice = [
-        (a, b, shared)
-        for a, b in itertools.combinations(sorted(series), 2)
-        if (shared := [name for name in joint_names if name in series[a] and name in series[b]])
-    ]
+    """Refuse joint states with an InputError if several topics name the same joints."""
+    topics: dict[str, set[str]] = {name: set() for name in joint_names}
+    for batch, _ in batches(recorded.messages_on(streams)):
+        for topic in {stream.topic for stream, _ in batch}:
+            of_topic = [each for each in batch if each[0].topic == topic]
+            for part in Intake(of_topic, recorded.deserialise).parts:
+                for name in topics.keys() & part.readings.strings[1:]:
+                    topics[name].add(topic)
+    twice = {name: found for name, found in topics.items() if len(found) > 1}
     if twice:
-        names = [name for name in joint_names if any(name in shared for *_, shared in twice)]
-        apart = '; '.join(_apart(a, b, series[a], series[b], shared) for a, b, shared in twice)
         raise InputError(
-            f'joints {", ".join(names)} come on several topics: {apart}. Choose the measured one '
+            f'joints {", ".join(twice)} come on several topics: '
+            f'{", ".join(sorted(set().union(*twice.values())))}. Choose the measured one '
             '(or several that name different joints) with --joint-topics'
         )
-
-
-def _joint_values(
-    recorded: Recorded, streams: Mapping[str, Stream]
-) -> dict[tuple[str, str], list[Series]]:
-    found = defaultdict(list)
-    for batch, _ in batches(recorded.messages_on(streams)):
-        for topic in dict.fromkeys(stream.topic for stream, _ in batch):
-            of_topic = [each for each in batch if each[0].topic == topic]
-            for _, _, (stamps, (_, *names), values) in Intake(
-                of_topic, recorded.deserialise
-            ).parts:
-                for name, column in zip(names, values.T, strict=True):
-                    found[topic, name].append((stamps, column))
-    return found
-
-
-def _apart(
-    a: str, b: str, first: Mapping[str, Series], second: Mapping[str, Series], names: Sequence[str]
-) -> str:
-    largest: tuple[float, str] | None = None
-    for name in names:
-        dense, sparse = sorted((first[name], second[name]), key=lambda each: -len(each[0]))
-        begin, end = dense[0][[0, -1]]
-        known = (sparse[0] >= begin) & (sparse[0] <= end)
-        if known.any():
-            resampled = np.interp(sparse[0][known] - begin, dense[0] - begin, dense[1])
-            error = float(np.abs(sparse[1][known] - resampled).max())
-            largest = max(largest or (error, name), (error, name))
-    if largest is None:
-        return f'{a} and {b} never come at the same time'
-    if largest[0] < SAME:
-        return f'{a} and {b} are the same'
-    return f'{a} and {b} differ by up to {largest[0]:.3g} rad or m, as for {largest[1]}'
 
 
 def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
