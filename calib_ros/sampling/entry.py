@@ -1,18 +1,17 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Admission of messages by their names (joints, frames, targets), and the samples kept."""
+"""Admission of messages by their names: joints, frames, targets."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.messages import NO_STAMP, Readings, Source
-from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
 from calib_ros.settings import EXCEPTION
 from calib_ros.values import LARGEST, MOST_NAMES
@@ -98,7 +97,9 @@ class FrameNames:
         if not self.note(device, frame_id, count):
             return f'in one of more than {MOST_NAMES} frames'
         usual = self.usual.get(device, frame_id)
-        return '' if frame_id == (wanted or usual) else strange(frame_id, usual)
+        if frame_id == (wanted or usual):
+            return ''
+        return f'in frame "{frame_id}", not in "{usual}" like the others'
 
     def note(self, device: str, frame_id: str, count: int) -> bool:
         """Note the frame of measurements; return False beyond MOST_NAMES frames."""
@@ -117,11 +118,6 @@ class FrameNames:
         return found or (max(known, key=known.__getitem__) if known else None)
 
     @property
-    def several(self) -> bool:
-        """Tell whether any device measured in several frames."""
-        return any(len(known) > 1 for known in self._known.values())
-
-    @property
     def different(self) -> tuple[str, ...]:
         """Return the different frames of one device, but for a few measurements; empty if none."""
         for device, known in self._known.items():
@@ -129,11 +125,6 @@ class FrameNames:
             if not few and not self.required(device):
                 return tuple(sorted(known))
         return ()
-
-
-def strange(frame_id: str, usual: str) -> str:
-    """Return that a measurement is not in the usual frame."""
-    return f'in frame "{frame_id}", not in "{usual}" like the others'
 
 
 class Part(NamedTuple):
@@ -245,55 +236,3 @@ class Entry:
                 for k in range(len(part.places))
             ]
         return sorted(parts, key=lambda part: int(part.places[0]))
-
-
-class Kept:
-    """Samples in order; `removed` is called with each one that is taken back."""
-
-    def __init__(
-        self, frames: FrameNames, dropped: Counter[str], removed: Callable[[Sample], None]
-    ) -> None:
-        self._frames, self._dropped, self._removed = frames, dropped, removed
-        self.samples: list[Sample] = []
-
-    def usable(self) -> list[Sample]:
-        """Return the samples in the frame of their device.
-
-        Targets measured once are left out if others were measured more often: they do not
-        constrain the arm, and hundreds of them would take minutes.
-        """
-        found = self.samples
-        if self._frames.wanted or self._frames.several:
-            found = [each for each in found if self._frame_of(each) == each.frame_id]
-        counts = Counter((each.device, each.target) for each in found if not each.validation)
-        once = {key for key, count in counts.items() if count == 1}
-        if not once or len(once) == len(counts):
-            return found
-        return [each for each in found if (each.device, each.target) not in once]
-
-    def _frame_of(self, sample: Sample) -> str:
-        return (sample.frame_id and self._frames.main(sample.device)) or sample.frame_id
-
-    def leave_out_strange(self) -> None:
-        """Take back samples in strange frames, if there are only a few."""
-        for sample in tuple(self.samples):
-            if self.is_strange(sample):
-                self.samples.remove(sample)
-                self._removed(sample)
-
-    def is_strange(self, sample: Sample) -> bool:
-        """Tell whether a sample is one of a few in a frame of their own; count it if so."""
-        frames = self._frames
-        if frames.required(sample.device) or not frames.several or frames.different:
-            return False
-        frame_id = self._frame_of(sample)
-        strays = sample.frame_id != frame_id
-        if strays:
-            self._dropped[f'measurements: {strange(sample.frame_id, frame_id)}'] += sample.count
-        return strays
-
-    @property
-    def different(self) -> str:
-        """Return that one device measured in different frames, if it matters."""
-        frames = ', '.join(self._frames.different)
-        return frames and f'poses came in different frames ({frames})'

@@ -20,7 +20,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Kept, Part
+from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Part
 from calib_ros.sampling.gathered import (
     check_joint_names,
     check_settings,
@@ -81,9 +81,7 @@ class CalibrationSession:
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
         self.pictures.clear()
-        self._kept = Kept(
-            self._frames, self._entry.dropped, lambda sample: self.on_removed(sample)
-        )
+        self.samples: list[Sample] = []
 
     def change(self, settings: Settings) -> None:
         """Continue with other settings; buffers and samples stay.
@@ -98,12 +96,8 @@ class CalibrationSession:
 
     def take(self, parts: Sequence[Part]) -> None:
         """Take messages in the order of their places."""
-        settled = len(self._frames.usual)
-        pieces = self._entry.pieces(parts, self.recording)
-        if len(self._frames.usual) != settled:
-            self._kept.leave_out_strange()
         try:
-            self._pipeline.take(pieces)
+            self._pipeline.take(self._entry.pieces(parts, self.recording))
         finally:
             self._settle()
 
@@ -115,7 +109,6 @@ class CalibrationSession:
         """Make samples of all waiting messages; no more will arrive."""
         self._pipeline.finish()
         self._settle(wait=True)
-        self._kept.leave_out_strange()
 
     @property
     def received(self) -> Counter[str]:
@@ -166,18 +159,28 @@ class CalibrationSession:
             if sample.frame_id:
                 self._frames.note(sample.device, sample.frame_id, sample.count)
         self._collector.maker.remember(samples)
-        self._kept.samples[:0] = samples
-        self._kept.leave_out_strange()
-
-    @property
-    def samples(self) -> list[Sample]:
-        """Return the samples so far."""
-        return self._kept.samples
+        self.samples[:0] = samples
 
     @property
     def usable(self) -> list[Sample]:
-        """Return the samples for identification (`Kept.usable`)."""
-        return self._kept.usable()
+        """Return the samples for identification, in the frame of their device.
+
+        Targets measured once are left out if others were measured more often: they do not
+        constrain the arm, and hundreds of them would take minutes.
+        """
+        frames = {name: self._frames.main(name) for name in {each.device for each in self.samples}}
+        found = [each for each in self.samples if each.frame_id in ('', frames[each.device])]
+        counts = Counter((each.device, each.target) for each in found if not each.validation)
+        once = {key for key, count in counts.items() if count == 1}
+        if len(once) == len(counts):
+            return found
+        return [each for each in found if (each.device, each.target) not in once]
+
+    @property
+    def _different(self) -> str:
+        """Return that one device measured in different frames, if it matters."""
+        frames = ', '.join(self._frames.different)
+        return frames and f'poses came in different frames ({frames})'
 
     @property
     def state(self) -> str:
@@ -232,7 +235,7 @@ class CalibrationSession:
         """Return what looks wrong in the received messages."""
         in_sockets = self.settings.mode == 'triggered' and self.received  # perhaps: not measured
         found = [] if self.samples or in_sockets else unheard(self.received)
-        if words := self._kept.different:
+        if words := self._different:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
@@ -282,9 +285,8 @@ class CalibrationSession:
         """Return a snapshot of the samples as a problem."""
         self._clocks.find(self._collector, None)
         self._flush()
-        if self._kept.different:
-            raise InputError(f'{self._kept.different}, {ONE_FRAME}')
-        self._kept.leave_out_strange()
+        if self._different:
+            raise InputError(f'{self._different}, {ONE_FRAME}')
         return self.problem_of(self.usable)
 
     def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
@@ -353,13 +355,8 @@ class CalibrationSession:
 
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
         self.pictures.through(made)
-        usual = self._frames.usual  # before it is known, nothing is strange
-        fresh = [
-            each
-            for each in self.pictures.ready(wait)
-            if each.device not in usual or not self._kept.is_strange(each)
-        ]
-        self._kept.samples += fresh
+        fresh = self.pictures.ready(wait)
+        self.samples += fresh
         self.made += len(fresh)
         for sample in fresh:
             self.on_sample(sample)
