@@ -324,35 +324,24 @@ def _successive(
 ) -> dict[int, FloatArray]:
     """Return by part J^T K J of errors fading in succession, for (length, size) each.
 
-    K = L + L^T - I, where L sums the stops so far, faded.
+    K = L + L^T - I, where L sums the stops so far, faded: s_k = x_k + exp(-1 / length) s_(k - 1).
     """
     size = len(names)
     found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
-        before: dict[tuple[int, float], FloatArray] = {}
+        faded = dict.fromkeys(kernels, np.zeros((1, 1)))
         for _, sums in samples.sums(chain, names, samples.observations.stops):
             for part, own in kernels.items():
                 if part >= len(sums):
                     continue
-                rows = sums[part][:-1]
-                together = np.zeros_like(rows)
-                for length, weight in own:
-                    faded = _faded_sums(rows, length, before.get((part, length), 0.0))
-                    before[part, length] = faded[..., -1]
-                    together += weight * (faded - 0.5 * rows)
-                cross = rows.reshape(size, -1) @ together.reshape(size, -1).T
+                lengths, weights = np.array(own).T
+                fading = np.exp(-1.0 / lengths)[:, np.newaxis]
+                rows = np.ascontiguousarray(sums[part][:-1].T)
+                stops = rows.reshape(len(rows), -1)
+                together = -0.5 * weights.sum() * stops
+                for stop, total in zip(stops, together, strict=True):
+                    faded[part] = fading * faded[part] + stop
+                    total += weights @ faded[part]
+                cross = rows.reshape(-1, size).T @ together.reshape(-1, size)
                 found[part] += cross + cross.T
     return found
-
-
-def _faded_sums(rows: FloatArray, length: float, before: FloatArray | float) -> FloatArray:
-    """Return sums (P, c, n) of rows (P, c, n), each of which fades over a number of stops.
-
-    They continue `before` (P, c): s_k = x_k + exp(-1 / length) s_(k - 1).
-    """
-    count, fading = rows.shape[2], float(np.exp(-1.0 / length))
-    added = rows.copy()
-    added[..., 0] += fading * before
-    bands = np.array([np.ones(count), np.full(count, -fading)])
-    sums = linalg.solve_banded((1, 0), bands, added.reshape(-1, count).T, check_finite=False)
-    return np.asarray(sums.T.reshape(rows.shape))
