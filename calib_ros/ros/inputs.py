@@ -29,8 +29,9 @@ from calib_ros.sampling.intake import BATCH, Stream, links_of
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.slices import SILENCE
 
-IMAGE_QUEUE = BATCH // 100
-"""Images of a topic that may wait while the node is busy, as a BATCH of other messages."""
+QUEUE, IMAGE_QUEUE = 10 * BATCH, BATCH // 100
+"""Messages and images of a topic that may wait while the node is busy: for seconds, if poses that
+do not fit the arm are judged on a busy machine."""
 
 
 @dataclass
@@ -224,7 +225,7 @@ def deserialised(data: bytes, name: str) -> Any:
 def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
     found = []
     with subscription.handle:
-        for _ in range(BATCH):
+        for _ in range(QUEUE):
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 break
@@ -235,7 +236,7 @@ def _waiting(subscription: Subscription) -> list[tuple[int, bytes]]:
 def _qos(stream: Stream) -> QoSProfile:
     """Return the QoS of a topic; a new one each time, because overriding changes it."""
     return QoSProfile(
-        depth=IMAGE_QUEUE if stream.type in PICTURES else BATCH,
+        depth=IMAGE_QUEUE if stream.type in PICTURES else QUEUE,
         reliability=ReliabilityPolicy.RELIABLE if stream.still else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if stream.still else DurabilityPolicy.VOLATILE,
     )

@@ -9,6 +9,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PointStamped
 from rclpy.node import Node
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_cell import Cell, Child, joint_messages, topics, values_of
 from sensor_msgs.msg import JointState
@@ -94,6 +95,17 @@ def test_a_queue_that_was_full_is_told(tmp_path, recording):
         assert cell.node.session.received['joints'] < 20
         assert int(values_of(heard[-1])['queue of /joint_states full']) > 0
         cell.spin_until(lambda: 'get lost' not in heard[-1].status[0].message)
+
+
+def test_messages_of_seconds_wait_while_the_node_is_busy(tmp_path, recording):
+    """Joint values in degrees let the node judge poses for five seconds: a fifth was lost."""
+    override = {'qos_overrides./joint_states.subscription.reliability': 'reliable'}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        publisher = cell.publisher(JointState, 'joint_states')
+        for k, message in enumerate(joint_messages(recording) * 3):
+            publisher.publish(message)
+            assert k % 500 or publisher.wait_for_all_acked(Duration(seconds=60))
+        cell.spin_until(lambda: cell.node.session.received['joints'] == 3600)
 
 
 def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, recording):
