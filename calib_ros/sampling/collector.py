@@ -172,11 +172,13 @@ class Collector:
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the joint states, given the number of measurements."""
-        needed = self.rests.needed(self.settings.still)
         between = self.dropped[f'measurements: {APART}']
-        found = [] if needed is None else [restless(needed, self.settings.still)]
         shared = self.dropped[f'{JOINTS}: {CONTRARY}']
-        return found + sparse(between, measurements, self.settings.max_gap, shared)
+        found = sparse(between, measurements, self.settings.max_gap, shared)
+        needed = self.rests.needed(self.settings.still)
+        if found or needed is None:  # of too rare joint states the noise is not known
+            return found
+        return [restless(needed, self.settings.still)]
 
     def astray(self) -> list[Hint]:
         """Report clocks that differ or differed by too much, or joint states that have ended."""

@@ -158,7 +158,7 @@ def test_nothing_is_told_of_still_where_the_arm_moves_or_is_sampled(motion, nois
 
 
 def test_joint_states_that_are_too_slow_are_told_and_the_rate_needed():
-    made = heard(tour(15), 29.5, 8.0)
+    made = heard(tour(15), 29.5, 8.0, early=lambda times: 0.02 * np.sin(7.0 * times**2))
     made.finish()
     (warning,) = told(made)
     assert re.match(r'\d{4} of 1460 measurements lie between joint states', warning)
