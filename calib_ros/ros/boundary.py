@@ -180,8 +180,7 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.announce()
-        while not stop.is_set() and rclpy.ok():
-            executor.spin_once(timeout_sec=0.1)
+        _spin(node, executor, stop)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
     except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
@@ -203,6 +202,13 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
         sys.stderr.flush()
         os._exit(status)
     return status
+
+
+def _spin(node: Any, executor: SingleThreadedExecutor, stop: threading.Event) -> None:
+    while not stop.is_set() and rclpy.ok():
+        executor.spin_once(timeout_sec=0.1)
+    for _ in (*node.services, *node.timers):  # calls that came before the end are answered
+        executor.spin_once(timeout_sec=0.0)
 
 
 def _handle_signals(handler: Any) -> None:
