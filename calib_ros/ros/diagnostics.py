@@ -32,6 +32,7 @@ class Diagnostics:
         self._node, self._session, self._archive = node, session, archive
         self._inputs, self._boundary, self._serial = inputs, boundary, serial
         self._dropped_before: dict[str, int] = {}
+        self.unloaded = ''  # why no calibration was loaded at the start, if one was wanted
         self._alike = 1
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
 
@@ -66,7 +67,8 @@ class Diagnostics:
         self._publisher.publish(message)
 
     def _judged(self, account: Account) -> tuple[bytes, str]:
-        wrong = [*self._namesakes(), *self._inputs.troubles()]
+        unloaded = '' if self._session.calibration else self.unloaded
+        wrong = [*filter(None, [unloaded]), *self._namesakes(), *self._inputs.troubles()]
         fresh = {
             cause: count
             for cause, count in account.dropped.items()
@@ -76,7 +78,7 @@ class Diagnostics:
         if fresh:
             wrong.append(f'messages are dropped ({", ".join(fresh)})')
         level = DiagnosticStatus.WARN if wrong else DiagnosticStatus.OK
-        if self._archive.trouble:
+        if self._archive.trouble or unloaded:
             level = DiagnosticStatus.ERROR
         return level, ''.join([self._archive.trouble, *(f'{text}; ' for text in wrong)])
 

@@ -254,8 +254,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             try:
                 log.info(f'{self._on_load(None)[1]}: it is published')
             except Exception as err:  # samples can be taken without it
-                self._identifying.last = f'no calibration is published at startup: {err}'
-                log.error(self._identifying.last)
+                self._diagnostics.unloaded = f'no calibration is published at startup: {err}'
+                log.error(self._diagnostics.unloaded)
         elif path is not None:
             log.info(
                 f'no calibration is published yet. There is {path}: call ~/load, or start with '

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import yaml
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from ros_cell import STOPS, Cell, pose_messages, topics, values_of
+from ros_cell import STOPS, Cell, pose_messages, topics
 from std_msgs.msg import String
 from std_srvs.srv import SetBool
 
@@ -316,7 +316,8 @@ def test_what_cannot_be_loaded_at_the_start_is_told_and_costs_nothing_else(
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         node = cell.start(**given)
         cell.spin_until(lambda: any(said in m.msg and m.level == m.ERROR for m in told))
-        cell.spin_until(lambda: heard and said in values_of(heard[-1])['last identification'])
+        cell.spin_until(lambda: heard and said in heard[-1].status[0].message)
+        assert heard[-1].status[0].level == DiagnosticStatus.ERROR
         assert node.session.calibration is None
         cell.play(topics(recording), node=node)
         cell.done('identify')
