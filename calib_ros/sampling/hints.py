@@ -158,10 +158,14 @@ def unsettled(refused: int, stops: int) -> list[Hint]:
     return [Hint(f'{refused} of {stops} stops still move where measured: set settle', words)]
 
 
-def unmeasured(stops: int) -> list[Hint]:
-    """Report stops in a row without a measurement."""
+def unmeasured(stops: int, between: int) -> list[Hint]:
+    """Report stops in a row without a measurement; `between` are all there are, if any."""
     if stops < FEW:
         return []
+    if between:
+        words = f'all {between} measurements came between the stops'
+        advice = 'synchronise the clocks (NTP, PTP), and stop until the device has measured'
+        return [Hint(f'{words}, none at one: do the clocks agree?', f'{words}: {advice}')]
     words = f'no measurements at the last {stops} stops: does the device see the target'
     return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
@@ -293,7 +297,10 @@ def progress(
     `fitted` holds the joint values (n,) of each.
     """
     counted = f'{len(fitted)} pose{"s" * (len(fitted) != 1)}'
-    if estimate is not None:
+    if estimate is not None and estimate.excess and estimate.rms > settings.largest_error:
+        apart = f'{1e3 * estimate.rms:.0f} mm from where the joints are'
+        counted += f', {apart}: check units, clocks and chain'
+    elif estimate is not None:
         counted += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()
     return [counted, f'hardly moved so far: {", ".join(still)}' if still else '']

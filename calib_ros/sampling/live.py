@@ -78,6 +78,7 @@ class Estimate:
     samples: int
     sigma: float  # RMS standard deviation [m] of positions over the joint range
     noise: float  # of the residuals, used for sigma [sigma given]
+    rms: float  # of position residuals [m]
     excess: float | None
 
     def enough(self, wanted: float) -> bool:
@@ -271,6 +272,7 @@ class LiveEstimate:
         jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
         variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
         sigma = float(np.sqrt(variance.mean()))
+        rms, excess = self._left(chain)
         return Estimate(
             chain,
             self._names,
@@ -278,14 +280,15 @@ class LiveEstimate:
             len(self._added),
             sigma,
             float(np.sqrt(noise)),
-            self._excess(chain) if self._enough(self._rows) else None,
+            rms,
+            excess if self._enough(self._rows) else None,
         )
 
-    def _excess(self, chain: Chain) -> float:
-        """Return the RMS position residual in units of the measurement scatter."""
+    def _left(self, chain: Chain) -> tuple[float, float]:
+        """Return the RMS position residual [m], and in units of the measurement scatter."""
         chosen = np.linspace(0, len(self._added) - 1, SOME).round().astype(int)
         some = [self._added[k] for k in np.unique(chosen)]
-        total = 0.0
+        total = squares = 0.0
         for members, each in self._groups(some):
             left = residual_arrays(chain, each)[0]
             scatter = np.full(len(each), self._sigmas[0] ** 2)
@@ -293,8 +296,9 @@ class LiveEstimate:
                 own = np.trace(each.covariance[:, :3, :3], axis1=1, axis2=2) / 3.0
                 scatter = np.where(np.isnan(own), scatter, own)
             spread = np.array([sample.spread for sample in members])
+            squares += float((left**2).sum())
             total += float(((left**2).mean(axis=1) / np.maximum(scatter, spread**2)).sum())
-        return math.sqrt(total / len(some))
+        return math.sqrt(squares / len(some)), math.sqrt(total / len(some))
 
 
 def barely_moved(chain: Chain, joints: FloatArray) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from calib_ros.sampling.delay import Clocks
 from calib_ros.sampling.hints import Hint, unmeasured, unsettled
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice
+from calib_ros.sampling.stops import MOVING
 from calib_ros.settings import Settings
 
 STRAY = 'stamp far from those before and after'
@@ -181,9 +182,10 @@ class Pipeline:
 
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""
-        maker = self.collector.maker
+        maker, missed = self.collector.maker, self.collector.unmeasured
         found = unsettled(maker.restless, maker.restless + maker.rested)
-        return found + (unmeasured(self.collector.unmeasured) if maker.rested else [])
+        between = 0 if maker.rested else self.collector.unused[f'{POSES}: {MOVING}']
+        return found + (unmeasured(missed, between) if maker.rested or between else [])
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

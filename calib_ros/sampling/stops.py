@@ -15,6 +15,7 @@ from calib_ros.sampling.interpolation import unwrapped
 from calib_ros.sampling.slices import Rows, Stamps
 from calib_ros.settings import Settings
 
+MOVING = 'the arm was moving'  # why a measurement is not used
 MOST_SPREAD = 2.0
 """Largest spread [noise] of measurements and joints at a stop. A convention."""
 NEAR = 2.0 * MOST_SPREAD
@@ -141,7 +142,7 @@ class Schedule:
             begin = max(begin, self.done_ns)
             if begin > until or end <= self.done_ns:
                 continue
-            self.add(begin, 'the arm was moving')
+            self.add(begin, MOVING)
             if begin <= self.sampled_ns:
                 self.sampled(min(end, until))
                 continue
@@ -156,7 +157,7 @@ class Schedule:
                 continue
             self.sample(begin, last)
             self.sampled(min(end, until))
-        self.add(until, 'the arm was moving')
+        self.add(until, MOVING)
 
 
 class Known:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sessions import SIGMAS, UR5E, drive, samples, session, tracker
-from streams import POSE, TRACKER, joint_state, of_joints, pose, take
+from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, take
 
 from calib_ros.errors import InputError
 from calib_ros.sampling.session import CalibrationSession
@@ -63,6 +63,26 @@ def test_no_forecast_where_what_is_left_is_not_noise(rng, model, advice):
     assert 'more expected for 0.1 mm' in made.status()
     as_noisy = session([replace(each, spread=1e-3) for each in given], loss='none', model=model)
     assert 'more expected for 0.1 mm' in as_noisy.status()
+
+
+def test_no_accuracy_is_expected_of_positions_in_millimetres():
+    made = session([replace(each, position=1e3 * each.position) for each in samples(30)])
+    assert re.search(r'30 poses, \d+ mm from where the joints are: check units', made.status())
+    assert 'expected' not in made.status()
+
+
+def test_the_status_tells_of_measurements_only_between_the_stops():
+    """By half a second apart, the clocks left each stop without a measurement, in silence."""
+    made, motion = session(), stops(UR5E.random_joints(8, np.random.default_rng(1)))
+    source, kind, measured = tracker()
+    come = []
+    for time in np.arange(0.0, 15.0, 0.04).tolist():
+        (stamp,), (row,) = stamps(np.array([time])).tolist(), motion([time])
+        come.append(of_joints(joint_state(stamp, UR5E.joint_names, row.tolist())))
+        if 1.3 < time % 2.0 < 1.7:
+            come.append((source, kind, measured(stamp, row)))
+    take(made, *come)
+    assert 'between the stops, none at one: do the clocks agree?' in made.status()
 
 
 def test_the_status_names_a_sample_that_does_not_fit():
