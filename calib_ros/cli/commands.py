@@ -59,7 +59,7 @@ tables of other systems (docs/tables.md); anything not given is guessed
   --quaternion wxyz=  order of the quaternion; default: xyzw
   --separator NAME=  comma, semicolon, tab or space
   --decimal NAME=  point or comma
-  --sheet NAME=  sheet of a workbook (.xlsx); default: the first
+  --sheet NAME=  sheet of a workbook (.xlsx); default: the first with the columns
   --joints-preset NAME=  layout of the --joints log
   @columns
   --rotation-vector  rx ry rz are a rotation vector

@@ -25,6 +25,7 @@ from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, from_c
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
+THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}([ .,'][0-9]{3})+([.,][0-9]*)?")
 Row = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
 Codes = tuple[Index, list[str]]
@@ -58,6 +59,8 @@ class Columns:
         remedy = 'correct that row or leave it out'
         if DECIMAL_COMMA.fullmatch(text):
             remedy = 'write a point, or give --decimal comma'
+        elif THOUSANDS.fullmatch(text):
+            remedy = 'write it without the marks between thousands'
         return InputError(
             f'{self.where(row, name)} must be a finite number, not {text!r}: {remedy}'
         )

@@ -37,14 +37,13 @@ from calib_ros.files.layouts import (
     finished,
     joint_columns,
 )
-from calib_ros.files.sheets import Sheet, read_sheet
+from calib_ros.files.sheets import Sheet, name_and_unit, places, read_sheet
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
 MEASURED = (*POSITION, 'distance')
-UNIT = re.compile(r'.*[\[(] *(\w+) *[\])]')
 UNITS = {'millimeters': 'mm', 'centimeters': 'cm', 'meters': 'm', 'micrometers': 'um'}
 UNITS |= {'inches': 'in'} | {unit: unit for unit in LENGTHS}
 
@@ -65,13 +64,14 @@ class Foreign:
     def convert(self, path: Path) -> tuple[Columns, tuple[str, ...]]:
         """Return our columns of a table, and notes about guesses and omissions."""
         table = _Table(path, self.layout, self.chain, self.log is None)
-        values, notes, lines = table.values(), table.notes, table.lines
+        values, lines = table.values(), table.lines
+        notes = [f'{path}: {note}' for note in table.notes]
         if self.log is not None:
             log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
             joints = log.values()
             if 'q1' not in joints:
                 joined = 0 if self.chain is None else len(self.chain.joints)
-                like = as_typed(like_joints(log.header, joined).get('q*', 'NAME*'))
+                like = as_typed(like_joints(log.names, joined).get('q*', 'NAME*'))
                 raise InputError(
                     f'{self.log} has no column q1; {log.has}: give --columns "q*={like}" or '
                     '--joints-preset'
@@ -83,18 +83,19 @@ class Foreign:
                     'column of the same name that names the poses, or a row for each measurement'
                 )
             how = f'by the column "{name}"' if name else 'row by row'
-            notes += [*log.notes, f'{how}, {self.log} holds the joint values of {path}']
+            notes += [f'{self.log}: {note}' for note in log.notes]
+            notes.append(f'{self.log}: holds the joint values of {path}, matched {how}')
             values = {ours: each[partners] for ours, each in joints.items()} | values
-        made = Columns(path, lines, table.words(), values, table.header)
+        made = Columns(path, lines, table.words(), values, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         measured = [made.values[name] for name in MEASURED if name in made.values]
         good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
         if not good.all():
             lines = made.lines[~good].tolist()
-            notes.append(f'nothing measured in {lines_in_words(lines)}: skipped')
+            notes.append(f'{path}: nothing measured in {lines_in_words(lines)}: skipped')
             made = made.select(good)
-        return finished(made, self.layout), tuple(f'{path}: {note}' for note in notes)
+        return finished(made, self.layout), tuple(notes)
 
 
 def as_csv(columns: Columns) -> str:
@@ -147,13 +148,15 @@ class _Table:
         kept, guessed = self._there(expressions), []
         lower = [name.lower() for name in self._sheet.header]
         for name, ours in own.items():
-            if ours in kept or ours in self._ours or lower.count(name.lower()) != 1:
+            found = places(lower, name.lower())
+            if ours in kept or ours in self._ours or len(found) != 1:
                 continue
-            column = lower.index(name.lower())
+            column = found[0]
             if ours in WORDS:
                 self._ours[ours] = f'#{column + 1}'
                 continue
-            if ours[0] in 'sva' and ours[1:].isdigit() and self._sheet.header[column] != name:
+            bare, _ = name_and_unit(self._sheet.header[column])
+            if ours[0] in 'sva' and ours[1:].isdigit() and bare != name:
                 continue  # the axes of KUKA are A1, A2, ...: no accelerations
             kept[ours] = Expression.parse(f'#{column + 1}')
             if name != ours:
@@ -165,7 +168,7 @@ class _Table:
             if missing := [name for name in names if name not in kept]:
                 raise InputError(
                     f'{self._path} has no column for {", ".join(missing)}; {self.has}. '
-                    f'{named_by_option(self.header, missing, len(names))}'
+                    f'{named_by_option(self.names, missing, len(names))}'
                 )
         return kept
 
@@ -194,6 +197,11 @@ class _Table:
     @property
     def header(self) -> tuple[str, ...]:
         return tuple(filter(None, self._sheet.header))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the columns without their units."""
+        return tuple(name_and_unit(name)[0] for name in self.header)
 
     def words(self) -> dict[str, str]:
         used = {ours: _bare(self._ours[ours]) for ours in WORDS if ours in self._ours}
@@ -235,7 +243,8 @@ class _Table:
                 length = unit or length
         length = length or self._said(LENGTHS, (*POSITION, 'distance'))
         angle = angle or self._said(ANGLES, (*TURNS, *IN_TURN))
-        joint = layout.joint_angle or angle or self._said(ANGLES, joint_columns(MOST_NAMES))
+        turning = [name for name in joint_columns(MOST_NAMES) if not self._slides(name)]
+        joint = layout.joint_angle or angle or self._said(ANGLES, turning)
         names = set(self._expressions)
         assumed = []
         if not length and names & {*POSITION, 'distance'}:
@@ -252,7 +261,7 @@ class _Table:
         """Return the unit that the names of some of our columns end with: `X [mm]`, or empty."""
         expressions = [each for name, each in self._expressions.items() if name in ours]
         named = {name for each in expressions for name in each.names}
-        found = {UNIT.sub(r'\1', self._called(name).replace('°', 'deg')) for name in named}
+        found = {name_and_unit(self._called(name))[1] for name in named}
         return found.pop() if len(found) == 1 and found <= {*units} else ''
 
     def _factor(self, ours: str, units: tuple[float, float, float]) -> float:
@@ -262,10 +271,13 @@ class _Table:
         if ours in (*TURNS, *IN_TURN, *SIGMAS[3:]):
             return 1.0 if self._layout.rotation_vector and not self._layout.angle else angle
         if JOINT.fullmatch(ours) and ours[0] != 's':
-            chain = self._chain
-            prismatic = chain is not None and chain.joints[int(ours[1:]) - 1].type == 'prismatic'
-            return length if prismatic else joint
+            return length if self._slides(ours) else joint
         return 1.0
+
+    def _slides(self, ours: str) -> bool:
+        """Return whether a column is of a prismatic joint."""
+        joints = () if self._chain is None else self._chain.joints
+        return any(each.type == 'prismatic' for each in joints[int(ours[1:]) - 1 :][:1])
 
 
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:

@@ -11,9 +11,11 @@ import codecs
 import re
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
@@ -24,7 +26,7 @@ from calib_ros.files.columns import (
     lines_in_words,
     of_rows,
 )
-from calib_ros.files.layouts import SEPARATORS, Layout
+from calib_ros.files.layouts import ANGLES, LENGTHS, SEPARATORS, Layout
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
@@ -32,6 +34,23 @@ HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 SHEETS = ('.xlsx', '.xlsm')
+SIGNS = {'°': 'deg', 'µm': 'um', 'μm': 'um'} | {unit: unit for unit in (*LENGTHS, *ANGLES)}
+"""Units by their signs."""
+_ANY = '|'.join(SIGNS)
+UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))')
+"""A name with its unit: X [mm], X (mm), X / mm."""
+
+
+def name_and_unit(cell: str) -> tuple[str, str]:
+    """Return the name of a column, and its unit if the header says it."""
+    match = UNIT.fullmatch(cell)
+    return (match[1], SIGNS[match[2] or match[3]]) if match else (cell, '')
+
+
+def places(header: Sequence[str], name: str) -> list[int]:
+    """Return the indices of the columns of a name; of those with a unit only if it has none."""
+    bare = header if name in header else [name_and_unit(cell)[0] for cell in header]
+    return [k for k, each in enumerate(bare) if each == name]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,55 +66,99 @@ class Sheet:
         """Return `#k` of a column by its name, None if unknown."""
         if name.startswith('#'):
             return name if 0 < int(name[1:]) <= len(self.header) else None
-        count = self.header.count(name)
-        if count > 1:
-            where = some([f'#{k}' for k, each in enumerate(self.header, 1) if each == name])
+        found = [f'#{k + 1}' for k in places(self.header, name)]
+        if len(found) > 1:
             raise InputError(
-                f'column "{name}" comes {count} times: name it by its number ({", ".join(where)})'
+                f'column "{name}" comes {len(found)} times: name it by its number '
+                f'({", ".join(some(found))})'
             )
-        return f'#{self.header.index(name) + 1}' if count else None
+        return found[0] if found else None
+
+
+@dataclass(frozen=True)
+class _Content:
+    rows: list[Row]  # of a text only the first
+    notes: list[str]
+    text: str = ''
+    separator: str = ''
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
-    """Read a table with a known layout.
+    """Read a table with a known layout; of a workbook the sheet named, or the first that fits.
 
     The header is the first line with all column `names`; if these are only numbers, the first with
     some of the `known` names.
     """
+    if path.suffix.lower() not in SHEETS:
+        return _sheet(path, _of_text(path, layout), layout, names, known)
+    faults: list[InputError] = []
+    found: list[Sheet] = []
+    for content in _of_workbook(path, layout.sheet):
+        try:
+            sheet = _sheet(path, content, layout, names, known)
+        except InputError as err:
+            faults.append(err)
+            continue
+        lower = [cell.lower() for cell in sheet.header]
+        if names or sum(bool(places(lower, name.lower())) for name in known) > 1:
+            return sheet
+        found.append(sheet)
+    if not found:
+        raise faults[0] if faults else InputError(f'{path} has no rows')
+    return found[0]
+
+
+def _of_text(path: Path, layout: Layout) -> _Content:
     notes: list[str] = []
-    text, separator = '', ''
-    if path.suffix.lower() in SHEETS:
-        rows = _workbook(path, layout.sheet, notes)
-    else:
-        text, coding = _text(path)
-        if coding:
-            notes.append(f'the text is read as {coding}')
-        if '\r' in text:
-            text = text.replace('\r\n', '\n').replace('\r', '\n')
-        if layout.comment:
-            text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
-        separator = layout.cut or _separator(path, text, notes)
-        if separator == ' ':
-            text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
-            text = re.sub(r'[ \t]+', ' ', text)
-        rows = _cells(path, text[: _after(text, HEAD_LINES)], separator)
-    decimal = layout.decimal or _decimal(rows, separator, notes)
+    text, coding = _text(path)
+    if coding:
+        notes.append(f'the text is read as {coding}')
+    if '\r' in text:
+        text = text.replace('\r\n', '\n').replace('\r', '\n')
+    if layout.comment:
+        text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
+    separator = layout.cut or _separator(path, text, notes)
+    if separator == ' ':
+        text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
+        text = re.sub(r'[ \t]+', ' ', text)
+    rows = _cells(path, text[: _after(text, HEAD_LINES)], separator)
+    return _Content(rows, notes, text, separator)
+
+
+def _sheet(
+    path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
+) -> Sheet:
+    rows, notes = content.rows, content.notes
+    decimal = layout.decimal or _decimal(rows, content.separator, notes)
     at, header = _header(path, rows, names, known)
-    used = [header.index(n) for n in names if not n.startswith('#') and n in header]
+    used = [k for name in names if not name.startswith('#') for k in places(header, name)]
     used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
     low = {name.lower() for name in known}
-    used += [k for k, cell in enumerate(header) if cell.lower() in low]
+    used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
     first = _first(path, rows, at, used, decimal, notes)
+    header = _with_units(header, [cells for _, cells in rows[max(at, 0) + 1 : first]])
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
     start = rows[first][0]
     body: Iterable[Sequence[Row]] = [rows[first:]]
-    if text:
-        body = _below(path, text, start, separator)
+    if content.text:
+        body = _below(path, content.text, start, content.separator)
     if decimal == ',':
         body = map(_with_points, body)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header, above, columns, tuple(notes))
+
+
+def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    """Return the names of columns with their units in the lines below."""
+    for cells in below:
+        units = [SIGNS.get(cell.strip('[]()')) for cell in cells]
+        pairs = zip_longest(header, units[: len(header)])
+        header = tuple(
+            f'{name} [{unit}]' if unit and name and not name_and_unit(name)[1] else name
+            for name, unit in pairs
+        )
+    return header
 
 
 def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[Row]]:
@@ -135,7 +198,8 @@ def _text(path: Path) -> tuple[str, str]:
     return data.decode('cp1252', errors='replace'), 'Windows-1252, because it is not UTF-8'
 
 
-def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
+def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
+    """Yield the sheets with rows: the one named, or the visible ones."""
     try:
         import openpyxl
     except ImportError as err:
@@ -148,28 +212,33 @@ def _workbook(path: Path, name: str, notes: list[str]) -> list[Row]:
             size = sum(each.file_size for each in packed.infolist())
         if size > LARGEST_SHEET:
             raise InputError(f'{path} is larger than {LARGEST_SHEET // 10**6} MB when unpacked')
-        book = openpyxl.load_workbook(path, read_only=True, data_only=True)
-        if name and name not in book.sheetnames:
-            raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(book.sheetnames)}')
-        seen = [each for each in book.worksheets if each.sheet_state == 'visible']
-        sheet = book[name] if name else seen[0]
-        if len(seen) > 1 and not name:
-            notes.append(f'sheet "{sheet.title}" is read, the first of {len(seen)} (--sheet)')
-        sheet.reset_dimensions()  # stated ones may be too small
-        rows: list[Row] = []
-        for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
-            if len(row) > MOST_ENTRIES:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
-            cells = [_cell(value) for value in row]
-            if any(cells):
-                rows.append((number, cells))
-        book.close()
+        with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
+            titles = book.sheetnames
+            if name and name not in titles:
+                raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(titles)}')
+            visible = [each for each in book.worksheets if each.sheet_state == 'visible']
+            for sheet in [book[name]] if name else visible:
+                notes = []
+                if len(visible) > 1 and not name:
+                    notes = [f'sheet "{sheet.title}" of {len(visible)} is read (--sheet)']
+                if rows := _rows(path, sheet):
+                    yield _Content(rows, notes)
     except InputError:
         raise
     except Exception as err:  # a broken workbook fails in many ways
         raise InputError(f'cannot read {path}: {" ".join(str(err).split())}') from err
-    if not rows:
-        raise InputError(f'{path} has no rows')
+
+
+def _rows(path: Path, sheet: Any) -> list[Row]:
+    """Return the rows of a sheet that are not empty, with their numbers."""
+    sheet.reset_dimensions()  # stated ones may be too small
+    rows: list[Row] = []
+    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
+        if len(row) > MOST_ENTRIES:
+            raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
+        cells = [_cell(value) for value in row]
+        if any(cells):
+            rows.append((number, cells))
     return rows
 
 
@@ -234,10 +303,10 @@ def _header(
     likely = words.index(max(words))  # title and data have fewer
     best: tuple[int, set[str]] = (likely, wanted)
     for k, (_, cells) in enumerate(rows[:HEAD_LINES]):
-        missing = wanted - set(cells)
+        missing = {name for name in wanted if not places(cells, name)}
         if wanted and not missing:
             return k, tuple(cells)
-        if not wanted and len(low & {cell.lower() for cell in cells}) > 1:
+        if not wanted and len(low & {name_and_unit(cell)[0].lower() for cell in cells}) > 1:
             return k, tuple(cells)
         if len(missing) < len(best[1]):
             best = (k, missing)
@@ -260,7 +329,10 @@ def _first(
                 left = lines_in_words([line for line, _ in rows[at + 1 : k]])
                 notes.append(f'there are no numbers in {left}: left out')
             return k
-    raise InputError('; '.join([f'{path} has no rows of numbers in the columns named', *notes]))
+    none = [f'{path} has no rows of numbers in the columns named']
+    for line, cells in rows[at + 1 : at + 2]:
+        none += [f'line {line} has "{cells[i]}"' for i in used[:1] if i < len(cells)]
+    raise InputError('; '.join([*none, *notes]))
 
 
 def _is_number(cell: str, decimal: str) -> bool:

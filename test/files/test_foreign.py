@@ -270,6 +270,8 @@ def test_joint_values_that_stand_a_row_below(read):
     ('text', 'layout', 'said'),
     [
         ('q1;q2;x;y;z\n1;2;3;4;five\n', {}, 'line 2: .* must be a finite number, not .five'),
+        ('q1;q2;x;y;z\n1;2;3;4;1.234,5\n', {}, 'without the marks between thousands'),
+        ('q1,q2,x,y,z\n1°,2°,3 m,4 m,5 m\n', {}, 'no rows of numbers .*; line 2 has "1°"'),
         ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
         ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),
@@ -340,7 +342,22 @@ def test_workbooks(tmp_path, monkeypatch):
     found = read_table(path, 2, foreign=Foreign(Layout()))
     assert_same(found, None)
     assert 'there are no numbers in line 3: left out' in str(found.warnings)
-    assert 'sheet "measured" is read, the first of 2 (--sheet)' in str(found.warnings)
+    assert 'sheet "measured" of 2 is read (--sheet)' in str(found.warnings)
+    book['first'].sheet_state = 'visible'
+    book['first'].append(['a protocol', 1])
+    points, log = book.create_sheet('points'), book.create_sheet('log')
+    for row in (['X [mm]', 'Y (mm)', 'Z / mm'], *(1e3 * PLACES).tolist()):
+        points.append(row)
+    for row in (['J1', 'J2'], ['deg', '°'], *np.rad2deg(JOINTS).tolist()):
+        log.append(row)
+    book.save(path)
+    assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
+    of_joints = Layout(columns={'q1': 'J1', 'q2': 'J2'})
+    apart = Foreign(Layout(sheet='points'), None, path, of_joints)
+    assert_same(read_table(path, 2, foreign=apart), None)
+    del book['points'], book['log']
+    book['first'].sheet_state = 'hidden'
+    book.save(path)
     smaller = zipfile.ZipFile(tmp_path / 'smaller.xlsx', 'w')
     with zipfile.ZipFile(path) as whole, smaller:
         for name in whole.namelist():

@@ -80,7 +80,7 @@ def test_what_is_no_expression(text):
         (['A1_rad', 'A2_rad', 'x', 'y', 'z'], 'Columns of other names: --columns "q*=A*_rad"'),
         (
             ['Joint 1 [rad]', 'Joint 2 [rad]', 'X [m]', 'y', 'z'],
-            '--columns "q*={Joint * [rad]},x={X [m]}"',
+            'Columns of other names: --columns "q*={Joint *}"',
         ),
         (
             ['x', 'y', 'z', 'a', 'b'],
@@ -90,10 +90,7 @@ def test_what_is_no_expression(text):
             ['q1', 'c11', 'c12', 'y', 'z'],
             'Is it another arm (--chain)? Columns of other names: --columns "q2=NAME"',
         ),
-        (
-            ['J1 [°]', 'J2 [°]', 'x [mm]', 'y [mm]', 'z [mm]'],
-            '--columns "q*={J* [°]},x={x [mm]},y={y [mm]},z={z [mm]}" --length mm --angle deg',
-        ),
+        (['J1 [°]', 'J2 [°]', 'x [mm]', 'y (mm)', 'z / mm'], 'other names: --columns "q*=J*"'),
         (['q0', 'q1', 'x', 'y', 'z'], '--columns "q1=q0,q2=q1"'),
         (['j_0', 'j_1', 'x', 'y', 'z'], '--columns "q1=j_0,q2=j_1"'),
         (
@@ -112,6 +109,15 @@ def test_columns_of_other_names_are_proposed_as_they_can_be_given(tmp_path, name
     assert str(told.value).endswith(proposed)
 
 
+def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text('rail [mm],turn [°],X [mm],Y [mm],Z [mm]\n1500,90,1,2,3\n')
+    chain = Chain('arm', 'standard', (Joint('rail', type='prismatic'), Joint('turn', a=0.3)))
+    (found,) = loading.table(path, chain, Settings()).fitted
+    np.testing.assert_allclose(found.joints, [[1.5, np.pi / 2]])
+    np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
+
+
 def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_header(tmp_path):
     """Of a tracker and a controller: other orders, a pose not measured, decimal commas."""
     log = 'Robot 7\n24.11.2026;noon\nPoint;Date;J1 [°];J2 [°]\n'
@@ -123,15 +129,19 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
     unnamed = Foreign(
         Layout(), Chain('arm', 'standard', (Joint('a'), Joint('b'))), tmp_path / 'log.csv'
     )
-    with pytest.raises(InputError, match=r'"q\*=\{J\* \[°\]\}"'):
+    with pytest.raises(InputError, match=r'"q\*=J\*"'):
         unnamed.convert(tmp_path / 'points.csv')
-    columns = {'q1': '{J1 [°]}', 'q2': '{J2 [°]}', 'x': '{X [mm]}', 'y': '{Y [mm]}'}
-    layout = Layout(columns={**columns, 'z': '{Z [mm]}'})
+    layout = Layout(columns={'q1': '{J1 [°]}', 'q2': 'J2'})
     given = Foreign(layout, None, tmp_path / 'log.csv', layout)
     (found,) = (table := read_table(tmp_path / 'points.csv', 2, foreign=given)).fitted
     np.testing.assert_allclose(np.rad2deg(found.joints), [[40, 4.5], [10, 1.5], [30, 3.5]])
     np.testing.assert_allclose(found.positions[:, 0], [0.4005, 0.1005, 0.3005])
-    assert 'by the column "Point"' in ' '.join(table.warnings)
+    assert 'matched by the column "Point"' in ' '.join(table.warnings)
+    separators = [each for each in table.warnings if 'semicolons' in each]
+    assert [each.rpartition('/')[2].partition(':')[0] for each in separators] == [
+        'points.csv',
+        'log.csv',
+    ]
     assert 'no units' not in ' '.join(table.warnings)
     (tmp_path / 'log.csv').write_text(log.replace('P4', 'P3'))
     with pytest.raises(InputError, match=r'has 4 rows, .* has 3: give both a column of the same'):
