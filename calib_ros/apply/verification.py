@@ -221,8 +221,8 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     count = len(moments)
     if count - lost < least:
         raise InputError(
-            f'{count} poses were measured; at least {least + lost} are needed'
-            + f', {lost} of them for the refitted frames' * (lost > 0)
+            f'{count} {"pose was" if count == 1 else "poses were"} measured; at least '
+            f'{least + lost} are needed' + f', {lost} of them for the refitted frames' * (lost > 0)
         )
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
 

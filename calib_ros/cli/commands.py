@@ -210,6 +210,7 @@ intends
 how to judge
   --tolerance MM  wanted RMS position error; without it: does the calibration still hold?
   --confidence SHARE=0.95  confidence of the interval of the RMS error
+  --json  print the verdict and its figures as JSON
   --out FOLDER  folder for the report and the residuals
   --force  {FORCE}
   --history DIR  {HISTORY}

@@ -53,6 +53,8 @@ RESULT_FILES = (
     *('before_after.png', 'settings.yaml'),
 )
 OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
+OF_UPDATES = ('new_base', 'new_tool')
+NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
@@ -60,7 +62,12 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         raise InputError(f'--tolerance must be positive, not {options.tolerance}')
     if not 0.0 <= options.largest_loss <= 1.0:
         raise InputError(f'--largest-loss must be from 0 to 1, not {options.largest_loss}')
-    if options.previous is not None:
+    update = options.previous is not None
+    for name in NOT_OF_UPDATES if update else OF_UPDATES:
+        if (value := getattr(options, name)) and value != getattr(Settings, name, None):
+            does = 'does not apply to' if update else 'needs'
+            raise InputError(f'--{name.replace("_", "-")} {does} --previous')
+    if update:
         return _recalibrated(options, screen)
     filed = given.history_of(options)
     with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:

@@ -216,11 +216,12 @@ def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) ->
     """
     found = [] if step is None or step.harmful else [str(step)]
     units = {joint.name: joint.driven.unit for joint in problem.chain.joints}
-    steps = [f'{name} ({1e3 * size:.3g} m{units[name]})' for name, size in coarse.items()]
+    steps: dict[str, list[str]] = {}
+    for name, size in coarse.items():
+        steps.setdefault(f'{1e3 * size:.3g} m{units[name]}', []).append(name)
     if steps:
-        found.append(
-            f'joint values are multiples of a step: {", ".join(steps)}; record more digits'
-        )
+        each = [f'{step} ({", ".join(names)})' for step, names in steps.items()]
+        found.append(f'joint values are multiples of {", ".join(each)}: record more digits')
     listed, chain = problem.chain.parallel or (), problem.chain
     ours = replace(chain, parallel=None).parallel or ()
     for names, others, does, are in ((ours, listed, 'omits', ''), (listed, ours, 'has', 'not ')):

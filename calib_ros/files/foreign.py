@@ -37,7 +37,7 @@ from calib_ros.files.layouts import (
     finished,
     joint_columns,
 )
-from calib_ros.files.sheets import Sheet, name_and_unit, places, read_sheet
+from calib_ros.files.sheets import Sheet, name_and_unit, only, places, read_sheet
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.texts import csv_text
@@ -149,9 +149,11 @@ class _Table:
         lower = [name.lower() for name in self._sheet.header]
         for name, ours in own.items():
             found = places(lower, name.lower())
-            if ours in kept or ours in self._ours or len(found) != 1:
+            if ours in kept or ours in self._ours or not found:
                 continue
-            column = found[0]
+            if len(found) > 1 and ours not in (*WORDS, *QUATERNION):
+                continue
+            column = only(found, name)
             if ours in WORDS:
                 self._ours[ours] = f'#{column + 1}'
                 continue

@@ -53,6 +53,16 @@ def places(header: Sequence[str], name: str) -> list[int]:
     return [k for k, each in enumerate(bare) if each == name]
 
 
+def only(found: Sequence[int], name: str) -> int:
+    """Return the index of a column; refuse several."""
+    if len(found) > 1:
+        where = ', '.join(some([f'#{k + 1}' for k in found]))
+        raise InputError(
+            f'column "{name}" comes {len(found)} times: name it by its number ({where})'
+        )
+    return found[0]
+
+
 @dataclass(frozen=True, eq=False)
 class Sheet:
     """The rows of a table in columns `#1`, `#2` ..., their names, and the cells `above`."""
@@ -66,13 +76,8 @@ class Sheet:
         """Return `#k` of a column by its name, None if unknown."""
         if name.startswith('#'):
             return name if 0 < int(name[1:]) <= len(self.header) else None
-        found = [f'#{k + 1}' for k in places(self.header, name)]
-        if len(found) > 1:
-            raise InputError(
-                f'column "{name}" comes {len(found)} times: name it by its number '
-                f'({", ".join(some(found))})'
-            )
-        return found[0] if found else None
+        found = places(self.header, name)
+        return f'#{only(found, name) + 1}' if found else None
 
 
 @dataclass(frozen=True)

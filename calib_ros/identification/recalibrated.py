@@ -95,7 +95,7 @@ class Recalibration(Shown):
         if self.reused:
             why, _, step = reused_in_words(self.reused).rpartition(': ')
             return why, f'{step}, and give only those'
-        if self.scale is not None:
+        if self.scale is not None and self.unexplained > changes.FALSE:
             return (
                 f'the scale of the measuring device changed, by {self.scale.size_in_words()}',
                 'check it with a known length, and the temperature and pressure set in it',

@@ -287,8 +287,28 @@ def test_what_each_device_measures_again_is_judged_in_its_own_frame(of_two, run,
     judged = ['new.csv', '--chain', 'ur5e']
     status, out, _ = run('verify', *judged, '--calibration', of_two, '--tolerance', '0.3')
     assert (status, out[:6]) == (0, 'PASS: ')
+    of_arm = '--calibration', of_two, '--tolerance', '0.3', '--json', '--out', 'verified'
+    status, out, _ = run('verify', *judged, *of_arm)
+    found = json.loads(out)
+    assert (status, found['verdict'], found['limit_mm'], found['poses']) == (0, 'PASS', 0.3, 10)
+    assert (
+        found['lower_mm'] < found['rms_mm'] < found['upper_mm'] < 0.3 < found['before']['rms_mm']
+    )
     status, out, _ = run('identify', *judged, '--previous', of_two)
     assert (status, out[:8]) == (0, 'accepted')
+
+
+@pytest.mark.parametrize(
+    ('given', 'said'),
+    [
+        (['--new-base'], '--new-base needs --previous'),
+        (['--history', 'h', '--previous', 'r'], '--history does not apply to --previous'),
+        (['--model', 'auto', '--previous', 'r'], '--model does not apply to --previous'),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(run, given, said):
+    status, _, err = run('identify', 'new.csv', '--chain', 'ur5e', *given)
+    assert (status, said in err) == (1, True)
 
 
 def test_a_device_that_a_calibration_does_not_know_has_no_frame_of_another(of_two, run, tmp_path):

@@ -121,7 +121,7 @@ def test_rounded_joint_values_are_no_gain(design):
             seen = measure(true, q, rng, *NOISE, oriented=bool(seed % 2))
             seen = replace(seen, joints=np.round(q, 3))
             result = identify(Problem(UR10E, seen, **SIGMAS))
-            assert 'shoulder_pan_joint (1 mrad)' in result.remarks[0]
+            assert 'multiples of 1 mrad (shoulder_pan_joint, ' in result.remarks[0]
             healthy += result.accepted and not errors
             found += result.accepted and bool(errors)
     assert healthy == 0

@@ -275,6 +275,7 @@ def test_joint_values_that_stand_a_row_below(read):
         ('q1,q2,x,y,z\n1,2,3,4,5\n1,,3,4,5\n', {}, 'line 3: q'),
         ('a,b,x,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'c', 'q2': 'b'}}, 'no column c'),
         ('a,b,a,y,z\n1,2,3,4,5\n', {'columns': {'q1': 'a'}}, 'comes 2 times: name it by its'),
+        ('q1,q2,x,y,z,split,split\n1,2,3,4,5,,test\n', {}, 'split" comes 2 times'),
         (PLAIN, {'columns': {'x': '#9'}}, 'has no column #9 for x'),
         (DEGREES.replace('90', '1'), {}, 'say which, --euler'),
         ('q1,q2,x,y,z,qx,qy,qz,qw\n1,2,3,4,5,0,0,0,2\n', {}, 'line 2: quaternion'),
