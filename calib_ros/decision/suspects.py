@@ -72,7 +72,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     Poses `of_images` are those of a board in a camera; joint values come from a table of places.
     """
     if of_images:
-        yield from _measured(_of_boards(sets[0].inverse))
+        yield from _measured(_of_boards(chain, sets[0]))
         for each in _of_places(chain):
             remedy = each.published if 'chain' in each.published else 'correct it in --places'
             yield replace(each, remedy=remedy)
@@ -111,22 +111,41 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
         yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
 
 
-def _of_boards(inverse: bool) -> Iterator[Suspect]:
+def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     """Yield mistakes of a camera and its board."""
     what, remedy = 'the camera is on the flange', '--eye-in-hand (or eye_in_hand)'
-    if inverse:
+    if seen.inverse:
         what, remedy = NOT_ON_FLANGE
-    yield Suspect(what, remedy, (Observations.inverted,), published=_in_sources(not inverse))
-    for unit, size in SCALES.items():
-        remedy = 'give square and marker in metres'
-        what = f'the lengths of the board are in {unit}, not metres'
-        yield Suspect(what, remedy, (_scaled(size),), published=remedy)
+    yield Suspect(what, remedy, (Observations.inverted,), published=_in_sources(not seen.inverse))
+    size = _size_of(chain, seen)
+    remedy = 'measure the print, and give square and marker in metres'
+    what = f'the board is stated {float(f"{1.0 / size:.3g}"):g} times as large as it is'
+    yield Suspect(what, remedy, (_scaled(size),), published=remedy)
     remedy = 'give images and corners as the camera sees them, u to the right and v down'
     yield Suspect('the images are mirrored', remedy, (_mirrored,), published=remedy)
 
 
 def _in_sources(on_flange: bool) -> str:
     return f'set eye_in_hand={str(on_flange).lower()} in sources'
+
+
+def _size_of(chain: Chain, seen: Observations) -> float:
+    """Return the factor by which the measured lengths become those of the arm, 1 if unknown.
+
+    Base and tool change neither the angle of a move nor its shift along the axis of the turn.
+    """
+    along = []
+    for rotations, places in (
+        np.split(replace(chain, base=None, tool=None).forward(seen.joints)[:, :3], [3], axis=2),
+        (seen.rotations, seen.positions[:, :, np.newaxis]),
+    ):
+        turns = se3.log_rotation(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2))
+        shifts = places[1:] - rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2) @ places[:-1]
+        along.append(np.einsum('nk,nk->n', turns, shifts[:, :, 0]))
+    far = np.abs(along[1]) >= np.median(np.abs(along[1]))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        size = float(np.median(along[0][far] / along[1][far]))
+    return size if 0.0 < size < np.inf else 1.0
 
 
 def _units(chain: Chain) -> Iterator[Suspect]:

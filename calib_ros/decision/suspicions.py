@@ -84,6 +84,10 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
     refusals = list(result.refusals)
     refusals += [] if scale is None else [scale]
+    printed = all(each.pixels is not None for each in problem.sets) and not problem.sigma_scale
+    if board and printed:
+        refusals.insert(0, Reason(Rule.SCALE, board))
+        board = ''
     imitated = imitated or bool(lens and refusals)
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))

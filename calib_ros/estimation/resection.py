@@ -64,9 +64,8 @@ def _require_fit(observations: Observations, rms: FloatArray) -> None:
     beside = ~(rms < NEARER * spread)
     if 2 * beside.sum() > len(rms):
         raise InputError(
-            f'the corners do not fit the board in {beside.sum()} of {len(rms)} images '
-            f'(typically {np.median(rms[beside]):.3g} px beside it): check the columns and rows '
-            'of the board, the numbers of its corners, and the lens'
+            f'the corners do not fit the board in {beside.sum()} of {len(rms)} images: check the '
+            'columns and rows of the board, the numbers of its corners, and the lens'
         )
 
 

@@ -356,7 +356,7 @@ def test_a_fit_that_runs_away_ends_in_words(monkeypatch):
     _, seen = scene(2, True)
     for given, words in (
         (seen, 'no stable solution: check the arm'),
-        (replace(seen, points=1e3 * seen.points), 'at all: the lengths of the board are in mm'),
+        (replace(seen, points=1e3 * seen.points), 'at all: the board is stated 1000 times'),
     ):
         with pytest.raises(InputError, match=words):
             identify(Problem(known(True), given, sigma_pixel=SIGMA))
