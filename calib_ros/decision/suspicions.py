@@ -26,6 +26,7 @@ the poses add nothing to the priors.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -45,11 +46,9 @@ from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.samples import seen_residuals
-from calib_ros.estimation.sizes import SPREAD, TYPICAL
+from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
-from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
@@ -77,13 +76,9 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     """
     if any(each.socket or each.plane for each in problem.sets):
         return result  # one place shows none of these
-    sister = _sister(problem, result) if another else ''
-    scale = None if sister else _scale(result)
     lens, imitated = _lens(problem, result) if another else ('', False)
     board = '' if lens else _board(problem, result)
-    gravity, sigmas = _gravity(problem, result), _sigmas(problem, result)
-    refusals = list(result.refusals)
-    refusals += [] if scale is None else [scale]
+    sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(result)]
     printed = all(each.pixels is not None for each in problem.sets) and not problem.sigma_scale
     if board and printed:
         refusals.insert(0, Reason(Rule.SCALE, board))
@@ -97,35 +92,16 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
         sigmas = ''
     coupled, motion = COUPLED if result.coupled else '', _motion(problem, result)
-    found = (sister, lens, board, gravity, coupled, motion, _order(problem), sigmas)
+    found = (lens, board, coupled, motion, _order(problem), sigmas)
     remarks = (*result.remarks, *(each for each in found if each))
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
 
-def _scale(result: Identification) -> Reason | None:
-    """Return that harm by a device out of scale is too likely, if nothing else refuses."""
+def _scale(result: Identification) -> Iterator[Reason]:
+    """Yield that harm by a device out of scale is too likely, if nothing else refuses."""
     rival, region = result.posterior.rival, result.region
-    if result.refusals or rival is None or region is None or region.by_scale < HARMFUL:
-        return None
-    return Reason(Rule.SCALE, out_of_scale(rival[1]))
-
-
-def _sister(problem: Problem, result: Identification) -> str:
-    far = SPREAD * TYPICAL['length'], SPREAD * TYPICAL['angle']
-    if not any(each.beyond(*far) for each in result.parameters):
-        return ''
-    types = [joint.type for joint in problem.chain.joints]
-    joints = problem.sets[0].spread().joints
-    nominal = _apart(problem.chain, result.chain, joints)
-    alike = [each for each in shipped_chains() if [j.type for j in each.joints] == types]
-    found = [(_apart(each, result.chain, joints), each.name) for each in alike]
-    distance, name = min(found, default=(np.inf, ''))
-    if distance > NEARER * nominal:
-        return ''
-    return (
-        f'the identified arm is closer to the supplied {name} ({1e3 * distance:.2f} mm) than to '
-        f'the nominal {problem.chain.name} ({1e3 * nominal:.2f} mm): is it the right chain file?'
-    )
+    if not result.refusals and rival and region and region.by_scale >= HARMFUL:
+        yield Reason(Rule.SCALE, out_of_scale(rival[1]))
 
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
@@ -136,27 +112,6 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
     names = [*parameters_of('base'), *parameters_of('tool')]
     return fit_to_arm(start, names, found, joints, iterations=12)[1]
-
-
-def _gravity(problem: Problem, result: Identification) -> str:
-    bent = [n for n, _ in result.chain.effects if effects.group_of(n) in ('gravity', 'compliance')]
-    if not bent:
-        return ''
-    rest = [name for name in result.names if name not in bent]
-    straight = result.chain.with_offsets({n: -result.chain.value(n) for n in bent})
-    given = explained(problem, straight, rest, bent)
-    best, words = 0.0, ''
-    for axis, along in zip('xyz', np.linalg.norm(problem.chain.gravity) * np.eye(3), strict=True):
-        x, y, z = along.tolist()  # coefficients have the sign
-        share = explained(problem, replace(straight, gravity=(x, y, z)), rest, bent)
-        best, words = max((best, words), (share, axis))
-    if not best - given > EXPLAINED * (1.0 - given):
-        return ''
-    return (
-        f'gravity along {words} of the base explains {100.0 * best:.0f} % of the residuals, '
-        f'along the direction given {100.0 * given:.0f} %: is the arm mounted on a wall? Set '
-        'gravity in the chain file'
-    )
 
 
 def _motion(problem: Problem, result: Identification) -> str:
