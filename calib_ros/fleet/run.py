@@ -246,33 +246,15 @@ def _version() -> str:
 def _done(
     client: Any, tasks: Sequence[Task], work: Callable[[Task], Outcome] = work
 ) -> Iterator[tuple[Task, Outcome]]:
-    """Yield tasks with their outcomes, as completed.
-
-    Up to four make a piece: large compared with dask's overhead of 4 ms, small to lose.
-    """
+    """Yield tasks with their outcomes, as completed."""
     from distributed import as_completed
 
-    size = max(1, min(4, len(tasks) // (4 * max(1, len(client.nthreads())))))
-    running: dict[str, Sequence[Task]] = {}
-
-    def submitted(pieces: Sequence[Sequence[Task]]) -> list[Any]:
-        futures = client.map(_all, pieces, [work] * len(pieces), pure=False)
-        running.update(zip((future.key for future in futures), pieces, strict=True))
-        return list(futures)
-
-    futures = submitted([tasks[k : k + size] for k in range(0, len(tasks), size)])
+    futures = client.map(work, tasks, pure=False)
+    of = dict(zip((future.key for future in futures), tasks, strict=True))
     completed = as_completed(futures, client.loop, with_results=True, raise_errors=False)
-    for future, outcomes in completed:
+    for future, outcome in completed:
         if future.status in ('cancelled', 'lost'):
             raise LostError('the scheduler is lost: results so far are saved; run again')
-        done = running.pop(future.key)
-        if future.status == 'error' and len(done) > 1:  # find the one that kills a worker
-            completed.update(submitted([(task,) for task in done]))
-            continue
         if future.status == 'error':
-            outcomes = (Outcome(error=f'its worker ended: {shortened(str(future.exception()))}'),)
-        yield from zip(done, outcomes, strict=True)
-
-
-def _all(tasks: Sequence[Task], work: Callable[[Task], Outcome]) -> tuple[Outcome, ...]:
-    return tuple(work(task) for task in tasks)
+            outcome = Outcome(error=f'its worker ended: {shortened(str(future.exception()))}')
+        yield of[future.key], outcome

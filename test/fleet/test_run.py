@@ -280,7 +280,7 @@ def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch
         run(plant, History(tmp_path / 'history'), Cluster())
 
 
-def test_small_tasks_go_together_and_the_one_that_ends_a_worker_is_found(plant, cluster):
+def test_the_task_that_ends_a_worker_is_found(plant, cluster):
     tasks = [Task(plant[0], Source(str(number))) for number in range(200)]
     with running._client(cluster) as client:
         done = {task.source.url: found for task, found in running._done(client, tasks, echoed)}
