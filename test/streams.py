@@ -9,7 +9,8 @@ import numpy as np
 from calib_ros.kinematics import se3
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.intake import Stream, feed
-from calib_ros.sampling.messages import JOINT_STATE, Readings, Source
+from calib_ros.sampling.messages import JOINT_STATE, Readings
+from calib_ros.sampling.sources import Source
 
 MS = 1_000_000
 S = 1_000_000_000

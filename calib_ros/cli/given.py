@@ -20,7 +20,15 @@ from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.rows import Filing, content_hash, measured_at, samples_hash, settings_hash
+from calib_ros.files.rows import (
+    Filing,
+    content_hash,
+    files_of,
+    inputs_of,
+    measured_at,
+    samples_hash,
+    settings_hash,
+)
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
@@ -40,7 +48,7 @@ class Unread(NamedTuple):
     @classmethod
     def of(cls, *paths: Path) -> Unread:
         """Return the files at some paths as they are now."""
-        each = [page.files_of(path) for path in paths]
+        each = [files_of(path) for path in paths]
         found = ((str(file), file.stat()) for files in each if all(each) for file in files)
         return cls(paths, tuple((name, now.st_size, now.st_mtime_ns) for name, now in found))
 
@@ -96,7 +104,7 @@ def filing_of(
     settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.paths[0]
     read, changed = [samples_hash(sets)], None
     if unread.files and unread == Unread.of(*unread.paths):
-        read = [each.sha256 for each in page.inputs_of(*unread.paths)]
+        read = [each.sha256 for each in inputs_of(*unread.paths)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     for name in (*OF_TABLES[1:], 'joints_preset'):  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result
@@ -112,7 +120,7 @@ def origin_of(
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
     people = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
-    return page.Origin(page.inputs_of(*known), settings=settings, command=options.typed, **people)
+    return page.Origin(inputs_of(*known), settings=settings, command=options.typed, **people)
 
 
 def page_of(

@@ -20,7 +20,7 @@ from calib_ros.sampling.hints import ALLOW, Account, allowing, too_much_lost
 from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.topics import Reading, Recorded, check_joints, choose
+from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
@@ -160,7 +160,7 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
 def _chosen(
     session: CalibrationSession,
     available: Mapping[str, str],
-    messages_on: Reading,
+    messages_on: MessagesOn,
     definitions: Mapping[str, MessageDefinition],
 ) -> tuple[dict[str, Stream], Recorded]:
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
@@ -246,7 +246,7 @@ def _is_message(stream: Stream, data: object) -> bool:
     return isinstance(data, bytes) and len(data) <= stored.largest(stream)
 
 
-def _decodable(messages_on: Reading) -> Reading:
+def _decodable(messages_on: MessagesOn) -> MessagesOn:
     """Omit what cannot be a message; `_feed` reports it."""
     return lambda streams: (each for each in messages_on(streams) if _is_message(*each))
 

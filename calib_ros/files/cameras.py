@@ -19,9 +19,9 @@ from calib_ros.files.boards import lens_of, read_board
 from calib_ros.files.detector import Detector, Image, opencv
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.messages import Source, parse_sources
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.sample import View
+from calib_ros.sampling.sources import Source, parse_sources
 
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm')
 ENCODINGS = {'mono8': (1, ''), '8UC1': (1, ''), 'rgb8': (3, 'RGB'), 'bgr8': (3, 'BGR')}

@@ -9,6 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime, timezone
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -114,6 +115,34 @@ def digest(content: object) -> str:
 def settings_hash(nominal: Chain, settings: Settings, *more: object) -> str:
     """Return the hash of what a result depends on besides the measurements."""
     return digest([chain_document(nominal), asdict(settings), *more])
+
+
+@dataclass(frozen=True)
+class Input:
+    """An input file."""
+
+    name: str
+    size: int
+    sha256: str
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return a file, or those of a folder; none for a pipe, which cannot be read twice."""
+    return sorted(each for each in (path, *path.rglob('*')) if each.is_file())
+
+
+def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
+    """Return all files at some paths, or in folders such as bags, with size and hash."""
+    found = []
+    for path in filter(None, paths):
+        for each in files_of(path):
+            digest = hashlib.sha256()
+            with each.open('rb') as file:
+                while block := file.read(1 << 20):
+                    digest.update(block)
+            name, size = str(each.relative_to(path.parent)), each.stat().st_size
+            found.append(Input(name, size, digest.hexdigest()))
+    return tuple(found)
 
 
 def content_hash(files: Sequence[str], session: str = '') -> str:

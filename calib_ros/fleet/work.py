@@ -16,11 +16,19 @@ from typing import Any, NamedTuple
 from calib_ros.errors import CalibrationError, ConfigError, shortened
 from calib_ros.files.history import is_local
 from calib_ros.files.loading import TABLES, of_bag, of_table, replayed, table
-from calib_ros.files.rows import Filing, Row, content_hash, digest, identified, measured_at
+from calib_ros.files.rows import (
+    Filing,
+    Row,
+    content_hash,
+    digest,
+    identified,
+    inputs_of,
+    measured_at,
+)
 from calib_ros.files.stored import RECORDED
 from calib_ros.fleet.plant import Robot
 from calib_ros.report.documents import configuration_yaml
-from calib_ros.report.page import Origin, inputs_of, render
+from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
 

@@ -8,17 +8,16 @@ None. All foreign text is escaped.
 
 from __future__ import annotations
 
-import hashlib
 import html
 import logging
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import resources
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import calib_ros
+from calib_ros.files.rows import Input
 from calib_ros.report.advice import Advice
 from calib_ros.texts import in_markdown, one_line
 
@@ -76,15 +75,6 @@ class Section:
 def section(name: str, title: str, *text: str, **more: Any) -> Section:
     """Return a section with the paragraphs that are not empty."""
     return Section(name, title, tuple(filter(None, text)), **more)
-
-
-@dataclass(frozen=True)
-class Input:
-    """An input file."""
-
-    name: str
-    size: int
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -256,22 +246,3 @@ def _row(cells: Iterable[str]) -> str:
 
 def _is_number(cell: str) -> bool:
     return cell.lstrip('+-').replace('.', '', 1).isdecimal()
-
-
-def files_of(path: Path) -> list[Path]:
-    """Return a file, or those of a folder; none for a pipe, which cannot be read twice."""
-    return sorted(each for each in (path, *path.rglob('*')) if each.is_file())
-
-
-def inputs_of(*paths: Path | None) -> tuple[Input, ...]:
-    """Return all files at some paths, or in folders such as bags, with size and hash."""
-    found = []
-    for path in filter(None, paths):
-        for each in files_of(path):
-            digest = hashlib.sha256()
-            with each.open('rb') as file:
-                while block := file.read(1 << 20):
-                    digest.update(block)
-            name, size = str(each.relative_to(path.parent)), each.stat().st_size
-            found.append(Input(name, size, digest.hexdigest()))
-    return tuple(found)

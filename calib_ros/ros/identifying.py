@@ -34,6 +34,7 @@ from calib_ros.files.rows import (
     Filing,
     Row,
     identified,
+    inputs_of,
     judged,
     measured_at,
     samples_hash,
@@ -262,7 +263,7 @@ def _without_middle(before: str, advice: str, longest: int) -> str:
 
 
 def _page(given: Snapshot, result: Identification) -> str | None:
-    from calib_ros.report.page import Origin, inputs_of, render
+    from calib_ros.report.page import Origin, render
     from calib_ros.report.poses import poses_of
     from calib_ros.report.reports import identification_report
 

@@ -46,9 +46,10 @@ from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_un
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.gathered import check_settings
 from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE, STANDARD, parse_sources
+from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sample import Sample, socket_place
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import STANDARD, parse_sources
 
 DIAGNOSTICS_PERIOD = 1.0  # time [s] between two reports on /diagnostics, the usual one
 TAKING_PERIOD = DIAGNOSTICS_PERIOD / 10.0

@@ -28,9 +28,9 @@ from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.ros import to_ros
 from calib_ros.ros.parameters import Given
 from calib_ros.ros.to_ros import LATCHED
-from calib_ros.sampling.messages import parse_sources
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import parse_sources
 
 
 class Broadcast:

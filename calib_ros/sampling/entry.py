@@ -11,8 +11,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.messages import NO_STAMP, Readings, Source
+from calib_ros.sampling.messages import NO_STAMP, Readings
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
+from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
 from calib_ros.values import LARGEST, MOST_NAMES
 

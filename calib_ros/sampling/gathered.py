@@ -18,8 +18,8 @@ from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.messages import parse_sources
 from calib_ros.sampling.sample import Frames, Sample, named, socket_pairs
+from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 

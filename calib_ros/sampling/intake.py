@@ -29,7 +29,6 @@ from calib_ros.sampling.messages import (
     TRANSFORMS,
     MessageError,
     Readings,
-    Source,
     frame_name,
     head_of,
     reading,
@@ -39,6 +38,7 @@ from calib_ros.sampling.messages import (
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
+from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Linked, Links
 from calib_ros.texts import LARGEST_TABLE
 
@@ -48,7 +48,9 @@ Deserialise: TypeAlias = Callable[[Any, str], Any]  # converts bytes and a type 
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and their messages, serialised or not, in order of arrival."""
 Row: TypeAlias = tuple[int, int, FloatArray]  # place, stamp [ns] and numbers of one message
-Found: TypeAlias = 'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
+Decoded: TypeAlias = (
+    'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
+)
 """Messages with the same names: places (N,), names, first and last stamp, reader."""
 
 
@@ -167,7 +169,7 @@ class Intake:
             for each in measured:
                 self._add(each.source, TRANSFORM, each.places, each.readings)
 
-    def _read(self, groups: Mapping[tuple[str, int], Sequence[int]]) -> Iterator[Found]:
+    def _read(self, groups: Mapping[tuple[str, int], Sequence[int]]) -> Iterator[Decoded]:
         single: list[int] = []
         for (_, size), group in groups.items():
             stream, places = self._batch[group[0]][0], np.array(group)
@@ -209,7 +211,7 @@ class Intake:
         found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
         self._add(source, stream.type, np.array([place]), found)
 
-    def _decode(self, places: Sequence[int]) -> Iterator[Found]:
+    def _decode(self, places: Sequence[int]) -> Iterator[Decoded]:
         alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
         for place in places:
             stream, data = self._batch[place]

@@ -1,26 +1,24 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""ROS messages to numbers, and their sources.
+"""ROS messages to numbers.
 
 Messages are read by their attributes only, so those of rclpy and rosbags are alike. Unusable ones
-are counted by cause. A source tells what a topic measures, and between which frames.
+are counted by cause.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
-import shlex
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.errors import InputError
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.values import LARGEST, ROUNDED, covariance_faults
 
@@ -178,138 +176,6 @@ def frame_name(name: str) -> str:
     return name.removeprefix('/')
 
 
-VALIDATION = 'validation_'
-"""Prefix of topics whose measurements judge the result and are never fitted."""
-MARKERS = {
-    'status': 'std_msgs/msg/String',
-    'calibration': 'std_msgs/msg/String',
-    'dh_parameters': 'std_msgs/msg/Float64MultiArray',
-}
-"""Topics that together identify a calibration node."""
-DISTANCE = 'distance'  # default device of distances: their origin is not that of a tracker
-
-
-@dataclass(frozen=True)
-class Source:
-    """One topic of measurements.
-
-    Each device has its own base frame, each target its own tool frame; a child frame in the
-    message names the target.
-    """
-
-    topic: str
-    type: str = ''  # such as geometry_msgs/msg/PoseStamped; empty for any
-    device: str = ''
-    target: str = ''
-    eye_in_hand: bool = False  # a camera on the flange measures a fixed target
-    validation: bool = False  # judges the result, never fitted
-    parent: str = ''  # frames of the measurement, among many transforms or bodies, as on /tf
-    child: str = ''
-    board: str = ''  # YAML of the board in images
-    info: str = ''  # CameraInfo topic of images, by default camera_info beside them
-    lens: str = 'given'  # by that topic, or `fitted` from there
-
-    def __post_init__(self) -> None:
-        if self.type and self.type not in TYPES:
-            raise UnknownNameError(f'type of source "{self.topic}"', self.type, TYPES)
-        frames = {self.parent, self.child} - {''}
-        if len(frames) != (2 if self.type in LINKS else 0):
-            raise ConfigError(
-                f'source "{self.topic}" needs parent=FRAME child=FRAME, between which it '
-                f'measures, if its type is {_or(LINKS)}, and only then'
-            )
-        if bool(self.board) != (self.type in PICTURES):
-            raise ConfigError(
-                f'source "{self.topic}" needs board=FILE, the board that it sees, if its type is '
-                f'{_or(PICTURES)}, and only then'
-            )
-        if self.lens not in LENSES:
-            raise UnknownNameError(f'lens of source "{self.topic}"', self.lens, LENSES)
-        for name in (self.device, self.target):
-            if '.' in name or ',' in name:
-                raise ConfigError(f'a device or target needs a name without . and , not "{name}"')
-
-    @property
-    def camera_info(self) -> str:
-        """Return the CameraInfo topic of images."""
-        beside = self.topic.removesuffix('/compressed').rpartition('/')
-        return self.info or f'{beside[0]}{beside[1]}camera_info'
-
-
-LENSES = ('given', 'fitted')
-TYPES = (*DECODERS, *LINKS, *PICTURES)  # message types of measurements
-
-STANDARD = (
-    Source('measured_pose', 'geometry_msgs/msg/PoseStamped'),
-    Source('measured_pose_with_covariance', 'geometry_msgs/msg/PoseWithCovarianceStamped'),
-    Source('measured_point', 'geometry_msgs/msg/PointStamped'),
-    Source('measured_transform', 'geometry_msgs/msg/TransformStamped'),
-    Source('measured_odometry', 'nav_msgs/msg/Odometry'),
-    Source('measured_distance', 'sensor_msgs/msg/Range', device=DISTANCE),
-    Source('validation_pose', 'geometry_msgs/msg/PoseStamped', validation=True),
-    Source('validation_point', 'geometry_msgs/msg/PointStamped', validation=True),
-)
-"""Default subscriptions of the node."""
-
-
-def parse_source(text: str) -> Source:
-    """Parse a source "TOPIC key=value ...".
-
-    Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
-    child, and of images board, info and lens. Short types such as PoseStamped are accepted; the
-    type defaults to TFMessage for a topic named tf or with parent and child, and to images with a
-    board. Values with blanks need quotes.
-    """
-    try:
-        topic, *pairs = shlex.split(text) or ('',)
-    except ValueError as err:
-        raise ConfigError(f'source "{text}" cannot be read: {err}') from err
-    if not topic or '=' in topic:
-        raise ConfigError(f'source "{text}" must begin with its topic: "TOPIC key=value ..."')
-    values: dict[str, Any] = {'validation': topic.rpartition('/')[2].startswith(VALIDATION)}
-    for pair in pairs:
-        key, equals, value = pair.partition('=')
-        if not equals or key not in KEYS:
-            raise UnknownNameError(f'key of source "{text}"', key, KEYS)
-        if key in ('eye_in_hand', 'validation'):
-            if value not in ('true', 'false'):
-                raise ConfigError(f'{key} of source "{text}" must be true or false, not "{value}"')
-            values[key] = value == 'true'
-        elif key == 'type':
-            full = (known for known in TYPES if value in (known, short_type(known)))
-            values[key] = next(full, value)
-        else:
-            values[key] = frame_name(value) if key in ('parent', 'child') else value
-    if values.keys() & {'parent', 'child'} or topic.rpartition('/')[2] == 'tf':
-        values.setdefault('type', TRANSFORMS)
-    if 'board' in values:
-        values.setdefault('type', PICTURES[topic.endswith('/compressed')])
-    source = Source(topic, **values)
-    if source.type.endswith('/Range') and not source.device:
-        source = replace(source, device=DISTANCE)
-    return source
-
-
-KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
-
-
-def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
-    """Parse sources; a topic may be named once, or once for each pair of frames."""
-    sources = tuple(parse_source(text) for text in texts)
-    names = [' '.join((each.topic, each.parent, each.child)).strip() for each in sources]
-    for source, name in zip(sources, names, strict=True):
-        if names.count(name) > 1:
-            raise ConfigError(f'source "{name}" is named twice')
-        if any(each.topic == source.topic and each.type != source.type for each in sources):
-            raise ConfigError(f'source "{source.topic}" is named with different types')
-    return sources
-
-
 def short_type(kind: str) -> str:
     """Return a message type without its package."""
     return kind.rpartition('/')[2]
-
-
-def _or(kinds: Sequence[str]) -> str:
-    *first, last = map(short_type, kinds)
-    return f'{", ".join(first)} or {last}'

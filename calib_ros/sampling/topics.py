@@ -9,22 +9,18 @@ from typing import NamedTuple, TypeAlias
 
 from calib_ros.errors import InputError
 from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
-from calib_ros.sampling.messages import (
-    CAMERA_INFO,
-    DECODERS,
-    JOINT_STATE,
-    LINKS,
-    MARKERS,
-    TYPES,
-    Source,
-    parse_source,
-    parse_sources,
-    short_type,
-)
+from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS, short_type
+from calib_ros.sampling.sources import TYPES, Source, parse_source, parse_sources
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
 
-Reading: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
+MARKERS = {
+    'status': 'std_msgs/msg/String',
+    'calibration': 'std_msgs/msg/String',
+    'dh_parameters': 'std_msgs/msg/Float64MultiArray',
+}
+"""Topics that together identify a calibration node."""
+MessagesOn: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 """Returns the messages of a recording on some topics."""
 
 
@@ -32,7 +28,7 @@ class Recorded(NamedTuple):
     """The types of a recording by topic, its messages, and how they are decoded."""
 
     available: Mapping[str, str]
-    messages_on: Reading
+    messages_on: MessagesOn
     deserialise: Deserialise
 
 

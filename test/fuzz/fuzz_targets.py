@@ -251,8 +251,9 @@ def message(data):
     """The first byte chooses the type; messages are divided by a mark."""
     from calib_ros.files.bags import _deserialiser
     from calib_ros.sampling.intake import Stream, feed
-    from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Source
+    from calib_ros.sampling.messages import DECODERS, JOINT_STATE
     from calib_ros.sampling.session import CalibrationSession
+    from calib_ros.sampling.sources import Source
 
     session = CalibrationSession(ARM)
     types = [JOINT_STATE, *DECODERS]

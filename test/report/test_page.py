@@ -18,12 +18,13 @@ from calib_ros import Calibration, Problem, identify, verify
 from calib_ros.apply import simulation
 from calib_ros.apply.workspace import survey
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import advice
 from calib_ros.report.applied import workspace_report
 from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
-from calib_ros.report.page import Input, Origin, Verdict, markdown, render
+from calib_ros.report.page import Origin, Verdict, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report

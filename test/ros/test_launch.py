@@ -18,7 +18,7 @@ from calib_ros.ros.arguments import (
     refuse_unknown,
     ros_arguments,
 )
-from calib_ros.sampling.messages import STANDARD
+from calib_ros.sampling.sources import STANDARD
 
 OTHERS = {'start_type_description_service'}
 """Parameters that every node has and no operator sets."""

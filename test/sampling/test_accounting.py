@@ -21,8 +21,8 @@ from streams import (
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.sampling.messages import Source
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import Source
 from calib_ros.settings import MODES, Settings
 
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4), Joint('c')))

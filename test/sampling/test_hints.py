@@ -29,7 +29,8 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.entry import Part
 from calib_ros.sampling.hints import too_much_lost
-from calib_ros.sampling.messages import PICTURES, Readings, Source
+from calib_ros.sampling.messages import PICTURES, Readings
+from calib_ros.sampling.sources import Source
 
 UR5E = load_chain('ur5e')
 TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))

@@ -10,7 +10,8 @@ from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.sampling.intake import Stream, feed
-from calib_ros.sampling.messages import JOINT_STATE, Source
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.sources import Source
 
 ARM = load_chain('ur10e')
 POSE, POINT = 'geometry_msgs/msg/PoseStamped', 'geometry_msgs/msg/PointStamped'

@@ -13,9 +13,9 @@ from calib_ros.errors import InputError
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report.words import verdict
-from calib_ros.sampling.messages import Source
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import Source
 
 LEFT_OUT = 'poses left out, in another frame or of a target measured once'
 

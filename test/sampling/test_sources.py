@@ -3,15 +3,8 @@
 import pytest
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.messages import (
-    DECODERS,
-    DISTANCE,
-    STANDARD,
-    TRANSFORMS,
-    Source,
-    parse_source,
-    parse_sources,
-)
+from calib_ros.sampling.messages import DECODERS, TRANSFORMS
+from calib_ros.sampling.sources import DISTANCE, STANDARD, Source, parse_source, parse_sources
 
 
 def test_keys_in_any_order():

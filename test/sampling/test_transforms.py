@@ -24,8 +24,9 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.cdr import alike
 from calib_ros.sampling.intake import Stream, feed, measured
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, parse_sources
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.sources import parse_sources
 from calib_ros.sampling.transforms import Linked, Links
 from calib_ros.settings import Settings
 
