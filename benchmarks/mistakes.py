@@ -259,10 +259,8 @@ def fewer(problem, count):
 def typical(problem):
     """Return the typical error of a problem as it is given [m]."""
     sets = tuple(each for each in problem.sets if each.distances is None)
-    trial = mistakes._tried(problem.chain, tuple(each.spread() for each in sets))
-    if trial is None:
-        return np.inf
-    return min(trial.error, mistakes._polished(problem, trial).error)
+    trial = mistakes.in_frames(problem, problem.chain, sets)
+    return np.inf if trial is None else trial.error
 
 
 def verdict(problem, words, clean):
