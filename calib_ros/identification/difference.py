@@ -42,11 +42,6 @@ from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
-INCOMPLETE = (
-    'not certain: a calibration by an earlier version does not tell how wobbling axes, at other '
-    'poses, would change it: identify it again'
-)
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Difference(Shown):
@@ -57,8 +52,7 @@ class Difference(Shown):
     errors and unmodelled effects too. Predicted positions differ by `rms` [m] over the joint range
     in the best frames, by `limit` [m] at most (95 %); the first model cannot follow `left` [m] of
     it. `changed` lists the changes, each with those indistinguishable from it; `unexplained` is
-    the probability of the remaining difference. An `incomplete` calibration, of an earlier
-    version, does not tell how wobble moves its parameters.
+    the probability of the remaining difference.
     """
 
     names: tuple[Parameter, ...]
@@ -71,7 +65,6 @@ class Difference(Shown):
     left: float
     changed: tuple[tuple[Explanation, ...], ...]
     unexplained: float
-    incomplete: bool
 
     @property
     def same(self) -> bool:
@@ -80,8 +73,6 @@ class Difference(Shown):
 
     def in_words(self) -> str:
         """Return the difference in words."""
-        if self.incomplete:
-            return f'{replace(self, incomplete=False).in_words()} ({INCOMPLETE})'
         if self.same:
             return f'unchanged within {1e3 * self.limit:.3f} mm'
         rms, limit = 1e3 * self.rms, 1e3 * self.limit
@@ -164,7 +155,6 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         left,
         tuple(changed),
         _chance(left_over, freedom, sum(len(each[0].names) for each in changed)),
-        not (first.unmodelled.names and second.unmodelled.names),
     )
 
 
