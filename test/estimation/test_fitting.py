@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a fit does before and after its least squares: priors that guard it, rows, statuses."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -125,18 +125,6 @@ def test_every_parameter_has_a_row_with_what_became_of_it():
         assert (row.status, row.std, row.freedom) == (status, None, np.inf)
 
 
-def test_priors_matter_if_they_hold_a_parameter_that_has_none():
-    problem = Problem(UR10E, seen(), priors={'elbow_joint.a': 1.0})
-    held = {'elbow_joint.a': 0.9, 'elbow_joint.d': 0.04}
-    told = SimpleNamespace(held=held.get)
-    assert not fitting._priors_matter(problem, tuple(held), told)
-    held['elbow_joint.d'] = 0.06
-    assert fitting._priors_matter(problem, tuple(held), told)
-    held['elbow_joint.d'] = 0.0
-    assert fitting._priors_matter(replace(problem, learned=Learned({}, 1.0)), tuple(held), told)
-    assert fitting._priors_matter(replace(problem, effects=('ratio',)), tuple(held), told)
-
-
 @pytest.mark.parametrize('count', [120, 600])
 def test_parameters_that_some_poses_do_not_excite_may_be_by_all(count, monkeypatch):
     """The elbow moves at one pose that the spread leaves out."""
@@ -150,70 +138,6 @@ def test_parameters_that_some_poses_do_not_excite_may_be_by_all(count, monkeypat
     names, factor = fitting._excited_names(problem, wanted, UR10E)
     assert names == tuple(n for n in problem.free if n in wanted)
     assert factor.shape == (len(names), len(names))
-
-
-@dataclass(frozen=True)
-class Done:
-    """A fit that is told: its factor, its noise, and what its data tell."""
-
-    factor: np.ndarray
-    noise: Noise
-    size: float
-    chain: object
-    told: dict
-
-
-def posterior_of(done, size, judging):
-    assert (size, judging) == (min(done.noise.size, 3.5), False)
-    return SimpleNamespace(priors=done.told, held=lambda name: float(name == 'elbow_joint.a'))
-
-
-def test_a_fit_is_repeated_with_guards_and_with_what_it_tells(monkeypatch):
-    """Without its outliers a session tells less; priors are no wider than common sense.
-
-    They are weighed against the most probable noise, unless the residuals show less.
-    """
-    names, chains = ('base.x', 'elbow_joint.a', 'elbow_joint.theta'), iter('abc')
-    problem, length = Problem(UR10E, seen()), 0.05 / 3.0
-    told, calls = {'elbow_joint.a': 1.0, 'elbow_joint.theta': 2e-3}, []
-    poor = np.diag([1.0, 0.9 / length, 100.0])
-
-    def fit(problem, simpler, chain, names, again=False):
-        calls.append((problem.learned, chain, again))
-        size = 2.0 + len(calls)
-        return Done(poor, noise(size, True), size, next(chains), told)
-
-    monkeypatch.setattr(fitting, '_fit', fit)
-    monkeypatch.setattr(fitting, 'posterior_of', posterior_of)
-    monkeypatch.setattr(fitting, '_likely_noise', lambda _: 3.5)
-    found = fitting._fit_all(problem, names, UR10E, 100.0 * np.eye(3), None)
-    guards, priors = {'elbow_joint.a': length}, {**told, 'elbow_joint.a': length}
-    assert calls == [
-        (None, UR10E, False),
-        (Learned(guards, 1.0), UR10E, False),
-        (Learned(priors, 3.5), 'b', True),
-    ]
-    assert (found.chain, found.size) == ('c', 4.0)
-    calls.clear()
-    chains = iter('ab')
-    told['elbow_joint.theta'] = 1.0
-    poor = 100.0 * np.eye(3)
-    found = fitting._fit_all(problem, names, UR10E, poor, None)
-    priors['elbow_joint.theta'] = 0.1 / 3.0
-    assert calls == [(None, UR10E, False), (Learned(priors, 3.0), 'a', True)]
-
-
-@pytest.mark.parametrize('held', [('elbow_joint.a', 'base.x'), ('base.x',), ()])
-def test_what_other_kinds_of_measurement_would_tell_is_held(held, monkeypatch):
-    """Unless a prior tells it, so that it is fitted."""
-    told = ('base.x',)
-    monkeypatch.setattr(fitting.identifiability, 'identifiable_and_held', lambda *_: (told, held))
-    monkeypatch.setattr(fitting, 'start_frames', lambda *_: 'start')
-    monkeypatch.setattr(fitting, '_excited_names', lambda *_: (told, np.eye(1)))
-    monkeypatch.setattr(fitting, '_fit_all', lambda *_: 'fitted')
-    monkeypatch.setattr(fitting, '_widened', lambda fitted, names: (fitted, names))
-    found = ('fitted', held[:1]) if len(held) == 2 else 'fitted'
-    assert fitting.fit(Problem(UR10E, seen())) == (told, 'start', found)
 
 
 def test_noise_is_searched_as_far_as_the_sizes_of_errors():

@@ -14,7 +14,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.estimation import robust
 from calib_ros.estimation.leastsquares import System, minimise
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import INNER, OUTER, Robust, distances_of, weights_of
+from calib_ros.estimation.robust import INNER, OUTER, distances_of, weights_of
 from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics import se3
 
@@ -135,32 +135,3 @@ def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(lo
     np.testing.assert_allclose(again, last, rtol=0.1, atol=0.1)
     weights = weights_of(distances_of(found.fit.chain, names, system)[0], loss)
     np.testing.assert_allclose(found.system.sets[0].weights ** 2, weights, rtol=0, atol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ('out', 'rms', 'loss', 'sums', 'chance', 'second'),
-    [
-        (True, 1.0, 'redescending', 2.26, 0.9e-3, True),
-        (False, 1.21, 'redescending', 2.26, 0.9e-3, True),
-        (False, 1.19, 'redescending', 2.26, 0.9e-3, False),  # nothing suspicious
-        (True, 1.0, 'huber', 2.26, 0.9e-3, False),
-        (True, 1.0, 'redescending', 2.24, 0.9e-3, False),  # a detail of the first
-        (True, 1.0, 'redescending', 2.26, 1.1e-3, False),  # it may be chance
-    ],
-)
-def test_a_second_fit_is_kept_where_it_shrinks_half_of_the_residuals(
-    out, rms, loss, sums, chance, second, monkeypatch
-):
-    """By more than ALIKE, and by more than chance allows at 99.9 %."""
-    normal = SimpleNamespace(rms=lambda _: rms)
-    first, another = (
-        Robust(SimpleNamespace(chain=size, normal=normal), None, distances, True, count, loss)
-        for size, distances, count in ((sums, (np.array([0, 100 * out]),), 3), (1.0, (), 4))
-    )
-    monkeypatch.setattr(robust, 'robust_fit', lambda *_: first)
-    monkeypatch.setattr(robust, 'reweighted', lambda *_: another)
-    monkeypatch.setattr(robust, 'trimmed_start', lambda *_: None)
-    monkeypatch.setattr(robust, 'trimmed_sum', lambda chain, _: chain)
-    monkeypatch.setattr(robust, '_chance', lambda *_: chance)
-    found = robust.thorough_fit(None, [], SimpleNamespace(count=10), loss)
-    assert found.iterations == (7 if second else 3)
