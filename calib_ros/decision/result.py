@@ -57,7 +57,6 @@ class Identification(Shown):
     priors: dict[str, float]
     """Standard deviations [m, rad] known beforehand."""
     world_frame: str
-    iterations: int
     converged: bool
     chance: float | None
     """Probability that drift of the device, shared by successive measurements, would let the arm's

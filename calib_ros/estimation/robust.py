@@ -65,7 +65,6 @@ class Robust:
     system: System
     distances: tuple[FloatArray, ...]
     settled: bool
-    iterations: int
     loss: str
 
     @property
@@ -86,8 +85,7 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
     """
     if system.count > MANY:
         few = thorough_fit(chain, names, system.spread(MANY), loss)
-        found = reweighted(few.fit.chain, names, system, loss, tolerance=0.1)
-        return replace(found, iterations=few.iterations + found.iterations)
+        return reweighted(few.fit.chain, names, system, loss, tolerance=0.1)
     first = robust_fit(chain, names, system, loss)
     suspicious = first.outliers.any() or first.fit.normal.rms(system) > SUSPICIOUS
     if loss != 'redescending' or not suspicious:
@@ -96,7 +94,7 @@ def thorough_fit(chain: Chain, names: Sequence[str], system: System, loss: str) 
     sums = [trimmed_sum(robust.fit.chain, system) for robust in (first, second)]
     another = sums[0] > ALIKE**2 * sums[1]
     if another and _chance(names, system, first, second) < 1.0 - SURE:
-        return replace(second, iterations=first.iterations + second.iterations)
+        return second
     return first
 
 
@@ -125,10 +123,9 @@ def _chance(names: Sequence[str], system: System, first: Robust, second: Robust)
 def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) -> Robust:
     """Fit the named parameters without gross errors."""
     fit = minimise(chain, names, system)
-    iterations = fit.iterations
     distances = distances_of(fit.chain, names, system)
     if loss == 'none' or max(d.max(initial=0.0) for d in distances) < INNER:
-        return Robust(fit, system, distances, True, iterations, loss)
+        return Robust(fit, system, distances, True, loss)
     if trimmed_sum(chain, system) < trimmed_sum(fit.chain, system):  # misled from a good start
         fit = replace(fit, chain=chain)
         distances = distances_of(chain, names, system)
@@ -136,14 +133,12 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
         before = distances
         bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
         fit = minimise(fit.chain, names, bounded, iterations=2)
-        iterations += fit.iterations
         distances = distances_of(fit.chain, names, system)
         if all(
             np.allclose(d, b, rtol=0.1, atol=0.1) for d, b in zip(distances, before, strict=True)
         ):
             break
-    robust = reweighted(fit.chain, names, system, loss)
-    return replace(robust, iterations=iterations + robust.iterations)
+    return reweighted(fit.chain, names, system, loss)
 
 
 def reweighted(
@@ -168,7 +163,6 @@ def reweighted(
         return tuple(np.minimum(d, s) for d, s in zip(found, simpler, strict=True))
 
     distances = judged(chain)
-    iterations = 0
     settled = False
     last: list[FloatArray] = []
     weights: list[FloatArray] = []
@@ -182,14 +176,13 @@ def reweighted(
         last, weights = weights, _damp_oscillation(found, weights, last)
         system = system.weighted(weights)
         fit = minimise(chain, names, system, tolerance)
-        chain, iterations = fit.chain, iterations + fit.iterations
+        chain = fit.chain
         distances = judged(chain)
         if not fit.converged:
             break
     if not (settled and fit.left < STEP_TOLERANCE):
         fit = minimise(chain, names, system)
-        iterations += fit.iterations
-    return Robust(fit, system, distances, settled, iterations, loss)
+    return Robust(fit, system, distances, settled, loss)
 
 
 def _damp_oscillation(

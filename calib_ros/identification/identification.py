@@ -110,7 +110,6 @@ def _identified(
         observability=identifiability.observability(fitted.factor, robust.system.count),
         priors=_priors(problem),
         world_frame=problem.world_frame,
-        iterations=robust.iterations,
         converged=before.converged and robust.fit.converged and robust.settled,
         chance=_chance(fitted, before.chain),
         refusals=(),

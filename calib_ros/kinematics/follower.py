@@ -60,8 +60,8 @@ class Solution(Shown):
 
     Errors (N,) of `position` [m] and `orientation` [rad] remain, those `before` are without the
     change; `reachable` (N,) [m] is the remaining position error in directions the arm can move.
-    `iterations` are those of the slowest sample. Joints `limited` (N, n) are held at a limit;
-    samples `damped` (N,) are changed in part, because the full change would exceed the largest.
+    Joints `limited` (N, n) are held at a limit; samples `damped` (N,) are changed in part, because
+    the full change would exceed the largest.
     """
 
     change: FloatArray
@@ -70,7 +70,6 @@ class Solution(Shown):
     reachable: FloatArray
     position_before: FloatArray
     orientation_before: FloatArray
-    iterations: int
     converged: Flags
     limited: Flags
     damped: Flags
@@ -143,10 +142,8 @@ class Follower:
             parts.append(self._solve_block(np.ascontiguousarray(joints[rows].T), signs, bounded))
             progress(min(1.0, rows.stop / len(joints)))
         names = [each.name for each in fields(Solution)]
-        found = {name: [getattr(part, name) for part in parts] for name in names}
-        iterations = max(found.pop('iterations'))
-        joined = {name: np.concatenate(arrays) for name, arrays in found.items()}
-        return Solution(iterations=iterations, **joined)
+        joined = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        return Solution(*joined)
 
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
         """Solve for commands (n, B); hold joints beyond a limit there and solve the rest again."""
@@ -156,7 +153,7 @@ class Follower:
         ways = self._ways(q, approach)
         task = _Task(q, approach, axes, origin, ways, never, np.zeros_like(q))
         before = self._errors(task, task.start)
-        x, errors, converged, damped, iterations = self._attempt(task)
+        x, errors, converged, damped = self._attempt(task)
         lower, upper = (((end - q.T).T / self._unit) for end in (self.lower, self.upper))
         while bounded:
             beyond = ~task.held & ((x < lower) | (x > upper))
@@ -165,22 +162,20 @@ class Follower:
                 break
             held = task.held | beyond
             task = task._replace(held=held, start=np.where(held, np.clip(x, lower, upper), 0.0))
-            x[:, rest], errors[rest], converged[rest], damped[rest], more = self._attempt(
-                task.select(rest)
-            )
-            iterations += more
+            again = self._attempt(task.select(rest))
+            x[:, rest], errors[rest], converged[rest], damped[rest] = again
         return Solution(
             (self._unit * x).T,
             *(errors[:, 0], errors[:, 1], errors[:, 2], before[:, 0], before[:, 1]),
-            *(iterations, converged, (task.held & ~never).T, damped),
+            *(converged, (task.held & ~never).T, damped),
         )
 
-    def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags, int]:
-        """Return x (n, B), errors (B, 3), convergence and damping (B,), and the iterations.
+    def _attempt(self, task: _Task) -> tuple[FloatArray, FloatArray, Flags, Flags]:
+        """Return x (n, B), errors (B, 3), convergence and damping (B,).
 
         If the first attempt fails, the weight of the orientation decides the compromise.
         """
-        x, _, converged, iterations = self._minimise(task, self._ridge, self._first_weight)
+        x, _, converged = self._minimise(task, self._ridge, self._first_weight)
         errors = self._errors(task, x)
         damped = np.zeros_like(converged)
         rest = np.flatnonzero(
@@ -189,12 +184,11 @@ class Follower:
         if rest.size:
             part = task.select(rest)
             stiffness, damped[rest] = self._stiffness(part)
-            x[:, rest], _, converged[rest], more = self._minimise(
+            x[:, rest], _, converged[rest] = self._minimise(
                 part, stiffness, self._weight, settle=True
             )
             errors[rest] = self._errors(part, x[:, rest])
-            iterations += more
-        return x, errors, converged, damped, iterations
+        return x, errors, converged, damped
 
     def _minimise(
         self, task: _Task, stiffness: FloatArray, weight: float, settle: bool = False

@@ -26,12 +26,11 @@ class Normal(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """Minima (..., B), costs (B,), which are settled (B,), and the number of steps."""
+    """Minima (..., B), costs (B,), and which are settled (B,)."""
 
     x: FloatArray
     cost: FloatArray
     settled: Flags
-    iterations: int
 
 
 def minimise(
@@ -59,9 +58,7 @@ def minimise(
     now = linearise(x, active)
     cost = now.cost.copy()
     diagonal = np.diag_indices(len(now.slope))
-    iterations = 0
-    while iterations < rounds:
-        iterations += 1
+    for _ in range(rounds):
         matrix = now.matrix.copy()
         matrix[diagonal] += damping * (1.0 if enough else matrix[diagonal])
         step = solve_positive(matrix, now.slope)
@@ -89,7 +86,7 @@ def minimise(
         over = still | (damping > 1e3)
         cost[active] = now.cost
     found[..., active] = x
-    return Minimum(found, cost, settled, iterations)
+    return Minimum(found, cost, settled)
 
 
 def solve_positive(matrix: FloatArray, right: FloatArray) -> FloatArray:

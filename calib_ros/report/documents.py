@@ -40,7 +40,6 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'accepted': result.accepted,
         'refusals': list(result.refusals),
         'remarks': list(result.remarks),
-        'iterations': result.iterations,
         'rank': result.rank,
         'unidentifiable': list(result.unidentifiable),
         'not_excited': list(result.not_excited),

@@ -104,28 +104,21 @@ def test_the_chance_of_leaving_so_many_out_is_that_of_the_f_test(out, share, mon
 
 
 @pytest.mark.parametrize('loss', ['redescending', 'huber'])
-def test_a_robust_fit_starts_from_least_absolute_lengths_and_counts_its_steps(loss, monkeypatch):
+def test_a_robust_fit_starts_from_least_absolute_lengths(loss, monkeypatch):
     """One more reweighting by 1 / distance hardly moves the start of the last phase."""
     rng, true, clean = measured_arm(1, 80)
     seen, _ = spoiled(clean, rng, 0.45, shift=(0.1, 1.5), turn=(0.1, 2.0))
     system = System((Samples(seen, *NOISE),))
     names = [name for name in UR10E.parameter_names if UR10E.owns_frame(name)]
-    steps, starts, reweighted = [], [], robust.reweighted
-
-    def counted(*arguments, **options):
-        found = minimise(*arguments, **options)
-        steps.append(found.iterations)
-        return found
+    starts, reweighted = [], robust.reweighted
 
     def kept(chain, *arguments):
         starts.append(chain)
         return reweighted(chain, *arguments)
 
-    monkeypatch.setattr(robust, 'minimise', counted)
     monkeypatch.setattr(robust, 'reweighted', kept)
     far = true.with_offsets({'base.x': 0.5, 'base.rz': 0.5, 'tool.y': 0.3})
     found = robust.robust_fit(far, names, system, loss)
-    assert found.iterations == sum(steps)
     assert found.settled
     size = max(1.0, found.fit.normal.rms(found.system))
     assert found.fit.left < robust.STEP_TOLERANCE * size
