@@ -310,7 +310,9 @@ def _choose_harmonics(
             more = added(model.judge(chosen, pair, what), pair)
         if several and (count == SEVERAL or (count < SEVERAL and not more)):
             progress('effects: all harmonics')
-            more = not added(model.judge_all_harmonics(chosen), model.harmonics) and more
+            every = f'all harmonics up to {HARMONICS[-1]} per turn'
+            verdict = model.judge(chosen, model.harmonics, every)
+            more = not added(verdict, model.harmonics) and more
         if not more:
             break
     return len(chosen) > before

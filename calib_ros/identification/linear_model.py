@@ -22,11 +22,10 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import group_of
 from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.leastsquares import Folds, System, owners, products_of, stacked
-from calib_ros.estimation.levels import CERTAIN, CLEARLY, CONFIDENT, SURE
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.estimation.samples import gram
-from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
@@ -35,9 +34,6 @@ from calib_ros.progress import Notify, quiet
 
 HARMONICS = range(3, 41)
 """Harmonics per turn of a joint to search; 1 and 2 belong to the eccentricities."""
-HARMONIC_SIZES = (TYPICAL['drive'], TYPICAL['drive'] / CLEARLY)
-"""Sizes [rad] of all harmonics together: the usual, and a smaller one that decides nothing in
-benchmarks/real_robots.py."""
 COMPARED = 15 * SOME_POSES
 """Samples that effects are compared on; larger sets are thinned to save time. By 2,000 errors
 are the same within 1e-4 (benchmarks/real_robots.py)."""
@@ -96,7 +92,7 @@ class LinearModel:
         self._shifts: Shifts | None = None
         if not any(each.socket for each in sets):
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
-        self._errors: dict[tuple[float, ...], FloatArray] = {}
+        self._errors: dict[tuple[int, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
         self._seen: Columns | None = None
 
@@ -117,15 +113,13 @@ class LinearModel:
             found[group] = [name for name in seen if name not in known]
         return found
 
-    def judge(
-        self, chosen: Sequence[str], added: Sequence[str], what: str, size: float = 0.0
-    ) -> Verdict:
-        """Compare held-out errors with and without `added` effects, of given or usual `size`."""
+    def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> Verdict:
+        """Compare held-out errors with and without `added` effects."""
         new = [name for name in added if name not in chosen]
         found, pays = [], True
         for dealing in range(len(self._folds)):
             before = self._left_out(dealing, chosen)
-            after = self._left_out(dealing, chosen, new, size)
+            after = self._left_out(dealing, [*chosen, *new])
             gain, limit = log_gain(before, after, self._groups, SURE)
             pays = pays and gain > max(limit, COUNTS)
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
@@ -140,17 +134,6 @@ class LinearModel:
         if prior is not None:
             self._system = replace(self._system, prior=replace(prior, noise=self._noise))
         self._errors.clear()
-
-    def judge_all_harmonics(self, chosen: Sequence[str]) -> Verdict:
-        """Judge all harmonics together, of the usual size, then of a smaller one."""
-        new = [name for name in self.harmonics if name not in chosen]
-        for size in HARMONIC_SIZES:
-            verdict = self.judge(
-                chosen, new, f'all harmonics up to {HARMONICS[-1]} per turn', size
-            )
-            if verdict.pays:
-                break
-        return verdict
 
     def strongest_harmonic(
         self, chosen: Sequence[str], progress: Notify
@@ -227,18 +210,13 @@ class LinearModel:
         known = {*self._names}
         return self._chain.with_effects([name for name in names if name not in known])
 
-    def _left_out(
-        self, dealing: int, chosen: Sequence[str], new: Sequence[str] = (), size: float = 0.0
-    ) -> FloatArray:
-        """Return held-out position errors (N, 3) [m] of every sample, by the other folds.
-
-        With the chosen and new effects, the latter of `size` or usual.
-        """
-        which = [*range(len(self._names)), *self._columns_of([*chosen, *new])]
-        key = (dealing, size, *which)
+    def _left_out(self, dealing: int, chosen: Sequence[str]) -> FloatArray:
+        """Return held-out position errors (N, 3) [m] of every sample, by the other folds."""
+        which = [*range(len(self._names)), *self._columns_of(chosen)]
+        key = (dealing, *which)
         if key in self._errors:
             return self._errors[key]
-        priors = np.append(self._priors(chosen), self._priors(new, size))
+        priors = self._priors(chosen)
         extra, offset = self._system.extra_rows(self._chain, self._names)
         offset = np.append(offset, np.zeros(len(priors)))
         extra = np.column_stack([linalg.block_diag(extra, np.diag(priors)), offset])
@@ -261,10 +239,10 @@ class LinearModel:
         self._errors[key] = np.concatenate(errors)
         return self._errors[key]
 
-    def _priors(self, names: Sequence[str], given: float = 0.0) -> FloatArray:
+    def _priors(self, names: Sequence[str]) -> FloatArray:
         """Return noise / sigma (P,) of the priors, zero without one.
 
-        Effects have the `given` size, else the usual one or that found in the data if larger.
+        Effects have the usual size, or that found in the data if larger.
         """
         sigmas, fitted = self._problem.prior_sigmas, {*self._names}
         found = np.zeros(len(names))
@@ -272,8 +250,7 @@ class LinearModel:
             size = sigmas.get(name, 0.0)
             if name not in fitted:
                 group = str(group_of(self._chain, name))
-                usual = max(effects.expected(name), self._sizes.get(group, 0.0))
-                size = given or usual
+                size = max(effects.expected(name), self._sizes.get(group, 0.0))
             found[k] = self._noise / size if size else 0.0
         return found
 
