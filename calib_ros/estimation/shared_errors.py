@@ -329,7 +329,7 @@ def _successive(
     size = len(names)
     found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
-        faded = dict.fromkeys(kernels, np.zeros((1, 1)))
+        last: dict[int, FloatArray] = {}
         for _, sums in samples.sums(chain, names, samples.observations.stops):
             for part, own in kernels.items():
                 if part >= len(sums):
@@ -339,9 +339,11 @@ def _successive(
                 rows = np.ascontiguousarray(sums[part][:-1].T)
                 stops = rows.reshape(len(rows), -1)
                 together = -0.5 * weights.sum() * stops
+                faded = last.setdefault(part, np.zeros((len(own), stops.shape[1])))
                 for stop, total in zip(stops, together, strict=True):
-                    faded[part] = fading * faded[part] + stop
-                    total += weights @ faded[part]
+                    faded *= fading
+                    faded += stop
+                    total += weights @ faded
                 cross = rows.reshape(-1, size).T @ together.reshape(-1, size)
                 found[part] += cross + cross.T
     return found
