@@ -12,6 +12,7 @@ from typing import TypeAlias
 import numpy as np
 
 from calib_ros.decision.misread import Turn, misread
+from calib_ros.decision.printed import size_of
 from calib_ros.estimation.levels import NEARER, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
@@ -117,7 +118,7 @@ def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     if seen.inverse:
         what, remedy = NOT_ON_FLANGE
     yield Suspect(what, remedy, (Observations.inverted,), published=_in_sources(not seen.inverse))
-    size = _size_of(chain, seen)
+    size = size_of(chain, seen)
     remedy = 'measure the print, and give square and marker in metres'
     what = f'the board is stated {float(f"{1.0 / size:.3g}"):g} times as large as it is'
     yield Suspect(what, remedy, (_scaled(size),), published=remedy)
@@ -127,25 +128,6 @@ def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 
 def _in_sources(on_flange: bool) -> str:
     return f'set eye_in_hand={str(on_flange).lower()} in sources'
-
-
-def _size_of(chain: Chain, seen: Observations) -> float:
-    """Return the factor by which the measured lengths become those of the arm, 1 if unknown.
-
-    Base and tool change neither the angle of a move nor its shift along the axis of the turn.
-    """
-    along = []
-    for rotations, places in (
-        np.split(replace(chain, base=None, tool=None).forward(seen.joints)[:, :3], [3], axis=2),
-        (seen.rotations, seen.positions[:, :, np.newaxis]),
-    ):
-        turns = se3.log_rotation(rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2))
-        shifts = places[1:] - rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2) @ places[:-1]
-        along.append(np.einsum('nk,nk->n', turns, shifts[:, :, 0]))
-    far = np.abs(along[1]) >= np.median(np.abs(along[1]))
-    with np.errstate(divide='ignore', invalid='ignore'):
-        size = float(np.median(along[0][far] / along[1][far]))
-    return size if 0.0 < size < np.inf else 1.0
 
 
 def _units(chain: Chain) -> Iterator[Suspect]:

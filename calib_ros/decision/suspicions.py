@@ -6,9 +6,6 @@ Lens. If other intrinsics of a camera explain most of the residuals, the given o
 another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
 the lens it would be another arm, not just a more accurate one.
 
-Board. Printers stretch one side of a page. The residuals at the board, averaged over the images,
-show the ratio of its sides; the arm absorbs the scale of both together, which is as uncertain.
-
 Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
 leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
 
@@ -30,10 +27,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy import special
 
-from calib_ros.decision.acceptance import out_of_scale, percent
+from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.misfits import explained
+from calib_ros.decision.printed import stretched
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
@@ -41,11 +38,9 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SCALE, SURE, TELLING, chance_of
+from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SURE, TELLING, chance_of
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import OUTLIER
-from calib_ros.estimation.samples import seen_residuals
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics.chain import Chain
@@ -53,8 +48,6 @@ from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parame
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
 
-LARGEST_SCALE = 10.0 * SCALE
-"""More than any arm grows: by 40 degrees, if all aluminium (23 ppm a degree)."""
 HARMFUL = 0.15
 """Probability of harm by the device's scale at which a result is refused: of 630 good ones 21 are
 (13 without any region); of 1,890 arms with such an error 64 are accepted and get worse
@@ -74,10 +67,11 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 
     `another` is false if a mistake is already named, which comes first.
     """
-    if any(each.socket or each.plane for each in problem.sets):
-        return result  # one place shows none of these
+    if any(each.socket or each.plane for each in problem.sets):  # shows only the scale of a bar
+        refused = _scale(result) if problem.separations else []
+        return replace(result, refusals=(*result.refusals, *refused))
     lens, imitated = _lens(problem, result) if another else ('', False)
-    board = '' if lens else _board(problem, result)
+    board = '' if lens else stretched(problem, result)
     sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(result)]
     printed = all(each.pixels is not None for each in problem.sets) and not problem.sigma_scale
     if board and printed:
@@ -267,33 +261,3 @@ def _imitated(freed: Problem, result: Identification) -> bool:
         _apart(each, other, np.concatenate(joints)) for each in (result.before, result.chain)
     )
     return after > NEARER * before
-
-
-def _board(problem: Problem, result: Identification) -> str:
-    for each, far in zip(problem.sets, result.distances, strict=True):
-        kept = far < OUTLIER
-        if each.points is None or distinct(each.images[kept]) < 2:
-            continue
-        seen, points = each.select(kept), each.points[kept]
-        _, shifts = seen_residuals(result.chain, seen)
-        if each.on_flange:  # the camera moves instead
-            shifts = -shifts
-        else:
-            poses = result.chain.forward(seen.joints, seen.approach, seen.base, seen.tool)
-            shifts = np.einsum('nji,nj->ni', poses[:, :3, :3], shifts)
-        _, image = np.unique(seen.images, return_inverse=True)
-        count = np.bincount(image)
-        stretched = []
-        for side, shift in zip(points.T[:2], shifts.T, strict=False):
-            beside = side - (np.bincount(image, side) / count)[image]
-            size = np.bincount(image, beside**2)
-            stretched.append(np.bincount(image, beside * shift) / np.maximum(size, 1e-300))
-        wider = stretched[0] - stretched[1]
-        mean, error = float(wider.mean()), wider.std(ddof=1) / np.sqrt(len(count))
-        if abs(mean) > LARGEST_SCALE + special.stdtrit(len(count) - 1, SURE) * error:
-            way = 'wider' if mean > 0.0 else 'narrower'
-            return (
-                f'the board is {percent(abs(mean))} % {way} for its height than stated: print it '
-                'unstretched, else the arm becomes as wrong'
-            )
-    return ''

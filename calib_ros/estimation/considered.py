@@ -30,6 +30,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.settings import Settings
 
 CONSIDERED = ('eccentricity', 'gravity')
 """Effects that any arm may have, fitted or not; moves of one joint hardly excite couplings."""
@@ -131,17 +132,20 @@ def doubted_products(
 def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], float]:
     """Return all lengths [m] that positions depend on, and the standard deviation of their scale.
 
-    There are none for sockets and planes, whose places are fixed. The travel of a prismatic joint
-    is scaled by its ratio, which is added to the returned chain.
+    There are none for sockets and planes, whose places are fixed, unless a bar is between them.
+    The travel of a prismatic joint is scaled by its ratio, which is added to the returned chain.
     """
     sets = [samples.observations for samples in system.sets]
-    if any(each.socket or each.plane for each in sets):
+    if any(each.socket or each.plane for each in sets) and not system.separations:
         return chain, {}, SCALE
     travels = [Parameter(j.name, 'ratio') for j in chain.joints if j.type == 'prismatic']
     chain = chain.with_effects(travels)
     names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
     scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
+    if all(each.socket for each in sets):
+        longest = max(distance for *_, distance in system.separations)
+        scale = max(scale, Settings.sigma_position / longest)
     return chain, {n: chain.value(n) for n in names} | {str(n): 1.0 for n in travels}, scale
 
 

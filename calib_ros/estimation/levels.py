@@ -45,6 +45,8 @@ SCALE = 1e-4
 (assumed)."""
 UNUSUAL = 1.0 - special.ndtr(1.0)
 """Share of devices out of scale: beyond one standard deviation."""
+LARGEST_SCALE = 10.0 * SCALE
+"""More than any arm grows: by 40 degrees, if all aluminium (23 ppm a degree)."""
 OUT_OF_SCALE = 25.0 * SCALE
 """Standard deviation of the scale of these; half are worse (within a factor of ten)."""
 PRINTED = 5e-3  # scale of a printed board (assumed): 1 mm of 200

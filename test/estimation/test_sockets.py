@@ -150,6 +150,15 @@ def test_known_distances_that_the_arm_does_not_keep_are_no_step(slip):
     assert (step and (step.what, step.sample)) == (('joint_4', 15) if slip else None)
 
 
+@pytest.mark.parametrize('error', [0.0, 0.01])
+def test_sockets_at_another_distance_than_stated_are_refused(error):
+    """A bar 1 % longer than stated made an arm worse, 2.6 mm -> 9.5 mm, and was accepted."""
+    problem = cell(0, noise=2e-5)[1]
+    stated = [(*pair, (1.0 - error) * distance) for *pair, distance in problem.separations]
+    result = identify(replace(problem, separations=stated))
+    assert result.accepted == (not error)
+
+
 def test_only_sockets_are_a_known_distance_apart():
     _, problem = cell(0)
     with pytest.raises(UnknownNameError, match=r'"base_9".*base_0_0'):
