@@ -151,7 +151,7 @@ def decoded(data: NDArray[np.uint8]) -> Image:
         image = cv2.imdecode(data, kind)
     except cv2.error:
         image = None
-    if image is None:
+    if image is None or image.dtype not in (np.uint8, np.uint16):
         return np.zeros((0, 0), dtype=np.uint8)
     if image.dtype == np.uint16:
         image = image >> max(int(image.max()).bit_length() - 8, 0)

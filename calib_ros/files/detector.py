@@ -183,25 +183,35 @@ class Detector:
 
     def _judged(self, image: Image, corners: FloatArray, ids: Index) -> Corners | Refusal:
         number, pixels = self._corners(image, corners, ids)
-        if len(number) < self._fewest:
+        few = len(number) < self._fewest
+        if few:  # markers may still tell that it is another board
+            points, seen = self._board.around_markers[ids].reshape(-1, 2), corners.reshape(-1, 2)
+        else:
+            points, seen = self._board.corners[number, :2], pixels
+        placed = self._placed(points, seen, points) if len(seen) else seen
+        apart = np.inf if placed is None else np.linalg.norm(placed - seen, axis=1).max(initial=0)
+        # lens and board may bend it by half a refinement window, or 10 %
+        if apart > max(0.5 * WIDEST, EXCEPTION * self._spacing(points, seen)):
+            return Refusal(
+                'whose corners do not fit the board',
+                f'its {"markers" if few else "corners"} do not fit the board ({apart:.0f} px '
+                'off): are type, columns, rows, square, marker and legacy those of this board, '
+                'and is it flat?',
+            )
+        if few:
             return Refusal(
                 'with too little of the board',
                 f'it shows {len(number)} of the {len(self._board.corners)} corners, fewer than '
                 f'{self._fewest}, and {len(ids)} markers: is only part of the board visible, or '
                 'is it another board?',
             )
-        points = self._board.corners[number, :2]
-        placed = self._placed(points, pixels, points)
-        apart = np.inf if placed is None else np.linalg.norm(placed - pixels, axis=1).max()
-        spacing = np.sqrt(_area(pixels) / max(_area(points), 1e-300)) * self._board.square
-        # lens and board may bend it by half a refinement window, or 10 %
-        if apart > max(0.5 * WIDEST, EXCEPTION * spacing):
-            return Refusal(
-                'whose corners do not fit the board',
-                f'its corners do not fit the board ({apart:.0f} px off): are columns, rows, '
-                'square and marker those of this board, and is it flat?',
-            )
         return number, pixels
+
+    def _spacing(self, points: FloatArray, pixels: FloatArray) -> float:
+        """Return the usual side [px] of a square of the board."""
+        if len(points) < 2:
+            return 0.0
+        return float(np.sqrt(_area(pixels) / max(_area(points), 1e-300))) * self._board.square
 
     def _placed(
         self, points: FloatArray, pixels: FloatArray, others: FloatArray
@@ -296,7 +306,7 @@ class Detector:
             found = len(self._markers(image, known[name], range(13, 14))[1])
             if found >= FEWEST:
                 return f', but {found} of {name}: is it the right board file?'
-        return ': is the board in sight, and well lit?'
+        return ': is the board in sight, well lit, and no plain chessboard?'
 
 
 def detect(

@@ -56,6 +56,7 @@ def test_images_are_refused_with_the_reason():
     other = boards.Board('charuco', 5, 7, 0.036, 0.026, 'DICT_4X4_50')
     small = boards.Board('charuco', 3, 3, 0.036, 0.026, 'DICT_6X6_250')
     wider = boards.Board('markers', 3, 6, 0.036, 0.026, 'DICT_6X6_250')
+    turned = boards.Board('charuco', 7, 5, 0.036, 0.026, 'DICT_6X6_250')
     whole = Detector(CHARUCO)
     cases = [
         (whole, photograph(CHARUCO, blur=4.0)[0], r'blurred: its sharpest edges are \d+ px wide'),
@@ -65,7 +66,8 @@ def test_images_are_refused_with_the_reason():
         (whole, np.zeros((0, 0), np.uint8), 'OpenCV cannot read this image'),
         (Detector(other), image, r'no marker of DICT_4X4_50, but \d+ of DICT_6X6'),
         (Detector(small), image, 'another board: marker'),
-        (Detector(wider), image, r'do not fit the board \(\d+ px off\)'),
+        (Detector(wider), image, r'its corners do not fit the board \(\d+ px off\)'),
+        (Detector(turned), image, r'its markers do not fit .*: are type, columns, rows'),
     ]
     for detector, picture, reason in cases:
         found = detector.of(picture)
@@ -87,6 +89,12 @@ def test_an_image_is_as_the_sensor_sees_it(orientation):
     image = np.arange(60 * 80, dtype=np.uint16).reshape(60, 80) // 20
     image = image.astype(np.uint8)
     np.testing.assert_allclose(decoded(turned_by_exif(image, orientation)), image, atol=3)
+
+
+def test_images_of_fractions_are_refused():
+    """As whole numbers they would be black."""
+    data = cv2.imencode('.tiff', np.full((60, 80), 0.5, np.float32))[1]
+    assert not decoded(data).size
 
 
 def test_images_of_twelve_bits_are_as_bright_as_they_can_be():
