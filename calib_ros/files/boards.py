@@ -45,6 +45,10 @@ HEADER = ('image', 'corner', 'u', 'v')
 SIZE = ('width', 'height')  # optional columns: size of the images [px]
 DISTORTION = ('distortion_model', 'distortion_coefficients')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
+DO_INSTEAD = (
+    'calibrate the camera as plumb_bob (k1 k2 p1 p2 k3), or give no distortion and fit the lens '
+    '(--lens fitted)'
+)
 POSED = 'flange_pose'  # name of the virtual arm
 
 
@@ -167,14 +171,14 @@ def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> 
 def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
     """Return the lens of a camera matrix (9), row by row, and its distortion k1 k2 p1 p2 k3."""
     if model not in DISTORTED:
-        raise ConfigError(f'{where}: distortion_model must be plumb_bob, not {model!r}')
+        raise ConfigError(f'{where}: distortion_model {model!r} is not supported: {DO_INSTEAD}')
     if len(matrix) != 9:
         raise ConfigError(f'{where}: camera_matrix must hold 9 numbers, not {len(matrix)}')
     fx, skew, cx, under, fy, cy, *last = matrix
     if skew or under or last != [0.0, 0.0, 1.0] or fx <= 0.0 or fy <= 0.0:
         raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
     if any(distortion[5:]):
-        raise ConfigError(f'{where}: distortion supports only k1 k2 p1 p2 k3')
+        raise ConfigError(f'{where}: distortion beyond k3 is not supported: {DO_INSTEAD}')
     distorted: dict[str, Any] = dict(zip(LENS_KINDS[4:], distortion, strict=False))
     return Lens(fx, fy, cx, cy, **distorted)
 

@@ -252,7 +252,7 @@ def test_memory_for_images_is_bounded(monkeypatch):
         ({'binning_x': 2}, 'without roi and binning'),
         ({'binning_y': 2}, 'without roi and binning'),
         ({'roi': RegionOfInterest(y_offset=8)}, 'without roi and binning'),
-        ({'distortion_model': 'equidistant'}, 'must be plumb_bob'),
+        ({'distortion_model': 'equidistant'}, 'as plumb_bob'),
         ({'d': [0.0] * 5 + [0.1] * 3}, 'only k1 k2 p1 p2 k3'),
     ],
 )
