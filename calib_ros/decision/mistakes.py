@@ -26,7 +26,7 @@ import numpy as np
 from calib_ros.decision.lost_rows import lost
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.suspects import ORIENTATIONS, Sets, Suspect, dead, signs, suspects
+from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
 from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
 from calib_ros.estimation.levels import (
     ALIKE,
@@ -244,7 +244,7 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
 
     Beam search: another mistake is added to each of the best few, until the arm explains the rest
     or another is no better. The first may be no better alone: two mistakes can hide each other. So
-    the signs of two and three joints are tried together.
+    these are tried together (`hidden`).
     """
     if given.error <= problem.largest_error:
         return None
@@ -256,9 +256,9 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
     for number in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[Trial, tuple[Suspect, ...]]] = {}
         together = [(*some, each) for some in kept for each in options]
-        for some in together if number else [*together, *signs(chain)]:
+        for some in together if number else [*together, *hidden(chain, options)]:
             if len({one.part for one in some}) == len(some):
-                more = tuple(sorted(some, key=lambda one: one.part != 'measured'))
+                more = tuple(sorted(some, key=lambda one: (*FIRST, one.part).index(one.part)))
                 trial = trial_of(chain, reduce(lambda sets, one: one.undone(sets), more, few))
                 if trial is not None:  # keeps the first of equivalent ones
                     found.setdefault(round(trial.share, 6), (trial, more))
@@ -276,7 +276,7 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
 def _together(mistakes: Sequence[Suspect]) -> Suspect:
     published = [f'{each.what} ({each.published})' for each in mistakes]
     of_tables = [
-        f'{each.what} ({each.remedy})' if each.part == 'measured' else setting
+        setting if 'chain file' in each.published else f'{each.what} ({each.remedy})'
         for each, setting in zip(mistakes, published, strict=True)
     ]
     what = 'several mistakes at once'

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import TypeAlias
@@ -30,6 +30,8 @@ ANGLES = (
 )
 """Actual unit of angles, assumed unit, option, and size of the actual in the assumed one."""
 SCALES = {'mm': 1e-3, 'cm': 1e-2, 'in': 0.0254}
+FIRST = ('measured', 'handed', 'order')
+"""Parts whose mistakes are undone before those of single joints."""
 NOT_ON_FLANGE = ('the camera is not on the flange', 'leave out --eye-in-hand (or eye_in_hand)')
 
 
@@ -40,7 +42,7 @@ class Suspect:
     `changes` in order undo it in the samples, `chain` is the corrected nominal one, joint values
     are `rows` below their measurement. Of equivalent mistakes, those of lowest `rank` are named.
     `published` is the remedy for messages, live or from a bag. Mistakes of different parts
-    (`measured` or a joint) may occur together.
+    (those of FIRST, or a joint) may occur together.
     """
 
     what: str
@@ -86,7 +88,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
             yield from _misread(chain, seen)
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
-        yield Suspect(what, remedy, (_mirrored,), 3)
+        yield Suspect(what, remedy, (_mirrored,), 3, part='handed')
     yield from _of_places(chain)
 
 
@@ -242,12 +244,14 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         what = f'{names[i]} and {names[j]} are swapped'
         remedy = f'--columns q{i + 1}=q{j + 1},q{j + 1}=q{i + 1}'
         published = 'swap them in joint_names, start without resume'
-        yield Suspect(what, remedy, (_joints(same[order]),), 2, published=published)
+        change = (_joints(same[order]),)
+        yield Suspect(what, remedy, change, 2, published=published, part='order')
     if len(names) > 3:
         columns = ','.join(f'q{k}=q{len(names) + 1 - k}' for k in range(1, len(names) + 1))
         what = 'the joints are in the order from tool to base'
         published = 'reverse joint_names, start without resume'
-        yield Suspect(what, f'--columns {columns}', (_joints(same[::-1]),), 2, published=published)
+        change = (_joints(same[::-1]),)
+        yield Suspect(what, f'--columns {columns}', change, 2, published=published, part='order')
     for k, stands in ((0, 'device moves'), (len(names) - 1, 'target does not move')):
         what = f'the {stands} with {names[k]}'
         remedy = 'leave this joint out of the chain file'
@@ -263,10 +267,11 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
             yield Suspect(what, remedy, (_joints(coupled),), 2)
 
 
-def signs(chain: Chain) -> list[tuple[Suspect, ...]]:
-    """Return mistakes of the signs of two and three joints at once."""
-    each = [_of_joint(chain, k, -1.0, '', 0.0) for k in range(len(chain.joints))]
-    return [*combinations(each, 2), *combinations(each, 3)]
+def hidden(chain: Chain, others: Sequence[Suspect]) -> list[tuple[Suspect, ...]]:
+    """Return mistakes that hide each other: signs, also with others in hand or order."""
+    signs = [_of_joint(chain, k, -1.0, '', 0.0) for k in range(len(chain.joints))]
+    ones = [each for each in others if each.part in FIRST[1:]]
+    return [*combinations(signs, 2), *product(ones, signs), *combinations(signs, 3)]
 
 
 def _of_one_unit(chain: Chain) -> Iterator[Suspect]:

@@ -12,7 +12,7 @@ from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.misread import _angles
 from calib_ros.decision.mistakes import explained
-from calib_ros.decision.suspects import dead
+from calib_ros.decision.suspects import _mirrored, _scaled, dead
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 
@@ -194,6 +194,14 @@ SEVERAL = {
         joints(lambda q: q * [1.0, -1.0, -1.0, 1.0, -1.0, 1.0]),
         [f'{name} counts the other way round' for name in (*TWO, 'elbow_joint')],
     ),
+    'a swap and a sign': (
+        joints(lambda q: (SIGNS * q)[:, [4, 1, 2, 3, 0, 5]]),
+        ('--columns q1=q5,q5=q1', 'elbow_joint counts the other way round'),
+    ),
+    'left-handed, in mm': (
+        lambda e: _scaled(1e3)(_mirrored(e)),
+        ('(--length mm)', 'axes of the measuring device are left-handed'),
+    ),
     'two units': (
         joints(lambda q: TWO_UNITS * q),
         [f'{name} is in degrees, the other joints in radians' for name in TWO],
@@ -214,6 +222,8 @@ SEVERAL = {
     [
         ('two signs', True),
         ('signs that hide each other', True),
+        ('a swap and a sign', True),
+        ('left-handed, in mm', True),
         ('two units', True),
         ('two units', False),
         ('sign and zero, in mm', False),
