@@ -2,6 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Something moved during the session: one step in time of a base, a tool or a joint's zero.
 
+If residuals are larger than the noise, one of the load and of all zeros at once is searched too,
+beyond what the arm bends under a constant load at its end.
+
 Each of these adds a group of columns X to the linear model, switched on at some stop. At the fit,
 with J the columns of the parameters and r the residuals, a group explains, of the remaining
 squares,
@@ -28,13 +31,14 @@ from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE, chance_of
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.robust import weights_of
+from calib_ros.estimation.robust import SUSPICIOUS, weights_of
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
+FRAMES = ('base', 'tool')
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
 
@@ -43,8 +47,9 @@ EXPLAINED = 0.5
 class Step:
     """What moved, when and by how much.
 
-    A base or tool frame, or a joint (`kind`: 'base', 'tool' or 'joint'); `thing` names the device
-    or target there. `set`, `sample`, its `image` and `stamp_ns` belong to the first sample after
+    A base or tool frame, a joint, all joints or the load (`kind`: 'base', 'tool', 'joint',
+    'joints' or 'load'); `thing` names the device or target there. `set`, `sample`, its `image` and
+    `stamp_ns` belong to the first sample after
     the step. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
     ('rad'); of a joint that of its zero. `share` is its share of the squared residuals beyond that
     of as many useless parameters. If all measurements on one side are outliers, `unused` says
@@ -70,13 +75,13 @@ class Step:
     @property
     def harmful(self) -> bool:
         """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
-        return self.kind == 'joint' or not self.unused
+        return self.kind not in FRAMES or not self.unused
 
     @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
         rule = Rule.MISTAKE if self.held else Rule.MOVED
-        return Reason(Rule.ENCODER if self.kind == 'joint' else rule, str(self))
+        return Reason(Rule.ENCODER if self.kind.startswith('joint') else rule, str(self))
 
     def __str__(self) -> str:
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
@@ -93,7 +98,12 @@ class Step:
         thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':
             thing, of = f'the zero of {self.what}', ''
+        if self.kind == 'joints':
+            thing, of = 'the zeros of several joints', ' at the target'
         text = f'{thing} moved {size}{of} before {where} ({when})'
+        if self.kind == 'load':
+            text = f'the load of the arm changed before {where} ({when}): poses differ {size}; '
+            text += 'measure with one load, or fit only the poses before or only those after'
         if self.unused:
             text += f'; measurements {self.unused} carry no weight'
         if self.apart:
@@ -109,6 +119,9 @@ def find_step(fitted: Fitted) -> Step | None:
     found = scan.best()
     if found is not None and scan.few_gross(found):
         scan = _Scan(fitted, gross=False)
+        found = scan.best()
+    if found is None and fitted.noise.position >= SUSPICIOUS:
+        scan = _Scan(fitted, arm=True)
         found = scan.best()
     return None if found is None or scan.drifts(found) else scan.described(found)
 
@@ -154,10 +167,14 @@ class _Found:
 class _Scan:
     """The linear model at a fit, with columns of everything that may have moved."""
 
-    def __init__(self, fitted: Fitted, gross: bool = True) -> None:
+    def __init__(self, fitted: Fitted, gross: bool = True, arm: bool = False) -> None:
         problem, names, robust = fitted.problem, fitted.names, fitted.robust
         self._problem, self._chain = problem, robust.fit.chain
-        self._groups = _groups(problem)
+        self._groups = _of_the_arm(problem) if arm else _groups(problem)
+        loads = [n for group in self._groups if group.kind == 'load' for n in group.names]
+        constant = [name for name in loads if name not in names]
+        self._chain = self._chain.with_effects(constant)
+        names = (*names, *constant)
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
         self._names = list(dict.fromkeys([*names, *self._added]))
@@ -175,7 +192,8 @@ class _Scan:
         number[order] = stops(np.concatenate([each.joints for each in sets])[order])
         self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
         self._stops = int(number.max(initial=-1)) + 1
-        extra, offset = replace(few, separations=()).extra_rows(self._chain, names)
+        known = replace(few, separations=()).extra_rows(self._chain, fitted.names)
+        extra, offset = np.pad(known[0], ((0, 0), (0, len(constant)))), known[1]
         whole = np.array([gram(rows) for rows in self._rows])
         matrix = whole.sum(axis=0)[: self._fitted]
         normal = matrix[:, : self._fitted] + extra.T @ extra
@@ -338,14 +356,24 @@ def _apart(joints: FloatArray, after: Flags) -> bool:
 
 
 def _thing(kind: str, seen: Observations) -> str:
-    if kind == 'joint':
-        return 'the joint'
+    if kind not in FRAMES:
+        return 'the load' if kind == 'load' else f'the {kind}'
     of_images = seen.pixels is not None
     target = ['the board' if of_images else 'the target']
     device = ['the camera', 'its lens'] if of_images else ['the measuring device']
     on_flange, other = (device, target) if seen.inverse or seen.on_flange else (target, device)
     *first, last = on_flange if kind == 'tool' else [*other, "the robot's foot"]
     return f'{", ".join(first)} or {last}' if first else last
+
+
+def _of_the_arm(problem: Problem) -> list[_Group]:
+    """Return the load, with the torque of a weight at the last joint, and the zeros of all."""
+    joints, everywhere = problem.chain.joints, tuple(range(len(problem.sets)))
+    last = joints[-1].name
+    load = tuple(Parameter(j.name, f'gravity_{last}') for j in joints if j.type == 'revolute')
+    zeros = tuple(joint.driven for joint in joints)
+    loads = [_Group('the load', 'load', load, everywhere)] if load else []
+    return [*loads, _Group('all joints', 'joints', zeros, everywhere)]
 
 
 def _groups(problem: Problem) -> list[_Group]:

@@ -23,6 +23,7 @@ from calib_ros.report.words import remarks
 
 COUNT, AT = 60, 26
 DESIGNS = ('random', 'path', 'sweep')
+ZEROS = [f'{name}.theta' for name in UR10E.joint_names]
 pytestmark = pytest.mark.usefixtures('unsearched')
 
 
@@ -283,3 +284,26 @@ def test_a_base_held_in_a_wrong_place_is_no_step(rng):
     result = identify(Problem(chain, seen, **SIGMAS))
     assert result.refusals[0].rule is Rule.MISTAKE
     assert 'the base held by the chain file is off by' in result.refusals[0]
+
+
+@pytest.mark.parametrize('what', ['load', 'joints', None])
+def test_another_load_and_other_zeros_of_all_joints(what, rng):
+    zeros = {name: 8e-4 * sign for name, sign in zip(ZEROS, (1, -1, 1, 1, -1, 1), strict=True)}
+    load = {f'{joint}.gravity_wrist_3_joint': 6e-4 for joint in UR10E.joint_names[1:4]}
+    true = arm(rng).with_effects(list(load)).with_offsets(load)  # a constant one is no step
+    changed = {'load': load, 'joints': zeros, None: {}}[what]
+    q, cell = poses('random', rng), Cell()
+    parts = [
+        measure(each, part, np.random.default_rng(k), *NOISE, cell)
+        for k, (each, part) in enumerate(((true, q[:AT]), (true.with_offsets(changed), q[AT:])))
+    ]
+    seen = Observations.from_arrays(
+        q, *(np.concatenate([getattr(e, k) for e in parts]) for k in ('positions', 'rotations'))
+    )
+    result = identify(Problem(UR10E, seen, **SIGMAS))
+    if what is None:
+        assert result.step is None
+        assert result.accepted
+    else:
+        assert (result.step.kind, result.step.sample) == (what, AT)
+        assert result.refusals[0].rule is (Rule.MOVED if what == 'load' else Rule.ENCODER)
