@@ -26,10 +26,8 @@ from calib_ros.progress import Notify
 from calib_ros.report.advice import ENOUGH
 from calib_ros.report.applied import plan_report
 
-TESTS = (
-    'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}: visit them in turn, 30 times, '
-    'and measure. Collisions are not checked'
-)
+TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
+VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
 ORIENTED = 'various orientations', 'one orientation'
 
 
@@ -55,7 +53,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
         remarks.append(f'the tool is unknown: the target is assumed at {place} m from the flange')
-    screen.say('\n'.join([*table, *remarks]))
+    screen.say('\n'.join([*table, *remarks, *([VISIT] if plan is None else [])]))
     if options.out is not None:
         page = _page_beside(options.out)
         origin = given.origin_of(options, (options.candidates, options.task, options.taken))

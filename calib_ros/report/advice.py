@@ -34,6 +34,12 @@ class Advice:
     refusal: str = ''  # the sentence of its rule
     again: str = AGAIN  # what to identify next
 
+    @property
+    def in_short(self) -> str:
+        """Return the heading, with the mistake if there is one."""
+        named = self.heading == rules()[Rule.MISTAKE].heading
+        return f'{self.heading}: {self.refusal.partition(" (")[0]}' if named else self.heading
+
 
 ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a convention
 SPREAD_OUT = 'spread over the whole workspace, with every joint moved through most of its range'

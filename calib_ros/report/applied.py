@@ -73,7 +73,7 @@ def _worst(found: Survey) -> Iterator[Section]:
         yield Section(
             f'regions-{label.split()[0]}',
             title,
-            ('The 6 regions with the largest errors, and the one with the smallest.',),
+            ('The 6 regions with the most, and the one with the least.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
             rows=tuple(map(_region, shown)),
         )
@@ -134,8 +134,9 @@ def plan_report(
     what = 'Test poses' if found is None else 'Poses to measure'
     verdict = Verdict('info', what, (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
+        'If you correct programs, not the controller, correct these poses: calib_ros compensate.',
         'Visit P1 to P5 in turn, 30 times, and measure each time.',
-        'Then judge: calib_ros verify.',
+        'Then judge: calib_ros verify with --commanded and these poses as they are here.',
     )
     if found is not None:
         curve = figures.predictions(found.accuracy, found.at_random, wanted_mm)
@@ -168,12 +169,14 @@ def plan_report(
 
 def _visit(chain: Chain, joints: FloatArray) -> Section:
     order = list(range(1, len(joints) + 1))
+    scale = figures.scale_of('order of visit')
+    scale['colorbar'] |= {'tickformat': 'd', 'nticks': min(len(order), 6)}
     path = figures.in_space(
         in_base(chain, joints)[:, :3, 3],
         'order of visit',
         mode='lines+markers',
         line={'color': '#b0b7bf', 'width': 2},
-        marker={'size': 5, 'color': order, **figures.scale_of('order of visit')},
+        marker={'size': 5, 'color': order, **scale},
         text=[f'pose {k}' for k in order],
         hoverinfo='text',
     )

@@ -74,7 +74,8 @@ def cumulated(before_mm: FloatArray, after_mm: FloatArray, things: str) -> Figur
         )
         for name, errors, line in (('before', before_mm, DASHED), ('after', after_mm, SOLID))
     ]
-    across = axis('position error [mm]', rangemode='tozero')
+    most = float(max(before_mm.max(initial=0.0), after_mm.max(initial=0.0)))
+    across = axis('position error [mm]', range=[0, 1.02 * most or 1.0])
     up = axis(f'{things} with at most this error [%]', range=[0, 100])
     return {'data': data, 'layout': {'xaxis': across, 'yaxis': up}}
 
@@ -253,5 +254,6 @@ def space(*data: Figure) -> Figure:
     """Return a figure in space with equal scales."""
     axes = {f'{name}axis': axis(f'{name} [m]') for name in 'xyz'}
     margin = {'l': 0, 'r': 0, 't': 30, 'b': 0}
-    layout = {'scene': {'aspectmode': 'data', **axes}, 'margin': margin}
+    look = {'eye': {'x': 1.9, 'y': -1.3, 'z': 0.8}, 'center': {'x': 0, 'y': 0, 'z': -0.15}}
+    layout = {'scene': {'aspectmode': 'data', 'camera': look, **axes}, 'margin': margin}
     return {'data': list(data), 'layout': layout}

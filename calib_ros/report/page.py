@@ -23,8 +23,14 @@ from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
-TYPED = re.compile(r'(?<![\w-])--[a-z][a-z0-9-]*( auto)?|calib_ros [a-z0-9]+(?![\w])')
-"""An option or a command."""
+VALUE = (
+    r'auto|none|mm|cm|deg|rad|[A-Z]{3}|[xyzw]{3,4}|\d+(?:\.\d+)?(?:e-?\d+)?|[a-z]+_?[a-z]*\d\w*'
+    r'|[\w*]+=[^\s;)]*[^\s;),.]|&(?:quot|#x27);\S+?&(?:quot|#x27);'
+)
+TYPED = re.compile(
+    rf'(?<![\w-])--[a-z][a-z0-9-]*(?: (?:{VALUE})(?![\w=-]))?|calib_ros [a-z0-9]+(?!\w)'
+)
+"""An option, with its value as messages write it, or a command."""
 MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
@@ -176,7 +182,7 @@ def filled(template: str, **values: Any) -> str | None:
     )
     values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
     safe = environment.filters['safe']
-    environment.filters['typed'] = lambda text: safe(_typed(text))
+    environment.filters['typed'] = lambda text: safe(typed(text))
     page: str = environment.get_template(template).render(**values)
     return page
 
@@ -185,7 +191,7 @@ def _template(name: str) -> str:
     return (resources.files('calib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
-def _typed(text: str) -> str:
+def typed(text: str) -> str:
     """Return a text as HTML, with commands and options as code that does not break at hyphens."""
     return TYPED.sub(r'<code>\g<0></code>', html.escape(str(_shown(text))))
 

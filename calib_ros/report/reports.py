@@ -160,7 +160,7 @@ def _refused(reasons: Sequence[Advice]) -> Verdict:
     if reasons[0].heading == GOOD_ARM.heading:
         heading = 'Not accepted, nothing to correct: the robot stays as it was'
         return Verdict('info', heading, (tried,))
-    whys = '. '.join(each.heading for each in reasons if each.steps)
+    whys = '. '.join(each.in_short for each in reasons if each.steps)
     return Verdict('bad', 'Not accepted: the robot stays as it was', (f'Why: {whys}.', tried))
 
 
@@ -177,6 +177,9 @@ def _steps(
     beyond = tolerance is not None and limits[0] > tolerance
     undecided = tolerance is not None and limits[0] <= tolerance < limits[1]
     found = {
+        'First check what is named above. If it is true, remove the cause and identify again.': (
+            bool(result.remarks)
+        ),
         'To get closer to the tolerance, identify with --model auto: it also corrects gears, '
         'gravity and backlash where that helps.': beyond and not result.chain.effects,
         'Compare the remaining error with the accuracy of the measuring device: no calibration '

@@ -108,7 +108,7 @@ def test_a_mistake_is_the_first_reason_and_what_follows_has_no_steps():
     report = report_of(problem, identify(problem))
     first, *others = report.advice
     assert '--chain ur5e' in first.refusal
-    assert report.verdict.text[0] == f'Why: {first.heading}.'
+    assert report.verdict.text[0].startswith(f'Why: {first.heading}: the arm is a ur5e')
     assert [each.steps for each in others] == [()]
 
 

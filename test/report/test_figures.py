@@ -139,6 +139,7 @@ def test_the_share_of_poses_within_an_error_is_counted(rng, count):
         for x, y in zip(curve['x'][1:], curve['y'][1:], strict=True):
             within = errors <= x * (1.0 + 1e-4)  # digits shown
             assert y == pytest.approx(100.0 * within.mean(), abs=0.1)
+    assert figure['layout']['xaxis']['range'][1] > max(before.max(), after.max())  # not cut
     assert drawing(figure, 200)
 
 

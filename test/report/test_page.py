@@ -20,7 +20,7 @@ from calib_ros.apply.workspace import survey
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.files.rows import Input
 from calib_ros.kinematics.chain_file import table_hash
-from calib_ros.report import advice
+from calib_ros.report import advice, page
 from calib_ros.report.applied import workspace_report
 from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
@@ -213,9 +213,28 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
     region = {'whole': False, 'share': 0.1, 'limit_mm': 1.0}
     assert as_document(near, {})['region'] == region
     doubtful = replace(result, remarks=('the arm is a ur3, not a ur5e',))
-    verdict = report_of(problem, doubtful).verdict
+    report = report_of(problem, doubtful)
+    verdict = report.verdict
     assert 'ur3' in verdict.text[1]
     assert verdict.state == 'open'
+    assert report.steps[0].startswith('First check what is named above')
+
+
+@pytest.mark.parametrize(
+    ('text', 'code'),
+    [
+        ('in the chain file, or --columns q3=-q3 (else', '--columns q3=-q3'),
+        ('--quaternion wxyz.', '--quaternion wxyz'),
+        ('set --largest-loss 0.25.', '--largest-loss 0.25'),
+        ('the arm is a ur10e: --chain ur10e (the', '--chain ur10e'),
+        ('--columns "q1=#1,x=#2": so', '--columns &quot;q1=#1,x=#2&quot;'),
+        ('--force replaces files', '--force'),
+        ('--new-base refits', '--new-base'),
+        ('run calib_ros verify.', 'calib_ros verify'),
+    ],
+)
+def test_options_are_code_with_their_values(text, code):
+    assert f'<code>{code}</code>' in page.typed(text)
 
 
 def test_no_pose_is_called_judged_where_none_was_left_out():
