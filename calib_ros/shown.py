@@ -8,7 +8,7 @@ import html
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -92,4 +92,6 @@ def _brief(value: object) -> str:
         text = repr(value) if plain else ''
         return text if 0 < len(text) <= 60 else f'<{len(value)} in a {type(value).__name__}>'
     text = repr(value)
+    if len(text) > 60 and is_dataclass(value) and 'array(' in text:
+        return f'<{type(value).__name__}>'
     return text if len(text) <= 60 else text[:57] + '...'

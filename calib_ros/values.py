@@ -34,6 +34,16 @@ MOST_NAMES = MOST_ENTRIES // 20
 """Joints of a chain, frames, targets, or sets of joint names in a cell."""
 
 
+def require(kind: type, **given: object) -> None:
+    """Refuse arguments of another type, by their names."""
+    for name, value in given.items():
+        if not isinstance(value, kind):
+            made = ' (Calibration.of(result))' if kind.__name__ == 'Calibration' else ''
+            raise ConfigError(
+                f'{name} must be of type {kind.__name__}{made}, not {type(value).__name__}'
+            )
+
+
 def parse_number(
     value: object,
     where: str,

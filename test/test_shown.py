@@ -36,9 +36,26 @@ def test_a_value_fits_on_a_screen(value):
     assert len(re.findall('<tr>', value._repr_html_())) >= 5
 
 
+@pytest.mark.parametrize(
+    ('call', 'said'),
+    [
+        (lambda: calib_ros.Problem(SEEN, CHAIN), 'chain must be of type Chain, not Observations'),
+        (lambda: calib_ros.identify(CHAIN), 'problem must be of type Problem, not Chain'),
+        (lambda: calib_ros.verify(RESULT, [SEEN], None), r'Calibration \(Calibration.of\(result'),
+        (lambda: calib_ros.verify(ARM, SEEN, None), 'sets must be a list of Observations'),
+        (lambda: calib_ros.difference(ARM, RESULT), 'second must be of type Calibration'),
+        (lambda: calib_ros.CalibrationSession('ur10e'), 'chain must be of type Chain, not str'),
+    ],
+)
+def test_arguments_of_another_type_are_named(call, said):
+    with pytest.raises(calib_ros.CalibrationError, match=said):
+        call()
+
+
 def test_a_result_is_a_data_frame():
     frame = RESULT.to_frame()
     assert list(frame['parameter']) == [p.name for p in RESULT.parameters]
+    assert frame['offset'].isna().sum() == 12  # base and tool are placed, not off
     assert frame['std'].isna().sum() == sum(p.std is None for p in RESULT.parameters)
     residuals = RESULT.fitted.to_frame()
     assert len(residuals) == 200
@@ -57,7 +74,9 @@ def test_without_pandas_that_is_said(monkeypatch):
 def test_a_notebook_shows_the_verdict_and_its_reasons():
     refused = replace(RESULT, refusals=(Reason(Rule.GAIN, 'no <b>gain'),))
     assert 'accepted</strong>' in RESULT._repr_html_()
-    assert f'{1e3 * RESULT.parameters[0].half_width():.4f}' in RESULT._repr_html_()
+    (arm,) = (p for p in RESULT.parameters if p.name == 'elbow_joint.a')
+    assert f'{1e3 * arm.half_width():.4f}' in RESULT._repr_html_()
+    assert 'base.x' not in RESULT._repr_html_()
     shown = refused._repr_html_()
     assert 'not accepted' in shown
     assert 'no &lt;b&gt;gain' in shown

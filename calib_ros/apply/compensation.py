@@ -29,6 +29,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
 from calib_ros.shown import Shown
+from calib_ros.values import require
 
 BESIDE = LEVER / 3.0
 """Distance [m] from the tool at which the effect of a turn is reported: a small tool's length."""
@@ -110,6 +111,7 @@ def compensate(
 
     Raises InputError for joint values of the wrong shape, or not finite.
     """
+    require(Compensator, compensator=compensator)
     command = np.array(joints, dtype=np.float64)
     count = len(compensator.nominal.joints)
     if command.ndim != 2 or command.shape[1] != count or not len(command):

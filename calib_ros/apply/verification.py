@@ -48,7 +48,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, Shown
-from calib_ros.values import SAME
+from calib_ros.values import SAME, require
 
 Verdict: TypeAlias = Literal['PASS', 'FAIL', 'UNDECIDED', 'holds', 'does not hold', 'no verdict']
 STANDS: dict[Verdict, Verdict] = {'PASS': 'holds', 'FAIL': 'does not hold'}
@@ -160,6 +160,9 @@ def verify(
     all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
+    require(Calibration, arm=arm)
+    if isinstance(sets, Observations) or not sets:
+        raise ConfigError('sets must be a list of Observations, at least one')
     _check(arm.chain, sets, tolerance, confidence, fitted)
     comparison, left, uncorrected = _compared(arm, sets, commanded, fitted)
     progress(2 / 3)

@@ -154,7 +154,7 @@ class Identification(Shown):
             {
                 'parameter': [str(p.name) for p in rows],
                 'value': [p.value for p in rows],
-                'offset': [p.offset for p in rows],
+                'offset': [None if self.chain.owns_frame(p.name) else p.offset for p in rows],
                 'std': [p.std for p in rows],
                 'within_95': [p.half_width() for p in rows],
                 'unit': [p.name.unit for p in rows],
@@ -168,7 +168,7 @@ class Identification(Shown):
         rows += [
             (str(p.name), f'{1e3 * p.offset:+.4f}', f'{1e3 * (p.half_width() or 0.0):.4f}')
             for p in self.parameters
-            if p.std is not None
+            if p.std is not None and not self.chain.owns_frame(p.name)
         ]
         figures = f'RMS {before.rms_mm:.3f} → {after.rms_mm:.3f} mm, by {self.validated_by}'
         verdict = 'accepted' if self.accepted else 'not accepted'

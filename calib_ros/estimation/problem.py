@@ -26,6 +26,7 @@ from calib_ros.kinematics.parameter import DELAY, FRAME_KINDS, LENS_KINDS, Param
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
+from calib_ros.values import require
 
 SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
 TOOL = 1.0  # largest length [m] of a target on a flange, assumed
@@ -91,6 +92,8 @@ class Problem(Shown):
     """True if the samples were messages, to which table options do not apply."""
 
     def __post_init__(self) -> None:
+        require(Chain, chain=self.chain)
+        require(Observations, observations=self.observations)
         priors = {f'the prior of {pattern}': sigma for pattern, sigma in self.priors.items()}
         for name, sigma in (self.sigmas | priors).items():
             if not isinstance(sigma, Real) or not 0.0 < float(sigma) < np.inf:

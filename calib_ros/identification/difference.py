@@ -41,6 +41,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
 from calib_ros.shown import Shown
+from calib_ros.values import require
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,6 +124,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
 
     Raises InputError if they have different joints, or no covariance.
     """
+    require(Calibration, first=first, second=second)
     arms = first.chain, second.chain
     ours, theirs = map(_rows_in_words, arms)
     if ours != theirs:

@@ -43,6 +43,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet, share_of
 from calib_ros.settings import EXCEPTION, effects_of
+from calib_ros.values import require
 
 
 @np.errstate(divide='ignore', over='ignore', invalid='ignore')  # of a diverging fit
@@ -57,6 +58,7 @@ def identify(
     Raises TooFewObservationsError with fewer equations than parameters. Raises InputError if the
     fit diverges; the message names the mistake that explains it, if any.
     """
+    require(Problem, problem=problem)
     try:
         return _identified(problem, simpler, progress)
     except np.linalg.LinAlgError as err:
@@ -209,6 +211,7 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
     geometric result is returned with the verdicts and a remark. An exception from `progress` ends
     the work. Raises UnknownNameError for another model.
     """
+    require(Problem, problem=problem)
     progress(f'model {"geometric" if model == "auto" else model}')
     if model != 'auto':
         return identify(replace(problem, effects=effects_of(model)), progress=progress)

@@ -42,6 +42,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
+from calib_ros.values import require
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -68,6 +69,7 @@ def recalibrate(
 
     Raises InputError if the calibration has no covariance, or does not know a frame.
     """
+    require(Calibration, previous=previous)
     found, arm = _recalibrated(previous, problem, years, growth, new)
     if found.accepted or found.reused or found.scale is not None:
         return found

@@ -27,7 +27,8 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         return found | {'after_with_outliers': asdict(which.figures_of_all[1])}
 
     def parameter(p: ParameterRow) -> dict[str, Any]:
-        found = {'value': p.value, 'offset': p.offset, 'std': p.std}
+        offset = None if result.chain.owns_frame(p.name) else p.offset
+        found = {'value': p.value, 'offset': offset, 'std': p.std}
         found['half_width_95'] = p.half_width()
         return found | {'unit': p.name.unit, 'status': p.status}
 

@@ -35,6 +35,7 @@ from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
+from calib_ros.values import require
 
 NOT_RECORDING = 'not recording: call ~/record with true'
 ONE_FRAME = (
@@ -57,6 +58,7 @@ class CalibrationSession:
         on_sample: Callable[[Sample], None] | None = None,
         on_removed: Callable[[Sample], None] | None = None,
     ) -> None:
+        require(Chain, chain=chain)
         self.chain = chain
         self.settings = settings or Settings()
         self.pictures = Pictures(lambda: self.settings.sigma_pixel)
@@ -196,6 +198,10 @@ class CalibrationSession:
         if why := self._entry.refused.get(JOINTS):
             return f'nothing can be sampled: joint states are refused, {why}'
         return self._collector.state()
+
+    def __repr__(self) -> str:
+        """Return the arm and what became of the messages."""
+        return f'<CalibrationSession of {self.chain.name}: {self.account()}>'
 
     def account(self) -> Account:
         """Return the account of the messages so far."""
