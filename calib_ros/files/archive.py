@@ -156,6 +156,11 @@ class Archive:
         return f'poses are in memory only: {self.error}; ' if self.error else ''
 
     @property
+    def _unsafe(self) -> bool:
+        """Tell whether samples would be lost if the files were closed."""
+        return bool(self.error and (self._waiting or self._journal))
+
+    @property
     def journal(self) -> Path | None:
         """Return the path of the journal, if any."""
         return None if self._journal is None else self._journal.path
@@ -203,7 +208,7 @@ class Archive:
     def start_new(self) -> Path | None:
         """Start another journal, on disk at once; return the path of the old one."""
         self.write()
-        if self._waiting:
+        if self._unsafe:
             raise InputError(
                 f'poses are in memory only and would be lost: {self.error}; make room, or start '
                 'the node again with another data_dir'
@@ -263,13 +268,13 @@ class Archive:
         """Close the journal; return what could not be written to it, and where it is."""
         self.write()
         words = ''
-        if self._waiting:
+        if self._unsafe:
             why = self.error
             with suppress(OSError):
                 self._path = Path(mkdtemp(prefix='calib_ros_')) / self._path.name
                 self._begin(b'' if self._journal is None else self._journal.content)
                 self.write()
-            where = 'are lost' if self._waiting else f'are in {self._path}, not in {self.folder}'
+            where = 'are lost' if self._unsafe else f'are in {self._path}, not in {self.folder}'
             words = f'poses {where}: {why}'
         if self._journal is not None:
             self._journal.close()
