@@ -18,6 +18,7 @@ from operator import itemgetter
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -175,7 +176,12 @@ class Inputs:
         overriding = QoSOverridingOptions(
             (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
         )
-        hearing = self._topics.setdefault(self._node.resolve_topic_name(stream.topic), Hearing())
+        try:
+            name = self._node.resolve_topic_name(stream.topic)
+        except rclpy_implementation.RCLError as err:
+            why = str(err).partition(', at /')[0]
+            raise ConfigError(f'"{stream.topic}" is no topic name: {why}') from err
+        hearing = self._topics.setdefault(name, Hearing())
         hearing.latched = stream.still
         try:
             subscription = self._node.create_subscription(

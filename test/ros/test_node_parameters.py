@@ -106,6 +106,7 @@ def test_all_of_an_atomic_change_or_nothing(idle):
         ({'mode': 'dwel'}, 'did you mean "dwell"'),
         ({'fixed': ['joint_2.a']}, 'unknown parameter "joint_2.a"'),
         ({'sources': ['/pose', '/pose type=Range']}, 'named twice'),
+        ({'sources': ['/b{x}']}, '"/b{x}" is no topic name: failed to resolve name'),
         ({'max_gapp': 1.0}, 'did you mean "max_gap"'),
         ({'delay': 'none'}, 'parameter "delay" must be a finite number'),
         ({'serial': 12}, 'must be text, not 12: write it in quotes'),
