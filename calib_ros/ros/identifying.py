@@ -100,13 +100,14 @@ class Filer:
             if self._history is not None:
                 self._history.file(row())
         except (CalibrationError, OSError) as err:
-            return f'; not filed in the history: {err}'
+            return f'{NOT_FILED} in the history: {err}'
         return ''
 
 
 ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
 KEEP = '; to keep it call ~/save'
+NOT_FILED = '; not filed'
 TELLING = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
@@ -245,9 +246,15 @@ class Identifying:
             path = self._archive.note(f'{text}\n')
             path = self._report or path
             more = f' ... full text: {path.name if path else "in the log"}'
-            before, advice, rest = text.partition(self._advice or text)
-            more = (KEEP if KEEP in rest else '') + more
-            text = _without_middle(before, advice, ANSWER_LENGTH - len(more)) + more
+            kept = [each for each in (KEEP, NOT_FILED) if each in text]
+            said = text.partition(kept[0])[0] if kept else text
+            before, advice, _ = said.partition(self._advice or said)
+            room = ANSWER_LENGTH - len(''.join((*kept, more)))
+            if kept and not self._advice:
+                text = textwrap.shorten(said, room, placeholder=' ...')
+            else:
+                text = _without_middle(before, advice, room)
+            text = ''.join((text, *kept, more))
         return success, text
 
 

@@ -21,7 +21,7 @@ from calib_ros.files.history import History
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
-from calib_ros.ros.identifying import KEEP, Snapshot, _page, _without_middle
+from calib_ros.ros.identifying import KEEP, NOT_FILED, Snapshot, _page, _without_middle
 from calib_ros.settings import Settings
 
 
@@ -63,11 +63,15 @@ def test_an_accepted_answer_keeps_its_hint_whole_and_says_how_to_save(cell, tmp_
     cell.node._archive._path = tmp_path / 'ur10e_20260102T030405000006Z.csv'
     verdict, hint = 'accepted: 40 poses, RMS 1.911 -> 0.0053 mm', 'J moves one way: mix the order'
     identifying._advice = hint
-    rest = f'valid; {"not identifiable, " * 20}note: {hint}{KEEP}; not filed'
+    rest = f'valid; {"not identifiable, " * 20}note: {hint}{KEEP}{NOT_FILED}: no room'
     _, found = identifying.shortened((True, f'{verdict} (95 %: 0.0045 to 0.006 mm); {rest}'))
     assert len(found) <= 200
     assert found.startswith(verdict)
-    assert f'... {hint}{KEEP} ... full text: ' in found
+    assert f'... {hint}{KEEP}{NOT_FILED} ... full text: ' in found
+    identifying._advice = ''
+    _, found = identifying.shortened((True, f'{verdict}; {rest}'))
+    assert len(found) <= 200
+    assert f' ...{KEEP}{NOT_FILED} ... full text: ' in found
 
 
 @pytest.mark.parametrize('folder', ['data', 'of a cell with a long name ' * 9])
