@@ -26,6 +26,8 @@ def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
     value = getattr(importlib.import_module(_HOMES[name]), name)
+    if hasattr(value, '__dataclass_fields__'):
+        value.__doc__ = importlib.import_module('calib_ros.shown').WithFields(value)
     globals()[name] = value
     return value
 

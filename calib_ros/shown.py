@@ -4,11 +4,15 @@
 
 from __future__ import annotations
 
+import ast
 import html
+import inspect
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -51,6 +55,27 @@ class Shown:
             for name, value in _briefly(self)
         )
         return f'<table><caption>{type(self).__name__}</caption>{"".join(rows)}</table>'
+
+
+class WithFields:
+    """The docstring of a dataclass with its fields as they are written, for help().
+
+    The source is read only when it is asked for; what cannot be found is left out.
+    """
+
+    def __init__(self, documented: type) -> None:
+        self._of, self._text = documented, documented.__doc__ or ''
+
+    def __get__(self, instance: object, owner: type) -> str:
+        """Return the text."""
+        with suppress(OSError):
+            lines = inspect.getsource(self._of).splitlines()
+            (found,) = ast.parse(textwrap.dedent('\n'.join(lines))).body
+            assert isinstance(found, ast.ClassDef)
+            body = list(takewhile(lambda x: isinstance(x, ast.AnnAssign | ast.Expr), found.body))
+            begin, end = (each.end_lineno or 0 for each in (body[0], body[-1]))
+            return '\n'.join([self._text, *lines[begin:end]])
+        return self._text
 
 
 def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
