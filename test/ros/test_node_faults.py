@@ -135,6 +135,15 @@ def test_a_renamed_joint_is_named(cell, recording, all_renamed):
     cell.spin_until(lambda: heard and whole in heard[-1].status[0].message)
 
 
+def test_the_diagnostics_warn_of_what_the_status_says(cell, recording):
+    heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+    cell.play({'joint_states': joint_messages(recording)[:50]})
+    cell.spin_until(lambda: heard and 'no measurements received' in heard[-1].status[0].message)
+    assert heard[-1].status[0].level == DiagnosticStatus.WARN
+    cell.play({'measured_pose': pose_messages(recording.poses)[:4]})
+    cell.spin_until(lambda: heard[-1].status[0].level == DiagnosticStatus.OK)
+
+
 def test_poses_that_no_identification_takes_are_told_by_the_status(cell, recording):
     """The status ended in an internal error, and nobody was told what was wrong."""
     logged = cell.log()
