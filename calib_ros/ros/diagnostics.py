@@ -77,8 +77,8 @@ class Diagnostics:
         self._dropped_before = account.dropped
         if fresh:
             wrong.append(f'messages are dropped ({", ".join(fresh)})')
-        warned = any(hint.status for hint in self._session.hints)  # the status says of what
-        level = DiagnosticStatus.WARN if wrong or warned else DiagnosticStatus.OK
+        doubt = wrong or self._session.doubtful  # of what the status says
+        level = DiagnosticStatus.WARN if doubt else DiagnosticStatus.OK
         if self._archive.trouble or unloaded:
             level = DiagnosticStatus.ERROR
         return level, ''.join([self._archive.trouble, *(f'{text}; ' for text in wrong)])

@@ -251,6 +251,11 @@ class CalibrationSession:
         return found + (losses(self.received, self._dropped) or self._pipeline.unsettled())
 
     @property
+    def doubtful(self) -> bool:
+        """Tell whether the status says that messages are refused, or something looks wrong."""
+        return bool(self._entry.refused) or any(hint.status for hint in self.hints)
+
+    @property
     def delay(self) -> Delay | None:
         """Return the delay of the measurement stamps, if the motion shows it."""
         return self._clocks.delay
