@@ -13,7 +13,7 @@ from rclpy.node import Node
 from calib_ros.files.archive import Archive
 from calib_ros.ros.boundary import Boundary
 from calib_ros.ros.inputs import Inputs
-from calib_ros.sampling.hints import Account
+from calib_ros.sampling.account import Account
 from calib_ros.sampling.session import CalibrationSession
 
 

@@ -51,7 +51,7 @@ from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
 from calib_ros.ros.inputs import Inputs
 from calib_ros.ros.outputs import Published
-from calib_ros.sampling.hints import too_much_lost
+from calib_ros.sampling.account import too_much_lost
 from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings

@@ -17,20 +17,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
+from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.making import ROW_WIDTH, Found, Maker, Numbered
 from calib_ros.sampling.sample import Sample
-from calib_ros.sampling.slices import (
-    JOINTS,
-    NO_ACCIDENT,
-    POSES,
-    Rows,
-    Series,
-    Slice,
-    Stamps,
-    StreamKey,
-    Waiting,
-)
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
 from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings

@@ -8,7 +8,8 @@ import numpy as np
 
 from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
-from calib_ros.sampling.slices import Rows, Stamps
+from calib_ros.sampling.buffers import Rows
+from calib_ros.sampling.slices import Stamps
 
 MOVED = STILL  # change of a value [rad or m] that counts as a move
 

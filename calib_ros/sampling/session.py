@@ -19,6 +19,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
+from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Part
 from calib_ros.sampling.gathered import (
@@ -28,7 +29,7 @@ from calib_ros.sampling.gathered import (
     problem_of,
     problem_since,
 )
-from calib_ros.sampling.hints import Account, Hint, frozen, losses, progress, unheard
+from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline

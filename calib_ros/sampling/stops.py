@@ -11,8 +11,9 @@ import numpy as np
 
 from calib_ros.estimation.levels import FEW, MOST_OUTLIERS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.interpolation import unwrapped
-from calib_ros.sampling.slices import Rows, Stamps
+from calib_ros.sampling.slices import Stamps
 from calib_ros.settings import Settings
 
 MOVING = 'the arm was moving'  # why a measurement is not used

@@ -15,8 +15,9 @@ import numpy as np
 
 from calib_ros.estimation.levels import FEW, TELLING
 from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
-from calib_ros.sampling.slices import Rows, Series, Stamps
+from calib_ros.sampling.slices import Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
 LOOKS_BACK = FEW  # samples in the window that the present one is compared with

@@ -20,7 +20,8 @@ from arriving import (
 from hypothesis import given, settings, strategies as st
 from streams import START, stamps, stops, sweep
 
-from calib_ros.sampling.slices import NO_ACCIDENT, TOO_MANY
+from calib_ros.sampling.buffers import TOO_MANY
+from calib_ros.sampling.slices import NO_ACCIDENT
 from calib_ros.values import MOST_NAMES
 
 LATE = 'measurements: later than lateness allows'
@@ -198,7 +199,7 @@ def test_targets_that_gave_no_sample_make_room_for_others():
 
 
 def test_a_target_that_was_sampled_makes_no_room(monkeypatch):
-    monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 2)
+    monkeypatch.setattr('calib_ros.sampling.buffers.MOST_NAMES', 2)
     motion = tour()
     made = collector()
     both = [pose_events(motion, 1.5, key=marker(k)) for k in (1, 2)]

@@ -95,7 +95,7 @@ def outcome(session):
 def test_a_batch_is_taken_as_its_messages_are(monkeypatch, seed, mode):
     rng = np.random.default_rng(seed)
     if seed == 4:  # the first stream that comes when none is in use takes the only place
-        monkeypatch.setattr('calib_ros.sampling.slices.MOST_NAMES', 1)
+        monkeypatch.setattr('calib_ros.sampling.buffers.MOST_NAMES', 1)
     first, second = shift(rng), shift(rng)
     # The clock jumps back when the recording begins again.
     messages = first + (second if seed % 2 else [])

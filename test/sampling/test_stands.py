@@ -5,7 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from calib_ros.sampling.slices import Piece, Slice, StreamKey, Waiting
+from calib_ros.sampling.buffers import Waiting
+from calib_ros.sampling.slices import Piece, Slice, StreamKey
 from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
 from calib_ros.settings import Settings
 

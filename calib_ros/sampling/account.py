@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The account of messages: received, sampled, and lost by cause."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.sampling.slices import JOINTS, POSES
+
+LOST = 'were dropped (stamps or full buffers)'
+ALLOW = 'accept the rest with largest_loss (--largest-loss)'
+_LOSS = re.compile(r'stamp|lateness|buffer full|memory')
+_TWICE = re.compile(r'same stamp twice|already exists')
+
+
+@dataclass(frozen=True)
+class Account:
+    """Counts of messages received, samples made, and what was dropped, by cause."""
+
+    joint_states: int
+    poses: int
+    waiting: int
+    samples: int
+    held_out: int
+    configurations: int
+    unused: dict[str, int]
+    dropped: dict[str, int]
+    notes: dict[str, int]
+    foreign_names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        text = f'{self.joint_states} joint states and {self.poses} measurements gave '
+        text += f'{self.samples} poses'
+        if self.held_out:
+            text += f' to fit and {self.held_out} held out'
+        if self.configurations < self.samples:
+            text += f', {self.configurations} of them different'
+        if self.waiting:
+            text += f', {self.waiting} measurements waiting'
+        for label, counts in (
+            ('not used', self.unused),
+            ('dropped', self.dropped),
+            ('note', self.notes),
+        ):
+            if counts:
+                parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
+                text += f'; {label}: {parts}'
+        if self.foreign_names:
+            text += (
+                f'; joint states name {", ".join(self.foreign_names)}: give the chain of this arm '
+                '(--chain) or, if only the names differ, set joint_names (--joint-names)'
+            )
+        return text
+
+
+def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]:
+    """Return the share of messages of a kind that was lost, and the main cause.
+
+    Lost messages were dropped for their stamp or a full buffer; duplicates, and what the device
+    did not see, do not count.
+    """
+    causes = {
+        cause: count
+        for cause, count in dropped.items()
+        if cause.startswith(kind) and _LOSS.search(cause) and not _TWICE.search(cause)
+    }
+    most = max(causes, key=causes.__getitem__, default='')
+    return sum(causes.values()) / total if total else 0.0, most.removeprefix(f'{kind}: ')
+
+
+def too_much_lost(account: Account, largest_loss: float) -> list[Reason]:
+    """Return why a result must not be accepted: more than `largest_loss` of a kind was lost."""
+    counts = ((JOINTS, account.joint_states), (POSES, account.poses))
+    found = [(name, *lost(name, count, account.dropped)) for name, count in counts]
+    return [
+        Reason(
+            Rule.DROPPED,
+            f'{100.0 * share:.0f} % of the {name} {LOST}; {allowing(share)}, or remove the cause: '
+            f'{cause}',
+        )
+        for name, share, cause in found
+        if share > largest_loss
+    ]
+
+
+def allowing(share: float) -> str:
+    """Return how to accept the loss of a share."""
+    return f'{ALLOW} {min(1.0, share + 0.01):.2f}'

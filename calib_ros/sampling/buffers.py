@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Stamped rows of numbers in bounded buffers."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.sampling.slices import NO_ACCIDENT, Slice, Stamps, StreamKey
+from calib_ros.values import MOST_NAMES
+
+AS_FLOATS = 8.0 * float(np.finfo(np.float32).eps)
+"""Relative and absolute difference of equal values, which may have been rounded to float."""
+
+
+class Rows:
+    """Stamped rows of numbers in one growing array, up to a capacity."""
+
+    def __init__(self, width: int, capacity: int) -> None:
+        self.width, self.capacity = width, capacity
+        self.count = self.contrary = 0  # rows held; rows dropped for others of the same stamp
+        self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
+        self._values = np.empty((len(self._stamps), width))
+
+    @property
+    def full(self) -> bool:
+        """Tell whether there is no room for another row."""
+        return self.count == self.capacity
+
+    @property
+    def stamps(self) -> Stamps:
+        """Return the stamps (M,) in the order of arrival."""
+        return self._stamps[: self.count]
+
+    @property
+    def values(self) -> FloatArray:
+        """Return the rows (M, width) in the order of arrival."""
+        return self._values[: self.count]
+
+    def extend(self, stamps: Stamps, rows: FloatArray) -> None:
+        """Add rows (M, at most width), NaN where they are shorter; there is room for them."""
+        end = self.count + len(stamps)
+        if end > len(self._stamps):
+            size = min(max(2 * self.count, end), self.capacity)
+            self._stamps = np.resize(self._stamps, size)
+            self._values = np.resize(self._values, (size, self._values.shape[1]))
+        width = rows.shape[1]
+        self._stamps[self.count : end] = stamps
+        self._values[self.count : end, :width] = rows
+        self._values[self.count : end, width:] = np.nan
+        self.count = end
+
+    def keep(self, index: NDArray[np.generic]) -> None:
+        """Keep only the rows of a mask (N,) or an index (K,), in its order."""
+        stamps = self.stamps[index]
+        self._values[: len(stamps)] = self.values[index]
+        self._stamps[: len(stamps)] = stamps
+        self.count = len(stamps)
+
+    def release(self, count: int) -> None:
+        """Drop the first rows."""
+        left = self.count - count
+        self._values[:left] = self._values[count : self.count]
+        self._stamps[:left] = self._stamps[count : self.count]
+        self.count = left
+
+    def sort(self) -> int:
+        """Sort the rows by stamp, one row each; return how many were dropped.
+
+        Of equal stamps the smallest values are kept, so that the order of arrival does not matter.
+        """
+        before = self.count
+        if before > 1 and not (np.diff(self.stamps) > 0).all():
+            order = np.lexsort((*self.values.T[::-1], self.stamps))
+            stamps, values = self.stamps[order], self.values[order]
+            again = np.diff(stamps) == 0
+            near = np.isclose(
+                values[1:][again], values[:-1][again], AS_FLOATS, AS_FLOATS, equal_nan=True
+            )
+            self.contrary += int((~near.all(axis=1)).sum())
+            self.keep(order[np.concatenate([[True], ~again])])
+        return before - self.count
+
+
+TOO_LATE = 'measurements: later than lateness allows'
+TOO_MANY = f'measurements: beyond {MOST_NAMES} targets or frames'
+
+
+class Apart:
+    """How far the stamps of a stream are from those of the joint states that come with them."""
+
+    def __init__(self) -> None:
+        self._newest_ns = 0  # the joint state before the last measurement
+        self._row = self._live = 0  # far ones in a row, and those with new joint states between
+        self._last_ns = self._moved_ns = 0  # the last one, and most ahead while joint states came
+
+    def note(self, stamps: Stamps, newest: Stamps, far_ns: int) -> None:
+        """Note measurements (M,), some further than `far_ns` from the `newest` joint states."""
+        ahead = stamps - newest
+        far = (np.abs(ahead) > far_ns) & (newest != 0)
+        if far.any():
+            live = np.cumsum(far & (np.diff(newest, prepend=self._newest_ns) != 0))
+            live = live + self._live - np.maximum.accumulate(np.where(far, 0, live + self._live))
+            near = np.flatnonzero(~far)
+            self._row = len(far) - 1 - int(near[-1]) if len(near) else self._row + len(far)
+            self._live = int(live[-1])
+            if live.max() >= NO_ACCIDENT:
+                self._moved_ns = max(self._moved_ns, int(ahead[live.argmax()]), key=abs)
+        else:
+            self._row = self._live = 0
+        self._newest_ns, self._last_ns = int(newest[-1]), int(stamps[-1])
+
+    @property
+    def seconds(self) -> float:
+        """Return by how much the clocks differed while joint states came [s]."""
+        return 1e-9 * self._moved_ns
+
+    def alone(self, newest_ns: int, far_ns: int) -> float:
+        """Return for how long measurements have come without joint states [s]."""
+        ahead = self._last_ns - newest_ns
+        return 1e-9 * ahead if self._row >= NO_ACCIDENT and ahead > far_ns else 0.0
+
+
+class Waiting(dict[StreamKey, Rows]):
+    """Buffers of rows (N, width) by stream.
+
+    A tracker may number markers without end: unused streams are forgotten, unless samples of them
+    are `kept`.
+    """
+
+    def __init__(
+        self, width: int, capacity: int, dropped: Counter[str], kept: Callable[[StreamKey], bool]
+    ) -> None:
+        super().__init__()
+        self._width, self._capacity = width, capacity
+        self._dropped, self._kept = dropped, kept
+        self.apart: dict[StreamKey, Apart] = {}
+
+    @property
+    def count(self) -> int:
+        """Return the number of waiting measurements."""
+        return sum(rows.count for rows in self.values())
+
+    @property
+    def images(self) -> set[int]:
+        """Return the numbers of waiting images."""
+        found = [rows.values[:, 0] for key, rows in self.items() if key.images]
+        return {int(number) for numbers in found for number in numbers.tolist()}
+
+    def extend(self, key: StreamKey, stamps: Stamps, numbers: FloatArray, after_ns: int) -> bool:
+        """Take measurements: numbers (M, w) at stamps (M,), those after `after_ns`.
+
+        Returns False if the stream is one too many.
+        """
+        if key not in self and len(self) >= MOST_NAMES:  # forget those without any use
+            for each in [each for each, rows in self.items() if not rows.count]:
+                if not self._kept(each):
+                    del self[each], self.apart[each]
+        if key not in self:
+            if len(self) >= MOST_NAMES:
+                self._dropped[TOO_MANY] += len(stamps)
+                return False
+            self[key], self.apart[key] = Rows(self._width, self._capacity), Apart()
+        rows = self[key]
+        due = np.flatnonzero(stamps > after_ns)
+        taken = due[: rows.capacity - rows.count]
+        if len(due) < len(stamps):
+            self._dropped[TOO_LATE] += len(stamps) - len(due)
+        if len(taken) < len(due):
+            self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
+        rows.extend(stamps[taken], numbers[taken])
+        return True
+
+    def room(self, given: Slice) -> int | None:
+        """Return up to where messages fit; None if room must be made."""
+        streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
+        if len(self.keys() | {each.key for each in streams}) > MOST_NAMES:
+            return None
+        end = len(given)
+        for key, places, *_ in streams:
+            assert isinstance(key, StreamKey)
+            room = self._capacity - (self[key].count if key in self else 0)
+            end = int(min([end, *(places[room : room + 1] - given.begin).tolist()]))
+        return end
