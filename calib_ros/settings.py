@@ -151,6 +151,11 @@ class Settings:
         (), 'parameters held at their nominal values, for example joint_2.a or *.alpha'
     )
 
+    @property
+    def sigmas(self) -> tuple[float, float]:
+        """Return the standard deviations of positions [m] and orientations [rad]."""
+        return self.sigma_position, self.sigma_orientation
+
     def for_problem(self) -> dict[str, Any]:
         """Return the settings of an identification, by the names of `Problem`."""
         from calib_ros.values import parse_number  # loads numpy, not needed by --help

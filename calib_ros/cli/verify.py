@@ -145,7 +145,7 @@ def _sets(
         screen.say(f'{read}; {session.account()}')
         if not session.usable:
             raise InputError(f'{options.measured} gives no poses: {session.account()}')
-        found = gathered(session.usable, (settings.sigma_position, settings.sigma_orientation))
+        found = gathered(session.usable, settings.sigmas)
         found = replace(found, warnings=read.warnings)
     names = arm.frames_of(found.owners)
     sets = [each.between(names) for each in (*found.fitted, *found.held_out)]

@@ -101,8 +101,7 @@ def table(
     Without a given layout, a table with other columns is read with the joints' names and another
     separator; guesses are among the warnings.
     """
-    sigmas = (settings.sigma_position, settings.sigma_orientation)
-    given = path, len(chain.joints), sessions, sigmas, eye_in_hand
+    given = path, len(chain.joints), sessions, settings.sigmas, eye_in_hand
     if foreign is None:
         with suppress(ColumnsError):
             return read_table(*given, progress=progress)

@@ -52,8 +52,7 @@ from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 from calib_ros.values import parse_number
 
-USUAL_SIGMAS = (Settings.sigma_position, Settings.sigma_orientation)
-"""Default standard deviations [m, rad]."""
+USUAL_SIGMAS = Settings().sigmas
 
 
 def read_table(

@@ -192,8 +192,7 @@ def poses_to_verify(
 ) -> Poses:
     """Return the poses of new measurements, all judged."""
     count = len(comparison.judged)
-    sigmas = (Settings.sigma_position, Settings.sigma_orientation)
-    samples = [samples_of(each, sigmas, Settings.sigma_pixel) for each in sets]
+    samples = [samples_of(each, Settings().sigmas, Settings.sigma_pixel) for each in sets]
     groups = [(samples, comparison, np.full(count, JUDGED), np.full(count, np.nan))]
     repeats = distinct(comparison.after.configurations) < count
     return _poses(chain, groups, by_line, NAMELESS, repeats)

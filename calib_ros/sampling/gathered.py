@@ -205,7 +205,7 @@ def problem_of(
     """Return samples as a problem, or None; with `posed` boards as poses, not corners."""
     if all(sample.validation for sample in samples):
         return None
-    found = gathered(samples, (settings.sigma_position, settings.sigma_orientation), posed)
+    found = gathered(samples, settings.sigmas, posed)
     return found.problem(chain, settings, of_messages=True)
 
 
@@ -216,10 +216,9 @@ def in_frames_of(
 
     Raises InputError if there are none, or if their frames are unknown to it.
     """
-    sigmas = (settings.sigma_position, settings.sigma_orientation)
     # without owners, the first device and target have the frames
     frames = Frames(calibration.owners) if calibration.owners else named(usable)
-    sets = [each for part in collect(since, sigmas, frames) for each in part]
+    sets = [each for part in collect(since, settings.sigmas, frames) for each in part]
     if not sets:
         raise InputError(
             'no poses since the calibration was identified or loaded: measure some new poses'
