@@ -12,8 +12,9 @@ their columns and p of these with the residuals, both beside the parameters, the
 
     (p^T (W + I / s^2)^-1 p - log det(I + s^2 W)) / 2
 
-In a small region parameters absorb waves without a trace in the residuals: unless the data rule it
-out, the typical size counts.
+In a small region parameters absorb waves without a trace in the residuals: the largest plausible
+size counts, at most the typical one. If the data rule that out, the mean square over all sizes
+does.
 
 The rest is random, from stop to stop. With the columns Q of the posterior, and of waves that show,
 scaled by a root of the covariance, the residuals r have the covariance B V B + B - B^2, B = I -
@@ -41,7 +42,7 @@ from calib_ros.estimation.evidence import Posterior
 from calib_ros.estimation.identifiability import covariance
 from calib_ros.estimation.joint_errors import Unmodelled, moved, moving, waved
 from calib_ros.estimation.leastsquares import System
-from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SEVERAL
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import gram
 from calib_ros.estimation.shared_errors import gathered, nonnegative
@@ -68,9 +69,7 @@ def unmodelled_errors(
     random = moved(chain, every, rows)
     rows = np.concatenate([rows[:count], waved(random[1], units.joints), rows[-1:]])
     products = np.array([gram(rows[:, part_of == k]) for k in range(len(used))])
-    sizes = 0.0, 0.0, TYPICAL['drive']
-    if len(units) >= TELLING:
-        sizes = _sizes(posterior, rows, part_of, products, random)
+    sizes = _sizes(posterior, rows, part_of, products, random)
     rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= own]
     along = share * products.sum(axis=0)[:own, :-1]
     middle = along[:, rest] @ posterior.square[np.ix_(rest, rest)] @ along[:, rest].T
@@ -89,8 +88,7 @@ def _sizes(
     """Return the sizes of turns, tilts and waves.
 
     From weighted rows (P + T + 1, c, n), those of T waves and the residual last, their `products`
-    by part, and rows of `random` turns and tilts. Waves have at least the typical size, unless the
-    data rule that out.
+    by part, and rows of `random` turns and tilts.
     """
     given = np.array([posterior.priors.get(name, np.inf) for name in posterior.names]) ** -2.0
     counts = np.bincount(part_of, rows.any(axis=0).sum(axis=1))
@@ -135,10 +133,14 @@ def _size_of_waves(
     seen = np.outer(tried**2, np.maximum(known, 0.0))
     squares = np.outer(tried**2, pulled**2) / (1.0 + seen)
     odds = 0.5 * (squares - np.log1p(seen)).sum(axis=1)  # against none
-    best = np.argmax(odds - 0.5 * (np.log(tried / typical) / np.log(SPREAD)) ** 2)
+    likely = odds - 0.5 * (np.log(tried / typical) / np.log(SPREAD)) ** 2
+    best = np.argmax(likely)
     found = float(tried[best]) if odds[best] > SHOWN else None
-    refuted = odds[best] - odds[len(tried) // 2] >= 2.0 * REFUTED  # less is unusual
-    return max(0.0 if refuted else typical, found or 0.0), found
+    weights = np.exp(likely - likely[best])
+    if odds[best] - odds[len(tried) // 2] >= 2.0 * REFUTED:  # less is unusual
+        return float(np.sqrt(np.average(tried**2, weights=weights))), found
+    most = tried[np.searchsorted(np.cumsum(weights), CONFIDENT * weights.sum())]
+    return min(float(most), max(typical, found or 0.0)), found
 
 
 def _variances(
