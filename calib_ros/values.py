@@ -94,8 +94,9 @@ def parse_mapping(
 ) -> dict[str, Any]:
     """Return a mapping from YAML with the required keys and no unknown ones."""
     if not isinstance(value, dict):
+        found = 'empty' if value is None else f'{value!r:.40}'
         raise ConfigError(
-            f'{where} must be a mapping with the keys {", ".join(keys)}, not {value!r:.100}'
+            f'{where} must be a mapping with the keys {", ".join(keys)}, not {found}'
         )
     for key in value:
         if key not in keys:

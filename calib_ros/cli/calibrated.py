@@ -54,7 +54,8 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
         source = program_of(options.program, nominal)
         corrected, result = compensate_program(compensator, source.program, work)
     if result.refusals:
-        screen.warn(f'nothing is written, {in_words(compensator, result)}', 'calib_ros')
+        refused = 'nothing is written, because not every point can be corrected'
+        screen.warn(f'{refused}: {in_words(compensator, result)}', 'calib_ros')
         for refusal in result.refusals[:NAMED]:
             screen.warn(refusal.reason, source.places[refusal.sample])
         if more := result.refusals[NAMED:]:

@@ -95,7 +95,7 @@ def _robot(
     where = f'{where} ({serial})'
     group = own.get('group')
     if group is not None and str(group) not in groups:
-        raise UnknownNameError(f'group in {where}', str(group), groups)
+        raise UnknownNameError(f'{where}: group', str(group), groups)
     shared = {} if group is None else groups[str(group)]
     given = {**shared, **own}
     chosen: dict[str, Any] = {}

@@ -193,7 +193,7 @@ def test_nothing_is_written_when_a_sample_is_refused(run, tmp_path, suffix, forc
     status, said, err = run(text, *(['--force'] if force else []), suffix=suffix)
     assert (status, said) == (Status.NOT_ACCEPTED, '')
     first, second, third = err.splitlines()
-    assert first.startswith('calib_ros: nothing is written, 1 of 3 points corrected')
+    assert first.startswith('calib_ros: nothing is written, because not every point can')
     places = ('line 4', 'line 5') if suffix == '.csv' else ('point 2', 'point 3')
     assert second.startswith(f'{places[0]}: near a singularity')
     assert third.startswith(f'{places[1]}: the command 4 of elbow_joint is beyond its limits')
