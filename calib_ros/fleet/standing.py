@@ -152,11 +152,29 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
         )
 
 
+def _without_twins(found: Sequence[Standing]) -> Iterator[Standing]:
+    """Yield standings; newest measurements that are those of another robot are unreadable."""
+    owners: dict[str, list[str]] = {}
+    for one in found:
+        if one.last is not None:
+            owners.setdefault(one.last.inputs, []).append(one.robot.serial)
+    for one in found:
+        last, errors = one.last, dict(one.errors)
+        own = owners[last.inputs] if last is not None else []
+        if last is not None and len(own) > 1:
+            others = some([serial for serial in own if serial != one.robot.serial], 3)
+            errors[last.source] = (
+                f'{last.source} has the measurements of {", ".join(others)}: only one robot made '
+                'them; put the right file there, or correct "measured" in the plant file'
+            )
+        yield replace(one, errors=errors)
+
+
 def standings(
     robots: Sequence[Robot], history: History, done: Run, years: float
 ) -> tuple[Standing, ...]:
     """Return the states of robots, worst first."""
-    found = [Standing.of(robot, history, done, years) for robot in robots]
+    found = _without_twins([Standing.of(robot, history, done, years) for robot in robots])
     order = list(STATES)
 
     def rank(one: Standing) -> tuple[int, float, float, str]:

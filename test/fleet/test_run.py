@@ -96,6 +96,17 @@ def test_a_night_counts_once_whatever_its_file_is_called(plant, cluster, tmp_pat
     assert done == []
 
 
+def test_the_measurements_of_another_robot_are_told_of(plant, cluster, tmp_path):
+    nights = tmp_path / 'nights'
+    (nights / 'B' / '001.csv').write_bytes((nights / 'A' / '001.csv').read_bytes())
+    history = History(tmp_path / 'history')
+    found = standings(plant, history, run(plant, history, cluster, None), 100.0)
+    for each, other in zip(sorted(found, key=lambda one: one.robot.serial), 'BA', strict=True):
+        assert 'unreadable' in each.states
+        (said,) = each.errors.values()
+        assert f'001.csv has the measurements of {other}: only one robot made them' in said
+
+
 def test_a_night_counts_once_after_an_upgrade(plant, cluster, tmp_path, monkeypatch):
     history = History(tmp_path / 'history')
     run(plant, history, cluster)
