@@ -308,10 +308,11 @@ def _header(
     likely = words.index(max(words))  # title and data have fewer
     best: tuple[int, set[str]] = (likely, wanted)
     for k, (_, cells) in enumerate(rows[:HEAD_LINES]):
-        missing = {name for name in wanted if not places(cells, name)}
+        bare = {name_and_unit(cell)[0] for cell in cells}
+        missing = wanted - bare - set(cells)
         if wanted and not missing:
             return k, tuple(cells)
-        if not wanted and len(low & {name_and_unit(cell)[0].lower() for cell in cells}) > 1:
+        if not wanted and len(low & {name.lower() for name in bare}) > 1:
             return k, tuple(cells)
         if len(missing) < len(best[1]):
             best = (k, missing)
