@@ -243,10 +243,10 @@ class _Table:
                 if unit and unit != length:
                     self.notes.append(f'lengths are in {unit}, as its head says')
                 length = unit or length
-        length = length or self._said(LENGTHS, (*POSITION, 'distance'))
-        angle = angle or self._said(ANGLES, (*TURNS, *IN_TURN))
+        length = self._given_or_said(length, LENGTHS, (*POSITION, 'distance'))
+        angle = self._given_or_said(angle, ANGLES, (*TURNS, *IN_TURN))
         turning = [name for name in joint_columns(MOST_NAMES) if not self._slides(name)]
-        joint = layout.joint_angle or angle or self._said(ANGLES, turning)
+        joint = self._given_or_said(layout.joint_angle or angle, ANGLES, turning)
         names = set(self._expressions)
         assumed = []
         if not length and names & {*POSITION, 'distance'}:
@@ -258,6 +258,12 @@ class _Table:
         if assumed:
             self.notes.append(f'no units are given: taking {", ".join(assumed)}')
         return LENGTHS[length or 'm'], ANGLES[angle or 'rad'], ANGLES[joint or 'rad']
+
+    def _given_or_said(self, given: str, units: Mapping[str, float], ours: Sequence[str]) -> str:
+        said = self._said(units, ours)
+        if given and said not in ('', given):
+            self.notes.append(f'its header says {said}, but {given} is given: taking {given}')
+        return given or said
 
     def _said(self, units: Mapping[str, float], ours: Sequence[str]) -> str:
         """Return the unit that the names of some of our columns end with: `X [mm]`, or empty."""
