@@ -28,7 +28,6 @@ DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}([ .,'][0-9]{3})+([.,][0-9]*)?")
 Row = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
-TOGETHER = 100  # rows whose cells fit the caches (benchmarks/tables.py)
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 
@@ -235,7 +234,7 @@ def csv_blocks(
                 block.append((above + line, row))
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
-            if len(block) == TOGETHER:
+            if len(block) * len(row) >= MOST_ENTRIES:  # cells that fit the caches
                 yield block
                 block = []
     except csv.Error as err:
