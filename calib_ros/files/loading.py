@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from calib_ros.decision.reasons import Reason
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import ColumnsError, TooFewObservationsError
 from calib_ros.estimation.problem import Problem
@@ -27,6 +27,8 @@ from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
 
+MEASURED = (Rule.MISTAKE, Rule.LARGEST_ERROR, Rule.CONVERGENCE, Rule.SCALE)
+"""What makes frames wrong, too, if there is no arm to judge."""
 TABLES = ('.csv', '.tsv', '.txt', '.xlsx', '.log', '.dat')  # suffixes of tables, lower case
 
 
@@ -41,7 +43,7 @@ class Loaded:
     by_line: bool = False  # stamps are the lines of a table
     images: Mapping[int, str] = field(default_factory=dict)  # names by line
     refusals: tuple[Reason, ...] = ()  # reasons not to accept any result
-    instead: bool = False  # the refusals replace those of the result
+    instead: bool = False  # the refusals replace those of the result about the arm
     owners: Mapping[str, Owner] = field(default_factory=dict)  # whose frame each is
 
     def between(self, names: Mapping[str, str]) -> Problem:
@@ -66,7 +68,7 @@ class Loaded:
             if self.read:
                 raise too_few(err, '; '.join((self.read, *self.warnings))) from err
             raise
-        own = () if self.instead else result.refusals
+        own = [e for e in result.refusals if not self.instead or e.rule in MEASURED]
         return replace(result, refusals=(*own, *self.refusals))
 
 

@@ -15,6 +15,7 @@ from recorded import TYPES, header, serialised, write
 from robots import DATA, needs_data
 
 from calib_ros.cli.main import main
+from calib_ros.decision.suspects import NOT_ON_FLANGE
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files import boards
 from calib_ros.files.cameras import decoded, read_image
@@ -325,6 +326,8 @@ def test_the_real_photographs(photographs, capsys, lens, least, limit):
     assert document['parameters']['base.fx']['status'] == (
         'fixed' if lens == 'given' else 'fitted'
     )
+    assert main([*words, '--places', str(REAL / 'poses.csv'), '--eye-in-hand']) == 3
+    assert NOT_ON_FLANGE[0] in json.loads(capsys.readouterr().out)['refusals'][0]
 
 
 @needs_data
