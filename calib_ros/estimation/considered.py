@@ -23,7 +23,7 @@ from scipy import linalg
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
 from calib_ros.estimation.leastsquares import System, normal_equations
-from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
+from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import Samples, gram
 from calib_ros.kinematics import effects
@@ -143,6 +143,8 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
     names: list[str] = [name for frame in chain.frame_names for name in parameters_of(frame)[:3]]
     names += [name for joint in chain.joints for name in joint.parameters if name.is_length]
     scale = PRINTED if all(each.pixels is not None for each in sets) else SCALE
+    if all(each.distances is not None and not each.plane for each in sets):
+        scale = LARGEST_SCALE
     if all(each.socket for each in sets):
         longest = max(distance for *_, distance in system.separations)
         scale = max(scale, Settings.sigma_position / longest)
