@@ -28,7 +28,7 @@ import numpy as np
 from calib_ros.estimation.considered import Doubts, doubted_products, lengths_of, lenses
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
-from calib_ros.estimation.levels import OUT_OF_SCALE, SCALE
+from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
@@ -146,7 +146,7 @@ def posterior_of(
     chain = fitted.chain.with_effects(own)
     beside = {name: std for name, std in (rounding or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
-    unsure = bool(lengths) and scale == SCALE and 'scale' not in known
+    unsure = bool(lengths) and scale < PRINTED and 'scale' not in known
     products = doubted_products(whole, every, system, Doubts(beside, lengths, bool(more)), noise)
     plain, cross, doubtful = products
     offsets = np.zeros(len(plain) - 1)
