@@ -253,7 +253,7 @@ def test_memory_for_images_is_bounded(monkeypatch):
         ({'binning_y': 2}, 'without roi and binning'),
         ({'roi': RegionOfInterest(y_offset=8)}, 'without roi and binning'),
         ({'distortion_model': 'equidistant'}, 'as plumb_bob'),
-        ({'d': [0.0] * 5 + [0.1] * 3}, 'only k1 k2 p1 p2 k3'),
+        ({'d': [0.0] * 5 + [0.1] * 3}, 'beyond k3 is not supported'),
     ],
 )
 def test_a_camera_info_that_cannot_be_used(change, said):
