@@ -12,9 +12,8 @@ their columns and p of these with the residuals, both beside the parameters, the
 
     (p^T (W + I / s^2)^-1 p - log det(I + s^2 W)) / 2
 
-In a small region parameters absorb waves without a trace in the residuals: the largest plausible
-size counts, at most the typical one. If the data rule that out, the mean square over all sizes
-does.
+In a small region parameters absorb waves without a trace in the residuals: unless the data rule
+the typical size out, the largest plausible one counts, at most the typical one.
 
 The rest is random, from stop to stop. With the columns Q of the posterior, and of waves that show,
 scaled by a root of the covariance, the residuals r have the covariance B V B + B - B^2, B = I -
@@ -138,7 +137,7 @@ def _size_of_waves(
     found = float(tried[best]) if odds[best] > SHOWN else None
     weights = np.exp(likely - likely[best])
     if odds[best] - odds[len(tried) // 2] >= 2.0 * REFUTED:  # less is unusual
-        return float(np.sqrt(np.average(tried**2, weights=weights))), found
+        return found or 0.0, found
     most = tried[np.searchsorted(np.cumsum(weights), CONFIDENT * weights.sum())]
     return min(float(most), max(typical, found or 0.0)), found
 

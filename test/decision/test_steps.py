@@ -157,7 +157,7 @@ def test_a_step_of_which_samples_are_fitted_is_not_beside_the_fit():
     distances[50] = 1.0
     system = problem.system(problem.sets)
     fit = minimise(result.chain, result.names, system, iterations=0)
-    robust = Robust(fit, system, (distances,), True, 0, problem.loss)
+    robust = Robust(fit, system, (distances,), True, problem.loss)
     step = find_step(SimpleNamespace(problem=problem, names=result.names, robust=robust))
     assert step.kind == 'base'
     assert not step.unused
