@@ -212,7 +212,7 @@ def test_a_full_disk(tmp_path, recording):
             path.with_suffix('.settings.yaml').name
         ]
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
-        level(DiagnosticStatus.OK, 'poses')
+        cell.spin_until(lambda: heard[-1].status[0].level != DiagnosticStatus.ERROR)
         cell.spin_until(lambda: 'memory' not in status[-1].data)
         assert len(samples_in(tmp_path)) == STOPS
         cell.done('save')
