@@ -336,7 +336,7 @@ def _first(
         if not used or any(_is_number(cell, decimal) for cell in cells):
             if k > at + 1:
                 left = lines_in_words([line for line, _ in rows[at + 1 : k]])
-                notes.append(f'there are no numbers in {left}: left out')
+                notes.append(f'there are no numbers in {left}: only units are read')
             return k
     none = [f'{path} has no rows of numbers in the columns named']
     for line, cells in rows[at + 1 : at + 2]:
