@@ -144,7 +144,9 @@ def _sheet(
     low = {name.lower() for name in known}
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
     first = _first(path, rows, at, used, decimal, notes)
-    header = _with_units(header, [cells for _, cells in rows[max(at, 0) + 1 : first]])
+    if at < 0 and first:  # columns by their numbers
+        header = tuple(f'#{k + 1}' for k in range(len(rows[first][1])))
+    header = _with_units(header, [cells for _, cells in rows[at + 1 : first]])
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
     start = rows[first][0]
     body: Iterable[Sequence[Row]] = [rows[first:]]
@@ -160,7 +162,7 @@ def _sheet(
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:
     """Return the names of columns with their units in the lines below."""
     for cells in below:
-        units = [SIGNS.get(cell.strip('[]() ').lower()) for cell in cells]
+        units = [SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
         pairs = zip_longest(header, units[: len(header)])
         header = tuple(
             f'{name} [{unit}]' if unit and name and not name_and_unit(name)[1] else name

@@ -162,6 +162,16 @@ def test_contradictory_units_are_refused(tmp_path, head, told):
         read_table(tmp_path / 'cell.csv', 2, foreign=Foreign(layout))
 
 
+@pytest.mark.parametrize('head', ['a [deg],b,c [mm],d,e', 'a,b,c,d,e\ndeg,deg,mm,mm,mm'])
+def test_units_of_columns_by_their_numbers(tmp_path, head):
+    (tmp_path / 'cell.csv').write_text(f'Cell\n{head}\n90,180,1,2,3\n')
+    columns = dict(zip(('q1', 'q2', 'x', 'y', 'z'), ('#1', '#2', '#3', '#4', '#5'), strict=True))
+    foreign = Foreign(Layout(columns=columns))
+    (found,) = read_table(tmp_path / 'cell.csv', 2, foreign=foreign).fitted
+    np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
+    np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
+
+
 def test_a_line_of_units_below_our_own_columns_is_read(tmp_path):
     (tmp_path / 'cell.csv').write_text('q1,q2,x,y,z\ndeg,deg,mm,mm,mm\n90,180,1,2,3\n')
     chain = Chain('arm', 'standard', (Joint('a'), Joint('b')))
