@@ -12,7 +12,7 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, is_dataclass
-from itertools import takewhile
+from itertools import chain, takewhile
 from typing import Any
 
 import numpy as np
@@ -69,13 +69,19 @@ class WithFields:
     def __get__(self, instance: object, owner: type) -> str:
         """Return the text."""
         with suppress(OSError):
-            lines = inspect.getsource(self._of).splitlines()
-            (found,) = ast.parse(textwrap.dedent('\n'.join(lines))).body
-            assert isinstance(found, ast.ClassDef)
-            body = list(takewhile(lambda x: isinstance(x, ast.AnnAssign | ast.Expr), found.body))
-            begin, end = (each.end_lineno or 0 for each in (body[0], body[-1]))
-            return '\n'.join([self._text, *lines[begin:end]])
+            each = (of for of in reversed(self._of.__mro__) if '__dataclass_fields__' in vars(of))
+            return '\n'.join([self._text, *chain.from_iterable(map(_fields, each))])
         return self._text
+
+
+def _fields(of: type) -> list[str]:
+    """Return the lines of the fields of a dataclass, without those that it inherits."""
+    lines = inspect.getsource(of).splitlines()
+    (found,) = ast.parse(textwrap.dedent('\n'.join(lines))).body
+    assert isinstance(found, ast.ClassDef)
+    body = list(takewhile(lambda x: isinstance(x, ast.AnnAssign | ast.Expr), found.body))
+    begin, end = (each.end_lineno or 0 for each in (body[0], body[-1]))
+    return lines[begin:end]
 
 
 def as_html(caption: str, text: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -22,6 +22,7 @@ def test_help_of_a_value_says_what_its_fields_are():
     assert 'tool: Frame | None = None\n"""T_world_base and T_flange_target; None if' in text
     assert text.endswith('in the base frame, for compliance."""')
     assert 'RMS position error [m] over poses like these' in calib_ros.Verification.__doc__
+    assert 'largest_turn: float' in calib_ros.Compensator.__doc__  # inherited
 
 
 def test_the_import_loads_nothing_else():

@@ -44,6 +44,8 @@ def test_a_value_fits_on_a_screen(value):
         (lambda: calib_ros.verify(RESULT, [SEEN], None), r'Calibration \(Calibration.of\(result'),
         (lambda: calib_ros.verify(ARM, SEEN, None), 'sets must be a list of Observations'),
         (lambda: calib_ros.difference(ARM, RESULT), 'second must be of type Calibration'),
+        (lambda: calib_ros.Calibration.of(CHAIN), 'result must be of type Identification'),
+        (lambda: calib_ros.Compensator(CHAIN, ARM), 'calibrated must be of type Chain, not Cal'),
         (lambda: calib_ros.CalibrationSession('ur10e'), 'chain must be of type Chain, not str'),
     ],
 )

@@ -50,6 +50,7 @@ class Compensator(Shown, Limits):
     """Where the calibration may be used; samples elsewhere are refused."""
 
     def __post_init__(self) -> None:
+        require(Chain, nominal=self.nominal, calibrated=self.calibrated)
         known = 'the nominal chain', self.nominal
         refuse_other_joints('the calibrated chain', self.calibrated, *known)
         if len(self.tool) != 3 or not np.isfinite(self.tool).all():

@@ -45,12 +45,13 @@ def rms_limits(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the limits (N,) of the interval of an RMS with (N,) degrees of freedom.
 
-    Beyond each limit lies half of what the interval may miss.
+    Beyond each limit lies half of what the interval may miss; the upper one may be inf.
     """
-    lower, upper = (
-        rms / np.sqrt(special.chdtri(freedom, miss) / freedom)
-        for miss in (0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence)
-    )
+    with np.errstate(divide='ignore'):
+        lower, upper = (
+            rms / np.sqrt(special.chdtri(freedom, miss) / freedom)
+            for miss in (0.5 - 0.5 * confidence, 0.5 + 0.5 * confidence)
+        )
     return lower, upper
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -85,9 +86,10 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
 def document(found: Verification) -> dict[str, Any]:
     """Return a verdict and its figures as plain values."""
     lengths = {name: getattr(found, name) for name in ('tolerance', 'limit', *LIKELY)}
+    known = {name: 1e3 * m for name, m in lengths.items() if m is not None and math.isfinite(m)}
     return {
         'verdict': found.verdict,
-        **{f'{name}_mm': None if m is None else 1e3 * m for name, m in lengths.items()},
+        **{f'{name}_mm': known.get(name) for name in lengths},
         'confidence': found.confidence,
         'poses': found.configurations,
         'poses_needed': found.needed,

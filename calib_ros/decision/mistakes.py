@@ -46,6 +46,8 @@ from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import LEVER
 
+THEN = ' (the uncorrected arm is then typically'
+
 
 @dataclass(frozen=True, eq=False)
 class Explained:
@@ -69,7 +71,7 @@ class Explained:
         if np.isnan(self.corrected):
             return f'{self.where}{whats[0]}'
         return (
-            f'{self.where}{" -- or ".join(whats)} (the uncorrected arm is then typically '
+            f'{self.where}{" -- or ".join(whats)}{THEN} '
             f'{1e3 * self.corrected:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
 

@@ -61,7 +61,10 @@ class Columns:
             remedy = 'write a point, or give --decimal comma'
         elif THOUSANDS.fullmatch(text):
             remedy = 'write it without the marks between thousands'
-        return InputError(
+        of_units = row == 0 and text != '' and not re.search('[0-9]', text)
+        if of_units:  # perhaps, as other tables have below their header
+            remedy += '; a line of units is read with --length and --joint-angle'
+        return (ColumnsError if of_units else InputError)(
             f'{self.where(row, name)} must be a finite number, not {text!r}: {remedy}'
         )
 

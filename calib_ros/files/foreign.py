@@ -37,15 +37,14 @@ from calib_ros.files.layouts import (
     finished,
     joint_columns,
 )
-from calib_ros.files.sheets import Sheet, name_and_unit, only, places, read_sheet
+from calib_ros.files.sheets import SIGNS, Sheet, name_and_unit, only, places, read_sheet
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
 MEASURED = (*POSITION, 'distance')
-UNITS = {'millimeters': 'mm', 'centimeters': 'cm', 'meters': 'm', 'micrometers': 'um'}
-UNITS |= {'inches': 'in'} | {unit: unit for unit in LENGTHS}
+WHAT = {'length': 'lengths', 'angle': 'angles', 'joint-angle': 'joint values'}
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +121,7 @@ class _Table:
         expressions: dict[str, Expression] = {}
         needed: dict[str, None] = {}
         self._optional: set[str] = set()
+        self._assumed: list[str] = []
         for ours, theirs in layout.columns.items():
             of_joint = JOINT.fullmatch(ours)
             if not (joints and int(ours[1:]) <= most if of_joint else not alone):
@@ -220,10 +220,10 @@ class _Table:
         called = [self._called(name) or name for name in names]
         read = self._sheet.columns.numbers(numbers, called)
         columns = dict(zip(names, read.T, strict=True))
-        units = self._units()
+        factors = self._factors()
         found = {}
         for ours, each in self._expressions.items():
-            value = np.broadcast_to(each.of(columns), len(self.lines)) * self._factor(ours, units)
+            value = np.broadcast_to(each.of(columns), len(self.lines)) * factors.get(ours, 1.0)
             if np.isinf(value).any():
                 line = self.lines[int(np.argmax(np.isinf(value)))]
                 raise InputError(f'{self._path}, line {line}: {ours} = {each.text} is infinite')
@@ -234,53 +234,80 @@ class _Table:
         """Return the text above the column of a name or `#k`."""
         return self._sheet.header[int((self._sheet.number(name) or '')[1:]) - 1]
 
-    def _units(self) -> tuple[float, float, float]:
-        layout = self._layout
-        length, angle = layout.length, layout.angle
+    def _factors(self) -> dict[str, float]:
+        """Return the factors of our columns to m and rad."""
+        layout, length = self._layout, self._layout.length
         for cells in self._sheet.above:
             if 'Length Units' in cells[:-1]:
-                unit = UNITS.get(cells[cells.index('Length Units') + 1].lower(), '')
-                if unit and unit != length:
+                unit = SIGNS.get(cells[cells.index('Length Units') + 1].lower(), '')
+                if unit in LENGTHS and unit != length:
                     self.notes.append(f'lengths are in {unit}, as its head says')
-                length = unit or length
-        length = self._given_or_said(length, LENGTHS, (*POSITION, 'distance'))
-        angle = self._given_or_said(angle, ANGLES, (*TURNS, *IN_TURN))
-        turning = [name for name in joint_columns(MOST_NAMES) if not self._slides(name)]
-        joint = self._given_or_said(layout.joint_angle or angle, ANGLES, turning)
-        names = set(self._expressions)
-        assumed = []
-        if not length and names & {*POSITION, 'distance'}:
-            assumed.append('lengths in m (--length)')
-        if not angle and names & {*TURNS, *IN_TURN}:
-            assumed.append('angles in rad (--angle)')
-        if not joint and 'q1' in names:
-            assumed.append('joint values in rad (--joint-angle)')
-        if assumed:
-            self.notes.append(f'no units are given: taking {", ".join(assumed)}')
-        return LENGTHS[length or 'm'], ANGLES[angle or 'rad'], ANGLES[joint or 'rad']
+                    length = unit
+        joints = [name for name in self._expressions if JOINT.fullmatch(name) and name[0] != 's']
+        slides = [name for name in joints if self._slides(name)]
+        turns = [name for name in joints if name not in slides]
+        lengths = self._told('length', length, (*POSITION, 'distance'), (*slides, *SIGMAS[:3]))
+        angles = self._told('angle', layout.angle, (*TURNS, *IN_TURN), SIGMAS[3:])
+        said = {self._said(name) for name in angles} - {''}
+        given = layout.joint_angle or layout.angle
+        if not given and len(said) == 1 and not any(map(self._said, turns)):
+            given = said.pop()
+        main = [name for name in turns if name[0] == 'q']
+        told = self._told('joint-angle', given, main, [name for name in turns if name[0] != 'q'])
+        if self._assumed:
+            self.notes.append(f'no units are given: taking {", ".join(self._assumed)}')
+        return {name: (LENGTHS | ANGLES)[unit] for name, unit in (lengths | angles | told).items()}
 
-    def _given_or_said(self, given: str, units: Mapping[str, float], ours: Sequence[str]) -> str:
-        said = self._said(units, ours)
-        if given and said not in ('', given):
-            self.notes.append(f'its header says {said}, but {given} is given: taking {given}')
-        return given or said
+    def _told(
+        self, option: str, given: str, main: Sequence[str], more: Sequence[str]
+    ) -> dict[str, str]:
+        """Return the units of our columns of a kind: given, in the header, or of the main ones."""
+        units, usual = (LENGTHS, 'm') if option == 'length' else (ANGLES, 'rad')
+        said = {name: self._said(name) for name in (*main, *more) if name in self._expressions}
+        for name, unit in said.items():
+            self._check_unit(name, unit, units, given)
+        if given:
+            for unit in dict.fromkeys(said.values()):
+                if unit not in ('', given):
+                    self.notes.append(
+                        f'its header says {unit}, but {given} is given: taking {given}'
+                    )
+            return dict.fromkeys(said, given)
+        found = {said[name] for name in main if name in said} - {''}
+        bare = [name for name, unit in said.items() if not unit]
+        if bare and len(found) > 1:
+            raise InputError(
+                f'{self._path}: {bare[0]} has no unit, others are in {" and ".join(sorted(found))}'
+                f': write it in the header, or convert them (--columns) and give --{option}'
+            )
+        if bare and not found:
+            self._assumed.append(f'{WHAT[option]} in {usual} (--{option})')
+        return {name: unit or next(iter(found), usual) for name, unit in said.items()}
 
-    def _said(self, units: Mapping[str, float], ours: Sequence[str]) -> str:
-        """Return the unit that the names of some of our columns end with: `X [mm]`, or empty."""
-        expressions = [each for name, each in self._expressions.items() if name in ours]
-        named = {name for each in expressions for name in each.names}
-        found = {name_and_unit(self._called(name))[1] for name in named}
-        return found.pop() if len(found) == 1 and found <= {*units} else ''
+    def _check_unit(self, ours: str, unit: str, units: Mapping[str, float], given: str) -> None:
+        """Refuse a unit of another kind; note one that an expression may have converted."""
+        each = self._expressions[ours]
+        of = f'{ours} = {" ".join(map(self._called, each.names))}'
+        if unit and unit not in units:
+            raise InputError(
+                f'{self._path}: {of} cannot be in {unit}, expected {", ".join(units)}: name the '
+                'right column (--columns)'
+                + ', or give --chain if it is prismatic'
+                * (self._chain is None and ours[0] == 'q')
+            )
+        if unit and not given and not {*each.terms} <= {*each.names}:
+            self.notes.append(f'{ours} = {each.text} is in {unit}, as its header says')
 
-    def _factor(self, ours: str, units: tuple[float, float, float]) -> float:
-        length, angle, joint = units
-        if ours in (*POSITION, 'distance', *SIGMAS[:3]):
-            return length
-        if ours in (*TURNS, *IN_TURN, *SIGMAS[3:]):
-            return 1.0 if self._layout.rotation_vector and not self._layout.angle else angle
-        if JOINT.fullmatch(ours) and ours[0] != 's':
-            return length if self._slides(ours) else joint
-        return 1.0
+    def _said(self, ours: str) -> str:
+        """Return the unit of one of our columns that the header says, `X [mm]`, or empty."""
+        each = self._expressions[ours]
+        found = {name_and_unit(self._called(name))[1] for name in each.names} - {''}
+        if len(found) > 1:
+            raise InputError(
+                f'{self._path}: {ours} = {each.text} mixes {" and ".join(sorted(found))}, as its '
+                'header says: write these columns in one unit'
+            )
+        return found.pop() if found else ''
 
     def _slides(self, ours: str) -> bool:
         """Return whether a column is of a prismatic joint."""

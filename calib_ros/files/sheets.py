@@ -34,23 +34,25 @@ HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 SHEETS = ('.xlsx', '.xlsm')
-SIGNS = {'°': 'deg', 'µm': 'um', 'μm': 'um'} | {unit: unit for unit in (*LENGTHS, *ANGLES)}
-"""Units by their signs."""
+LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
+SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
+SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'micrometers': 'um', 'inch': 'in', 'inches': 'in'}
+SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
+"""Units by their signs and words in small letters."""
 _ANY = '|'.join(SIGNS)
-UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))')
+UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))', re.I)
 """A name with its unit: X [mm], X (mm), X / mm."""
 
 
 def name_and_unit(cell: str) -> tuple[str, str]:
     """Return the name of a column, and its unit if the header says it."""
     match = UNIT.fullmatch(cell)
-    return (match[1], SIGNS[match[2] or match[3]]) if match else (cell, '')
+    return (match[1], SIGNS[(match[2] or match[3]).lower()]) if match else (cell, '')
 
 
 def places(header: Sequence[str], name: str) -> list[int]:
-    """Return the indices of the columns of a name; of those with a unit only if it has none."""
-    bare = header if name in header else [name_and_unit(cell)[0] for cell in header]
-    return [k for k, each in enumerate(bare) if each == name]
+    """Return the indices of the columns of a name, with or without its unit."""
+    return [k for k, cell in enumerate(header) if name in (cell, name_and_unit(cell)[0])]
 
 
 def only(found: Sequence[int], name: str) -> int:
@@ -86,6 +88,7 @@ class _Content:
     notes: list[str]
     text: str = ''
     separator: str = ''
+    title: str = ''  # of a sheet
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
@@ -96,20 +99,20 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
     """
     if path.suffix.lower() not in SHEETS:
         return _sheet(path, _of_text(path, layout), layout, names, known)
-    faults: list[InputError] = []
+    faults: list[str] = []
     found: list[Sheet] = []
     for content in _of_workbook(path, layout.sheet):
         try:
             sheet = _sheet(path, content, layout, names, known)
         except InputError as err:
-            faults.append(err)
+            faults.append(f'sheet "{content.title}": {err}')
             continue
         lower = [cell.lower() for cell in sheet.header]
         if names or sum(bool(places(lower, name.lower())) for name in known) > 1:
             return sheet
         found.append(sheet)
     if not found:
-        raise faults[0] if faults else InputError(f'{path} has no rows')
+        raise InputError('; '.join(some(faults)) or f'{path} has no rows in visible sheets')
     return found[0]
 
 
@@ -141,7 +144,9 @@ def _sheet(
     low = {name.lower() for name in known}
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
     first = _first(path, rows, at, used, decimal, notes)
-    header = _with_units(header, [cells for _, cells in rows[max(at, 0) + 1 : first]])
+    if at < 0 and first:  # columns by their numbers
+        header = tuple(f'#{k + 1}' for k in range(len(rows[first][1])))
+    header = _with_units(header, [cells for _, cells in rows[at + 1 : first]])
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
     start = rows[first][0]
     body: Iterable[Sequence[Row]] = [rows[first:]]
@@ -157,7 +162,7 @@ def _sheet(
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:
     """Return the names of columns with their units in the lines below."""
     for cells in below:
-        units = [SIGNS.get(cell.strip('[]()')) for cell in cells]
+        units = [SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
         pairs = zip_longest(header, units[: len(header)])
         header = tuple(
             f'{name} [{unit}]' if unit and name and not name_and_unit(name)[1] else name
@@ -218,16 +223,16 @@ def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
         if size > LARGEST_SHEET:
             raise InputError(f'{path} is larger than {LARGEST_SHEET // 10**6} MB when unpacked')
         with closing(openpyxl.load_workbook(path, read_only=True, data_only=True)) as book:
-            titles = book.sheetnames
+            titles = {each.title: each for each in book.worksheets}  # without charts
             if name and name not in titles:
                 raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(titles)}')
             visible = [each for each in book.worksheets if each.sheet_state == 'visible']
-            for sheet in [book[name]] if name else visible:
+            for sheet in [titles[name]] if name else visible:
                 notes = []
                 if len(visible) > 1 and not name:
                     notes = [f'sheet "{sheet.title}" of {len(visible)} is read (--sheet)']
                 if rows := _rows(path, sheet):
-                    yield _Content(rows, notes)
+                    yield _Content(rows, notes, title=sheet.title)
     except InputError:
         raise
     except Exception as err:  # a broken workbook fails in many ways
@@ -333,7 +338,7 @@ def _first(
         if not used or any(_is_number(cell, decimal) for cell in cells):
             if k > at + 1:
                 left = lines_in_words([line for line, _ in rows[at + 1 : k]])
-                notes.append(f'there are no numbers in {left}: left out')
+                notes.append(f'there are no numbers in {left}: only units are read')
             return k
     none = [f'{path} has no rows of numbers in the columns named']
     for line, cells in rows[at + 1 : at + 2]:

@@ -165,7 +165,8 @@ def _without_twins(found: Sequence[Standing]) -> Iterator[Standing]:
             others = some([serial for serial in own if serial != one.robot.serial], 3)
             errors[last.source] = (
                 f'{last.source} has the measurements of {", ".join(others)}: only one robot made '
-                'them; put the right file there, or correct "measured" in the plant file'
+                'them. If it is another, put the right file there, or correct "measured" in the '
+                f'plant file, and remove {last.key}.parquet from the history'
             )
         yield replace(one, errors=errors)
 

@@ -48,6 +48,7 @@ from calib_ros.kinematics.chain_file import (
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
+from calib_ros.values import require
 
 HEAD = '# Corrected chain by calib_ros; readable wherever a chain file is expected.\n'
 
@@ -93,6 +94,7 @@ class Calibration(Shown):
 
         `verify` recognises the `fitted` ones, and cannot pass on them.
         """
+        require(Identification, result=result)
         before, after = (result.validation or result.fitted).figures
         region, noise, owners = result.region, result.noise, owners or {}
         rms_mm = round(after.rms_mm, 6)  # as in the file

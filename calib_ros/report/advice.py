@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 
+from calib_ros.decision.mistakes import THEN
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.settings import EXCEPTION
@@ -38,7 +39,7 @@ class Advice:
     def in_short(self) -> str:
         """Return the heading, with the mistake if there is one."""
         named = self.heading == rules()[Rule.MISTAKE].heading
-        return f'{self.heading}: {self.refusal.partition(" (")[0]}' if named else self.heading
+        return f'{self.heading}: {self.refusal.partition(THEN)[0]}' if named else self.heading
 
 
 ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a convention

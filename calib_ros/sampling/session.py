@@ -148,6 +148,8 @@ class CalibrationSession:
         sample = self.samples.pop()
         self._entry.unused['measurements: of a removed pose'] += sample.count
         self._collector.forget(sample)
+        if sample.frame_id:
+            self._frames.note(sample.device, sample.frame_id, -sample.count)
         self.on_removed(sample)
         return sample
 

@@ -300,6 +300,16 @@ def test_what_each_device_measures_again_is_judged_in_its_own_frame(of_two, run,
     assert (status, out[:8]) == (0, 'accepted')
 
 
+def test_json_of_a_verdict_alone_is_printed_and_has_no_infinity(of_two, run, tmp_path):
+    write_csv(tmp_path / 'new.csv', seen_by((LEICA,), 10, 2))
+    judged = ['new.csv', '--chain', 'ur5e', '--calibration', of_two, '--json', '--tolerance']
+    status, out, _ = run('verify', *judged, '0.001', '--quiet')
+    assert (status, json.loads(out)['verdict']) == (3, 'FAIL')
+    status, out, _ = run('verify', *judged, '0.3', '--confidence', str(np.nextafter(1.0, 0.0)))
+    found = json.loads(out, parse_constant=pytest.fail)
+    assert (status, found['verdict'], found['upper_mm']) == (3, 'UNDECIDED', None)
+
+
 @pytest.mark.parametrize(
     ('given', 'said'),
     [

@@ -342,7 +342,7 @@ def test_workbooks(tmp_path, monkeypatch):
     book.save(path)
     found = read_table(path, 2, foreign=Foreign(Layout()))
     assert_same(found, None)
-    assert 'there are no numbers in line 3: left out' in str(found.warnings)
+    assert 'there are no numbers in line 3: only units are read' in str(found.warnings)
     assert 'sheet "measured" of 2 is read (--sheet)' in str(found.warnings)
     book['first'].sheet_state = 'visible'
     book['first'].append(['a protocol', 1])

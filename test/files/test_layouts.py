@@ -120,6 +120,76 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
     np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
 
 
+@pytest.mark.parametrize(
+    ('head', 'row'),
+    [
+        ('q1 [DEG],q2 (Deg),X [MM],Y / MM,Z [mm]', '90,180,1,2,3'),
+        ('q1,q2,x,y,z\n[deg],,[ mm ],,', '90,180,1,2,3'),
+        ('q1,q2,x,y,z\nDegrees,Degrees,inches,millimeter,Meters', '90,180,.03937007874,2,.003'),
+        ('q1 [deg],q2 [rad],x [mm],y [m],z [cm]', '90,3.141592653589793,1,.002,.3'),
+        ('q1 [rad],q2 [rad],x [mm],y,z,rx [deg],ry,rz', '1.5707963268,3.1415926536,1,2,3,90,0,0'),
+    ],
+)
+def test_each_column_has_its_own_unit(tmp_path, head, row):
+    (tmp_path / 'cell.csv').write_text(f'{head}\n{row}\n')
+    foreign = Foreign(Layout(rotation_vector='rx' in head))
+    table = read_table(tmp_path / 'cell.csv', 2, foreign=foreign)
+    (found,) = table.fitted
+    np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
+    np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
+    if 'rx' in head:
+        np.testing.assert_allclose(found.rotations[0] @ [0, 1, 0], [0, 0, 1], atol=1e-9)
+    assert 'no units' not in str(table.warnings)
+
+
+@pytest.mark.parametrize(
+    ('head', 'told'),
+    [
+        (
+            'q1 [mm],q2,x [mm],y,z',
+            r'q1 = q1 \[mm\] cannot be in mm, .* --chain if it is prismatic',
+        ),
+        ('q1,q2,x [deg],y,z', r'x = x \[deg\] cannot be in deg, expected m, cm'),
+        ('q1,q2,x [mm],y [m],z', 'z has no unit, others are in m and mm'),
+        ('q1,q2,x [mm],x,y', 'Several columns are called x'),
+        ('q1,Y [m],X [mm],y,z', r'x = X\+Y mixes m and mm'),
+    ],
+)
+def test_contradictory_units_are_refused(tmp_path, head, told):
+    (tmp_path / 'cell.csv').write_text(f'{head}\n1,2,3,4,5\n')
+    layout = Layout(columns={'q2': 'q1', 'x': 'X+Y'} if 'X' in head else {})
+    with pytest.raises(InputError, match=told):
+        read_table(tmp_path / 'cell.csv', 2, foreign=Foreign(layout))
+
+
+@pytest.mark.parametrize('head', ['a [deg],b,c [mm],d,e', 'a,b,c,d,e\ndeg,deg,mm,mm,mm'])
+def test_units_of_columns_by_their_numbers(tmp_path, head):
+    (tmp_path / 'cell.csv').write_text(f'Cell\n{head}\n90,180,1,2,3\n')
+    columns = dict(zip(('q1', 'q2', 'x', 'y', 'z'), ('#1', '#2', '#3', '#4', '#5'), strict=True))
+    foreign = Foreign(Layout(columns=columns))
+    (found,) = read_table(tmp_path / 'cell.csv', 2, foreign=foreign).fitted
+    np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
+    np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
+
+
+def test_a_line_of_units_below_our_own_columns_is_read(tmp_path):
+    (tmp_path / 'cell.csv').write_text('q1,q2,x,y,z\ndeg,deg,mm,mm,mm\n90,180,1,2,3\n')
+    chain = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    (found,) = loading.table(tmp_path / 'cell.csv', chain, Settings()).fitted
+    np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
+    np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
+    with pytest.raises(InputError, match='a line of units is read with --length'):
+        read_table(tmp_path / 'cell.csv', 2)
+
+
+def test_units_of_standard_deviations_and_of_converted_columns(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text('q1,q2,X [mm],y,z,sx [um],sy [um],sz [um]\n1,2,3,4,5,10,10,10\n')
+    table = read_table(path, 2, foreign=Foreign(Layout(columns={'x': 'X/1000'})))
+    np.testing.assert_allclose(np.diag(table.fitted[0].covariance[0])[:3], 1e-10)
+    assert 'x = X/1000 is in mm, as its header says' in str(table.warnings)
+
+
 def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_header(tmp_path):
     """Of a tracker and a controller: other orders, a pose not measured, decimal commas."""
     log = 'Robot 7\n24.11.2026;noon\nPoint;Date;J1 [°];J2 [°]\n'

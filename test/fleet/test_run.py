@@ -105,6 +105,12 @@ def test_the_measurements_of_another_robot_are_told_of(plant, cluster, tmp_path)
         assert 'unreadable' in each.states
         (said,) = each.errors.values()
         assert f'001.csv has the measurements of {other}: only one robot made them' in said
+    last = max(history.rows('B'), key=lambda row: row.time)
+    assert f'remove {last.key}.parquet' in said
+    (nights / 'B' / '001.csv').unlink()
+    (tmp_path / f'history/robot=B/{last.key}.parquet').unlink()
+    found = standings(plant, history, run(plant, history, cluster, None), 100.0)
+    assert not any(each.errors for each in found)
 
 
 def test_a_night_counts_once_after_an_upgrade(plant, cluster, tmp_path, monkeypatch):

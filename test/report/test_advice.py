@@ -11,7 +11,9 @@ from pages import page_of, report_of
 
 from calib_ros import Problem, identify, load_chain
 from calib_ros.apply import simulation
+from calib_ros.decision.mistakes import Explained
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.suspects import Suspect
 from calib_ros.report import advice
 
 
@@ -22,6 +24,15 @@ def test_every_refusal_is_told_in_plain_words(rule):
     assert told.steps
     assert told.meaning
     assert told.refusal == 'something new'
+
+
+def test_a_verdict_names_each_of_several_mistakes():
+    both = Suspect(
+        'several mistakes at once', 'a and b are swapped (--columns a); c counts (sign: -1)'
+    )
+    found = Explained((both,), 1.0, 2e-3)
+    (told,) = advice.advice([Reason(Rule.MISTAKE, str(found))])
+    assert told.in_short.endswith(f': {both.what}: {both.remedy}')
 
 
 @pytest.mark.parametrize('rule', [Rule.GAIN, Rule.REGION])

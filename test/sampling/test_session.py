@@ -94,6 +94,15 @@ def test_a_sample_in_a_stray_frame_is_left_out_when_the_usual_one_is_known():
     assert made.identify().accepted
 
 
+def test_poses_of_another_frame_can_be_removed():
+    made = session(samples(30, frame_id='left'), samples(5, seed=6, start=100, frame_id='right'))
+    assert 'different frames (left, right)' in made.status()
+    for _ in range(5):
+        made.remove_last()
+    assert 'different frames' not in made.status()
+    assert made.identify().accepted
+
+
 def test_frame_id_helps_at_once_when_frames_differ():
     made = session(samples(30, frame_id='left'), samples(20, seed=6, start=100, frame_id='right'))
     with pytest.raises(InputError, match='set frame_id'):
