@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Something moved during the session: one step in time of a base, a tool or a joint's zero.
 
-If residuals are larger than the noise, one of the load and of all zeros at once is searched too,
-beyond what the arm bends under a constant load at its end.
+If none is found and residuals are larger than the noise, these are searched again beyond what the
+arm bends under a constant load at its end, and one of the load and of all zeros at once too.
 
 Each of these adds a group of columns X to the linear model, switched on at some stop. At the fit,
 with J the columns of the parameters and r the residuals, a group explains, of the remaining
@@ -49,12 +49,11 @@ class Step:
 
     A base or tool frame, a joint, all joints or the load (`kind`: 'base', 'tool', 'joint',
     'joints' or 'load'); `thing` names the device or target there. `set`, `sample`, its `image` and
-    `stamp_ns` belong to the first sample after
-    the step. `size` is the RMS change of positions ('m') or, if that weighs more, orientations
-    ('rad'); of a joint that of its zero. `share` is its share of the squared residuals beyond that
-    of as many useless parameters. If all measurements on one side are outliers, `unused` says
-    which: the fit is not affected. If the arm's places before and after lie `apart`, errors of the
-    arm look like a step.
+    `stamp_ns` belong to the first sample after the step. `size` is the RMS change of positions
+    ('m') or, if that weighs more, orientations ('rad'); of a joint that of its zero. `share` is
+    its share of the squared residuals beyond that of as many useless parameters. If all
+    measurements on one side are outliers, `unused` says which: the fit of frames is not affected.
+    If the arm's places before and after lie `apart`, errors of the arm look like a step.
     """
 
     what: str
@@ -115,15 +114,19 @@ class Step:
 
 def find_step(fitted: Fitted) -> Step | None:
     """Return the step that explains more than half of the residuals of a fit, if any."""
-    scan = _Scan(fitted)
-    found = scan.best()
-    if found is not None and scan.few_gross(found):
-        scan = _Scan(fitted, gross=False)
-        found = scan.best()
+    scan, found = _searched(fitted, loaded=False)
     if found is None and fitted.noise.position >= SUSPICIOUS:
-        scan = _Scan(fitted, arm=True)
-        found = scan.best()
+        scan, found = _searched(fitted, loaded=True)
     return None if found is None or scan.drifts(found) else scan.described(found)
+
+
+def _searched(fitted: Fitted, loaded: bool, gross: bool = True) -> tuple[_Scan, _Found | None]:
+    """Return the linear model, with a constant load or without, and its best step."""
+    scan = _Scan(fitted, loaded, gross)
+    found = scan.best()
+    if gross and found is not None and scan.few_gross(found):
+        return _searched(fitted, loaded, gross=False)
+    return scan, found
 
 
 def _some_places(stops: int) -> Index:
@@ -141,7 +144,7 @@ def _some_places(stops: int) -> Index:
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Columns switched on together: a frame of some sets, or the zero of a joint."""
+    """Columns switched on together: a frame of some sets, zeros of joints, or the load."""
 
     what: str
     kind: str
@@ -167,13 +170,14 @@ class _Found:
 class _Scan:
     """The linear model at a fit, with columns of everything that may have moved."""
 
-    def __init__(self, fitted: Fitted, gross: bool = True, arm: bool = False) -> None:
+    def __init__(self, fitted: Fitted, loaded: bool, gross: bool) -> None:
         problem, names, robust = fitted.problem, fitted.names, fitted.robust
         self._problem, self._chain = problem, robust.fit.chain
-        self._groups = _of_the_arm(problem) if arm else _groups(problem)
+        self._groups = _groups(problem) + (_of_the_arm(problem) if loaded else [])
         loads = [n for group in self._groups if group.kind == 'load' for n in group.names]
         constant = [name for name in loads if name not in names]
         self._chain = self._chain.with_effects(constant)
+        constant += [j.driven for j in problem.chain.joints if j.driven not in problem.free]
         names = (*names, *constant)
         self._fitted = len(names)
         self._added = list(dict.fromkeys(n for group in self._groups for n in group.names))
@@ -202,6 +206,8 @@ class _Scan:
         left = np.zeros(len(self._names) + 1)
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
+        usual = bool(self._left.sum() < SUSPICIOUS**2 * self._equations.sum())
+        self._explained = bool(constant) and usual and fitted.noise.position >= SUSPICIOUS
 
     def _budget(self, group: _Group) -> tuple[float, float, float]:
         """Return equations, degrees of freedom and remaining squares of a group's sets."""
@@ -212,6 +218,8 @@ class _Scan:
 
     def best(self) -> _Found | None:
         """Return the best step, if it explains most of the squares."""
+        if self._explained:  # by what is wrong from the first pose on
+            return None
         some = _some_places(self._stops)
         if any(group.held for group in self._groups):
             some = np.concatenate([[0], some])

@@ -307,3 +307,23 @@ def test_another_load_and_other_zeros_of_all_joints(what, rng):
     else:
         assert (result.step.kind, result.step.sample) == (what, AT)
         assert result.refusals[0].rule is (Rule.MOVED if what == 'load' else Rule.ENCODER)
+
+
+@pytest.mark.parametrize('what', ['joint', 'tool', 'base'])
+def test_a_soft_arm_hides_no_step(what, rng):
+    """Beside its bending a slip would be that of several joints, and a bump none."""
+    load = {f'{joint}.gravity_wrist_3_joint': 1e-3 for joint in UR10E.joint_names[1:4]}
+    true = arm(rng).with_effects(list(load)).with_offsets(load)
+    seen = measure(true, poses('random', rng), rng, *NOISE)
+    step = identify(Problem(UR10E, moved(seen, true, what, 1e-3), **SIGMAS)).step
+    assert (step.kind, step.sample) == (what, AT)
+
+
+@pytest.mark.parametrize('what', ['joint', 'tool', None])
+def test_a_wrong_zero_that_is_held_is_no_step(what):
+    """Nearly all of its poses are after the third, so a slip there would explain most."""
+    true, seen = session(17)
+    seen = moved(seen, true, what, 2e-3) if what else seen
+    held = ('shoulder_lift_joint.theta', 'elbow_joint.theta')
+    step = identify(Problem(UR10E, seen, fixed=held, **SIGMAS)).step
+    assert (step and (step.kind, step.sample)) == (what and (what, AT))
