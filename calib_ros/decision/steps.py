@@ -39,6 +39,7 @@ from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
 FRAMES = ('base', 'tool')
+OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
 EXPLAINED = 0.5
 """Share of the squared residuals that an explanation needs: most of them (benchmarks/harm.py)."""
 
@@ -97,12 +98,11 @@ class Step:
         thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':
             thing, of = f'the zero of {self.what}', ''
-        if self.kind == 'joints':
-            thing, of = 'the zeros of several joints', ' at the target'
         text = f'{thing} moved {size}{of} before {where} ({when})'
+        if self.kind in OF_THE_ARM:
+            text = f'{thing} changed before {where} ({when}): poses differ {size}'
         if self.kind == 'load':
-            text = f'the load of the arm changed before {where} ({when}): poses differ {size}; '
-            text += 'measure with one load, or fit only the poses before or only those after'
+            text += '; measure with one load, or fit only the poses before or only those after'
         if self.unused:
             text += f'; measurements {self.unused} carry no weight'
         if self.apart:
@@ -365,7 +365,7 @@ def _apart(joints: FloatArray, after: Flags) -> bool:
 
 def _thing(kind: str, seen: Observations) -> str:
     if kind not in FRAMES:
-        return 'the load' if kind == 'load' else f'the {kind}'
+        return OF_THE_ARM.get(kind, 'the joint')
     of_images = seen.pixels is not None
     target = ['the board' if of_images else 'the target']
     device = ['the camera', 'its lens'] if of_images else ['the measuring device']

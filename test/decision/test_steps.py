@@ -306,6 +306,8 @@ def test_another_load_and_other_zeros_of_all_joints(what, rng):
         assert result.accepted
     else:
         assert (result.step.kind, result.step.sample) == (what, AT)
+        thing = 'the load of the arm' if what == 'load' else 'the zeros of several joints'
+        assert result.refusals[0].startswith(f'{thing} changed before line {AT + 1} (')
         assert result.refusals[0].rule is (Rule.MOVED if what == 'load' else Rule.ENCODER)
 
 
