@@ -330,18 +330,21 @@ def _successive(
     found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
         last: dict[int, FloatArray] = {}
-        for _, sums in samples.sums(chain, names, samples.observations.stops):
+        number = -1
+        for numbers, sums in samples.sums(chain, names, samples.observations.stops):
+            later = np.diff(numbers, prepend=number)  # zero within a stop, across blocks
+            number = numbers[-1]
             for part, own in kernels.items():
                 if part >= len(sums):
                     continue
                 lengths, weights = np.array(own).T
-                fading = np.exp(-1.0 / lengths)[:, np.newaxis]
+                fading = np.exp(-np.divide.outer(later, lengths))[:, :, np.newaxis]
                 rows = np.ascontiguousarray(sums[part][:-1].T)
                 stops = rows.reshape(len(rows), -1)
                 together = -0.5 * weights.sum() * stops
                 faded = last.setdefault(part, np.zeros((len(own), stops.shape[1])))
-                for stop, total in zip(stops, together, strict=True):
-                    faded *= fading
+                for stop, total, share in zip(stops, together, fading, strict=True):
+                    faded *= share
                     faded += stop
                     total += weights @ faded
                 cross = rows.reshape(-1, size).T @ together.reshape(-1, size)
