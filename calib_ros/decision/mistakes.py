@@ -153,7 +153,8 @@ def _unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
         return (sets[worst],), ''
     shared = set.intersection(*({each.base, each.tool} for each in sets))
     own = ', '.join(sorted({sets[worst].base, sets[worst].tool} - shared))
-    return (sets[worst],), f'in the measurements with {own} alone, '
+    which = f'with {own}' if own else f'of {len(sets[worst])} poses'
+    return (sets[worst],), f'in the measurements {which} alone, '
 
 
 def _of_images(problem: Problem) -> bool:

@@ -354,12 +354,15 @@ def test_a_fit_that_runs_away_ends_in_words(monkeypatch):
 
     monkeypatch.setattr(identification, 'fit', away)
     _, seen = scene(2, True)
-    for given, words in (
-        (seen, 'no stable solution: check the arm'),
-        (replace(seen, points=1e3 * seen.points), 'at all: the board is stated 1000 times'),
+    large = replace(seen, points=1e3 * seen.points)
+    one, others = np.split(np.arange(len(seen)), [len(POINTS)])  # one image fits any
+    for given, more, words in (
+        (seen, (), 'no stable solution: check the arm'),
+        (large, (), 'at all: the board is stated 1000 times'),
+        (large.select(one), (large.select(others),), 'of 29 poses alone, the board'),
     ):
         with pytest.raises(InputError, match=words):
-            identify(Problem(known(True), given, sigma_pixel=SIGMA))
+            identify(Problem(known(True), given, more=more, sigma_pixel=SIGMA))
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
