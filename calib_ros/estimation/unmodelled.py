@@ -13,7 +13,8 @@ their columns and p of these with the residuals, both beside the parameters, the
     (p^T (W + I / s^2)^-1 p - log det(I + s^2 W)) / 2
 
 In a small region parameters absorb waves without a trace in the residuals: unless the data rule
-the typical size out, the largest plausible one counts, at most the typical one.
+the typical size out, the largest plausible one counts, at most the typical one or a larger one
+that shows.
 
 The rest is random, from stop to stop. With the columns Q of the posterior, and of waves that show,
 scaled by a root of the covariance, the residuals r have the covariance B V B + B - B^2, B = I -

@@ -170,7 +170,10 @@ def plan_report(
 def _visit(chain: Chain, joints: FloatArray) -> Section:
     order = list(range(1, len(joints) + 1))
     scale = figures.scale_of('order of visit')
-    scale['colorbar'] |= {'tickformat': 'd', 'nticks': min(len(order), 6)}
+    bar = scale['colorbar']
+    bar |= {'tickformat': 'd', 'nticks': min(len(order), 6)}
+    bar |= {'orientation': 'h', 'y': 0.0, 'yanchor': 'top'}  # narrow screens keep their width
+    bar['title']['side'] = 'top'
     path = figures.in_space(
         in_base(chain, joints)[:, :3, 3],
         'order of visit',
