@@ -5,10 +5,8 @@
 from __future__ import annotations
 
 import argparse
-import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, given
@@ -23,7 +21,7 @@ from calib_ros.identification.calibration import Calibration, calibration_file
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain, table_hash
 from calib_ros.progress import share_of
-from calib_ros.report.documents import figures_document
+from calib_ros.report.documents import verification_document
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, likely, remarks, standing, verification_report
@@ -32,7 +30,6 @@ from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
-LIKELY = ('rms', 'lower', 'upper')  # of poses like these
 EARLIER = ('verification.txt',)  # of earlier versions: no verdict stays beside a newer one
 
 
@@ -65,7 +62,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     for warning in warnings:
         screen.warn(warning)
     if options.json:
-        screen.data(dump_json(document(found)))
+        screen.data(dump_json(verification_document(found)))
     else:
         show(found, screen)
     passed = standing(found)[0].state not in ('bad', 'open')
@@ -81,29 +78,6 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
         contents['report.md'] = markdown(report, {})
         contents |= given.page_of(report, screen, pdf=options.pdf)
     return status
-
-
-def document(found: Verification) -> dict[str, Any]:
-    """Return a verdict and its figures as plain values."""
-    lengths = {name: getattr(found, name) for name in ('tolerance', 'limit', *LIKELY)}
-    known = {name: 1e3 * m for name, m in lengths.items() if m is not None and math.isfinite(m)}
-    return {
-        'verdict': found.verdict,
-        **{f'{name}_mm': known.get(name) for name in lengths},
-        'confidence': found.confidence,
-        'poses': found.configurations,
-        'poses_needed': found.needed,
-        **figures_document(found.comparison),
-        'by_pose': [
-            {'measured': each.cycles, 'before_mm': each.before, 'after_mm': each.after}
-            | {'repeatability_mm': each.repeatability}
-            for each in found.each
-        ],
-        'by_program': found.by_program,
-        'refitted': list(found.fitted),
-        'reused': found.reused,
-        'remarks': list(remarks(found)),
-    }
 
 
 def show(found: Verification, screen: Screen) -> None:

@@ -49,9 +49,8 @@ from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
 
 HARMFUL = 0.15
-"""Probability of harm by the device's scale at which a result is refused: of 630 good ones 21 are
-(13 without any region); of 1,890 arms with such an error 64 are accepted and get worse
-(benchmarks/scale.py)."""
+"""Probability of harm by the device's scale at which a result is refused: of 630 good ones 23 are;
+of 1,890 arms with a scale of 0.1 to 0.3 % 59 are accepted and get worse (benchmarks/scale.py)."""
 LEAST_NOISE = NEARER * EXCEPTION
 """Residuals in units of the given sigmas below which these are wrong: clearly less than a
 tenth, the ratio of a device's repeatability to its accuracy; mm would be thousandths."""

@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A result for programs: the content of result.json, and settings as a parameter file."""
+"""Results for programs: result.json, the verdict of verify, and settings as a parameter file."""
 
 from __future__ import annotations
 
+import math
 import platform
 from dataclasses import asdict
 from typing import Any
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 
 import calib_ros
+from calib_ros.apply.verification import Verification
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.fitted import ParameterRow
 from calib_ros.report import words
+from calib_ros.report.verdicts import remarks
 from calib_ros.settings import Settings
 from calib_ros.texts import dump_yaml
 
@@ -92,3 +95,28 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
     for name, value in asdict(settings).items():
         parameters[name] = (list(value) or ['']) if isinstance(value, tuple) else value
     return dump_yaml({'/**': {'ros__parameters': parameters}})
+
+
+def verification_document(found: Verification) -> dict[str, Any]:
+    """Return a verdict and its figures as plain values."""
+    of_poses_like_these = 'rms', 'lower', 'upper'
+    names = ('tolerance', 'limit', *of_poses_like_these)
+    lengths = {name: getattr(found, name) for name in names}
+    known = {name: 1e3 * m for name, m in lengths.items() if m is not None and math.isfinite(m)}
+    return {
+        'verdict': found.verdict,
+        **{f'{name}_mm': known.get(name) for name in lengths},
+        'confidence': found.confidence,
+        'poses': found.configurations,
+        'poses_needed': found.needed,
+        **figures_document(found.comparison),
+        'by_pose': [
+            {'measured': each.cycles, 'before_mm': each.before, 'after_mm': each.after}
+            | {'repeatability_mm': each.repeatability}
+            for each in found.each
+        ],
+        'by_program': found.by_program,
+        'refitted': list(found.fitted),
+        'reused': found.reused,
+        'remarks': list(remarks(found)),
+    }

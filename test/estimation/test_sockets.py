@@ -13,6 +13,7 @@ from in_sockets import DISTANCE, IIWA, cell, difference, led_to
 
 from calib_ros import Chain, Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty
+from calib_ros.decision.reasons import Rule
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.kinematics import se3
@@ -157,6 +158,7 @@ def test_sockets_at_another_distance_than_stated_are_refused(error):
     stated = [(*pair, (1.0 - error) * distance) for *pair, distance in problem.separations]
     result = identify(replace(problem, separations=stated))
     assert result.accepted == (not error)
+    assert any(each.rule is Rule.SCALE for each in result.refusals) == bool(error)
 
 
 def test_only_sockets_are_a_known_distance_apart():

@@ -213,6 +213,8 @@ def test_a_full_disk(tmp_path, recording):
         ]
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (hard, hard))
         cell.spin_until(lambda: heard[-1].status[0].level != DiagnosticStatus.ERROR)
+        assert 'memory' not in heard[-1].status[0].message
+        assert ' poses' in heard[-1].status[0].message
         cell.spin_until(lambda: 'memory' not in status[-1].data)
         assert len(samples_in(tmp_path)) == STOPS
         cell.done('save')
