@@ -35,8 +35,9 @@ HEAD_LINES = MOST_ENTRIES // 10
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 SHEETS = ('.xlsx', '.xlsm')
 LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
+LONG |= {'micrometer': 'um'}
 SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
-SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'micrometers': 'um', 'inch': 'in', 'inches': 'in'}
+SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
 SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
 _ANY = '|'.join(SIGNS)
