@@ -129,15 +129,13 @@ def norms(vectors: FloatArray) -> FloatArray:
 
 
 def left_jacobian_inverse(vector: FloatArray) -> FloatArray:
-    """Return J_l(v)^-1 (3, 3) (Chirikjian 2012).
+    """Return J_l(v)^-1 (..., 3, 3) of rotation vectors (..., 3) (Chirikjian 2012).
 
     For small w, log(exp(w) exp(v)) = v + J_l(v)^-1 w.
     """
-    angle = float(np.linalg.norm(vector))
+    half = 0.5 * np.maximum(np.linalg.norm(vector, axis=-1), 1e-6)[..., np.newaxis, np.newaxis]
+    factor = (1.0 - half / np.tan(half)) / (2.0 * half) ** 2
     cross = skew(vector)
-    if angle < 1e-6:
-        return np.asarray(np.eye(3) - 0.5 * cross)
-    factor = 1.0 / angle**2 - 0.5 / (angle * np.tan(0.5 * angle))
     return np.asarray(np.eye(3) - 0.5 * cross + factor * cross @ cross)
 
 

@@ -40,6 +40,8 @@ def test_the_left_jacobian_is_the_central_difference(angle, seed):
     expected = (more - less).T / (2.0 * step)
     found = se3.left_jacobian_inverse(vector)
     np.testing.assert_allclose(found, expected, atol=1e-7)
+    among_others = se3.left_jacobian_inverse(np.array([[1.0, -2.0, 0.5], vector]))[1]
+    np.testing.assert_allclose(among_others, found, rtol=0.0, atol=1e-15)
     if angle < 0.01:  # its series, of which the next term is the fourth power over 720
         cross = se3.skew(vector)
         series = np.eye(3) - cross / 2.0 + cross @ cross / 12.0
