@@ -13,12 +13,11 @@ import numpy as np
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
-from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.sample import Frames, Sample, named, socket_pairs
+from calib_ros.sampling.sample import Frames, Sample, socket_pairs
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
@@ -128,16 +127,6 @@ def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
     return found if posed or samples[0].view is None else _seen(found, samples)
 
 
-def check_joint_names(chain: Chain, names: Sequence[str]) -> None:
-    """Refuse joint names with a ConfigError unless there is one for each joint."""
-    count = len(chain.joints)
-    if not len(names) == len(set(names)) == count:
-        raise ConfigError(
-            f'joint_names must be {count} different names, one for each of '
-            f'{", ".join(chain.joint_names)}; not {", ".join(names)}'
-        )
-
-
 def check_settings(chain: Chain, settings: Settings) -> None:
     """Refuse settings with a ConfigError that no identification of a chain could use."""
     if settings.mode == 'continuous' and any(
@@ -197,44 +186,3 @@ def gathered(
     pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
     cameras = {} if posed else lenses(samples, frames)
     return Gathered(fitted, held_out, pairs, world_frame, cameras, frames.owners)
-
-
-def problem_of(
-    chain: Chain, samples: Sequence[Sample], settings: Settings, posed: bool = False
-) -> Problem | None:
-    """Return samples as a problem, or None; with `posed` boards as poses, not corners."""
-    if all(sample.validation for sample in samples):
-        return None
-    found = gathered(samples, settings.sigmas, posed)
-    return found.problem(chain, settings, of_messages=True)
-
-
-def in_frames_of(
-    calibration: Calibration, since: Sequence[Sample], usable: Sequence[Sample], settings: Settings
-) -> list[Observations]:
-    """Return the poses measured since a calibration, among all usable ones, in its frames.
-
-    Raises InputError if there are none, or if their frames are unknown to it.
-    """
-    # without owners, the first device and target have the frames
-    frames = Frames(calibration.owners) if calibration.owners else named(usable)
-    sets = [each for part in collect(since, settings.sigmas, frames) for each in part]
-    if not sets:
-        raise InputError(
-            'no poses since the calibration was identified or loaded: measure some new poses'
-        )
-    known = calibration.chain.frame_names
-    if not all(each.base in known and each.tool in known for each in sets):
-        raise InputError(
-            'the new poses come from a device or target that the calibration does not know'
-        )
-    return sets
-
-
-def problem_since(
-    calibration: Calibration, chain: Chain, sets: Sequence[Observations], settings: Settings
-) -> Problem:
-    """Return sets between the frames of a calibration as a problem of the nominal chain."""
-    cameras = {each.camera for each in sets if each.pixels is not None}
-    seen = {name: lens for name in cameras if (lens := calibration.chain.frame(name).lens)}
-    return Gathered(sets, lenses=seen).problem(chain, settings)

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.result import Identification
-from calib_ros.errors import InputError, TooFewObservationsError
+from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -22,18 +22,12 @@ from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Part
-from calib_ros.sampling.gathered import (
-    check_joint_names,
-    check_settings,
-    in_frames_of,
-    problem_of,
-    problem_since,
-)
+from calib_ros.sampling.gathered import Gathered, check_settings, collect, gathered
 from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
-from calib_ros.sampling.sample import Sample, named, socket_place
+from calib_ros.sampling.sample import Frames, Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
 from calib_ros.values import require
@@ -66,7 +60,11 @@ class CalibrationSession:
         self.on_sample = on_sample or (lambda sample: None)
         self.on_removed = on_removed or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
-        check_joint_names(chain, self.joint_names)
+        if not len(self.joint_names) == len({*self.joint_names}) == len(chain.joints):
+            raise ConfigError(
+                f'joint_names must be {len(chain.joints)} different names, one for each of '
+                f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
+            )
         check_settings(chain, self.settings)
         self.recording = True
         self.calibration: Calibration | None = None  # the last one accepted or loaded
@@ -305,10 +303,10 @@ class CalibrationSession:
 
     def problem_of(self, samples: Sequence[Sample], posed: bool = False) -> Problem:
         """Return samples as a problem; with `posed` boards as poses, not corners."""
-        found = problem_of(self.chain, samples, self.settings, posed)
-        if found is None:
+        if all(sample.validation for sample in samples):
             raise InputError(f'no poses to fit: {self.summary}')
-        return found
+        found = gathered(samples, self.settings.sigmas, posed)
+        return found.problem(self.chain, self.settings, of_messages=True)
 
     def identify(self) -> Identification:
         """Identify from the samples so far, and keep the result if accepted."""
@@ -348,16 +346,32 @@ class CalibrationSession:
     def recent(self) -> tuple[Calibration, Problem]:
         """Return the calibration, and the last stops since then as a problem."""
         calibration, sets = self._since(NO_ACCIDENT)
-        return calibration, problem_since(calibration, self.chain, sets, self.settings)
+        cameras = {each.camera for each in sets if each.pixels is not None}
+        seen = {name: lens for name in cameras if (lens := calibration.chain.frame(name).lens)}
+        return calibration, Gathered(sets, lenses=seen).problem(self.chain, self.settings)
 
     def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
+        """Return the calibration, and the poses measured since in its frames."""
         calibration = self.calibration
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')
         self._flush()
         since = [each for each in self.usable if each not in self._known]
         since = since[-most:] if most else since
-        return calibration, in_frames_of(calibration, since, self.usable, self.settings)
+        # without owners, the first device and target have the frames
+        frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
+        found = collect(since, self.settings.sigmas, frames)
+        sets = [each for part in found for each in part]
+        if not sets:
+            raise InputError(
+                'no poses since the calibration was identified or loaded: measure some new poses'
+            )
+        known = calibration.chain.frame_names
+        if not all(each.base in known and each.tool in known for each in sets):
+            raise InputError(
+                'the new poses come from a device or target that the calibration does not know'
+            )
+        return calibration, sets
 
     def _flush(self) -> None:
         self._pipeline.flush()
