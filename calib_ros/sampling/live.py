@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ from calib_ros.estimation.leastsquares import (
     STEP_TOLERANCE,
     Prior,
     System,
-    normal_equations,
+    products_of,
 )
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
@@ -182,16 +182,15 @@ class LiveEstimate:
 
     def _settle(self) -> None:
         for _ in range(ROUNDS):
-            if np.abs(self._step()).max() < SMALL_STEP or len(self._added) > SOME:
+            chain, step, *_ = self._estimate()
+            if np.abs(step).max() < SMALL_STEP or len(self._added) > SOME:
                 break
-            self._linearise(self._estimate())
+            self._linearise(chain)
 
     def _linearise(self, chain: Chain) -> None:
         inverse, residual = self._prior.rows(chain, self._names)
-        self._chain = chain
-        self._information = np.diag(inverse**2)
-        self._vector = inverse * residual
-        self._cost, self._rows = float(residual @ residual), 0
+        rows = np.column_stack([np.diag(inverse), residual])
+        self._chain, self._products, self._rows = chain, rows.T @ rows, 0
         added, self._added = self._added, []
         self._add(added, gate=False)
 
@@ -200,10 +199,7 @@ class LiveEstimate:
         if gate and self._enough(self._rows):
             samples = self._plausible(samples)
         system = self._system(self._groups(samples))
-        normal = normal_equations(self._chain, self._names, system)
-        self._information = self._information + normal.matrix
-        self._vector = self._vector + normal.gradient
-        self._cost += normal.cost
+        self._products = self._products + products_of(self._chain, self._names, system)[0].sum(0)
         self._rows += system.rows
         self._added += samples
 
@@ -227,48 +223,37 @@ class LiveEstimate:
         return System(tuple(Samples(each, *self._sigmas) for _, each in groups), prior)
 
     def _plausible(self, samples: Sequence[Sample]) -> list[Sample]:
-        chain = self._estimate()
-        covariance, noise = self._uncertainty()
+        chain, _, covariance, noise = self._estimate()
         # samples of one place may agree better than the model holds elsewhere
         covariance, noise = covariance * max(1.0 / noise, 1.0), max(noise, 1.0)
         good: list[Sample] = []
         for members, some in self._groups(samples):
-            left = residual_arrays(chain, some)[0]
-            model = ErrorModel(chain, self._names, some.base, some.tool)
-            jacobian = model.jacobian(some.joints, some.approach, some.velocity)[:, :3]
-            if some.distances is not None:
-                points = chain.forward(some.joints, some.approach, some.base, some.tool)[:, :3, 3]
-                rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-                jacobian = rays[:, np.newaxis] @ jacobian
-            spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-            spread += np.eye(left.shape[1]) * noise * self._sigmas[0] ** 2
+            placed = Samples(replace(some, covariance=None), *self._sigmas)
+            width = 3 if some.distances is None else 1
+            *rows, left = placed.rows_of(chain, self._names)[:, :width].transpose(0, 2, 1)
+            jacobian = np.stack(rows, axis=2)
+            spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + noise * np.eye(width)
             size = (left * np.linalg.solve(spread, left[..., np.newaxis])[..., 0]).sum(axis=1)
             for sample, far in zip(members, (size > OUTER**2).tolist(), strict=True):
                 (self.suspicious if far else good).append(sample)
         return good
 
-    def _solved(self) -> tuple[FloatArray, FloatArray]:
-        """Return the step to the estimate (P,), and a root (P, P) of its covariance."""
-        return solved(self._information, self._vector, np.zeros(len(self._names)))
+    def _estimate(self) -> tuple[Chain, FloatArray, FloatArray, float]:
+        """Return the chain, the step (P,) to it, its covariance, and the variance of the noise.
 
-    def _step(self) -> FloatArray:
-        return self._solved()[0]
-
-    def _estimate(self) -> Chain:
+        The covariance (P, P) is for the noise of the residuals.
+        """
         assert self._chain is not None
-        return self._chain.with_offsets(dict(zip(self._names, self._step(), strict=True)))
-
-    def _uncertainty(self) -> tuple[FloatArray, float]:
-        """Return the covariance for the noise of the residuals, and its variance."""
-        step, root = self._solved()
-        left = max(self._cost - float(step @ self._vector), 0.0)
-        freedom = self._rows - len(self._names)
+        vector = self._products[:-1, -1]
+        step, root = solved(self._products[:-1, :-1], vector, np.zeros(len(vector)))
+        left = max(float(self._products[-1, -1] - step @ vector), 0.0)
+        freedom = self._rows - len(vector)
         noise = max(left / freedom, STEP_TOLERANCE**2) if freedom > 0 else 1.0
-        return noise * root @ root.T, noise
+        chain = self._chain.with_offsets(dict(zip(self._names, step, strict=True)))
+        return chain, step, noise * root @ root.T, noise
 
     def _result(self) -> Estimate:
-        chain = self._estimate()
-        covariance, noise = self._uncertainty()
+        chain, _, covariance, noise = self._estimate()
         jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
         variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
         sigma = float(np.sqrt(variance.mean()))
