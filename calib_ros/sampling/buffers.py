@@ -176,11 +176,11 @@ class Waiting(dict[StreamKey, Rows]):
         rows.extend(stamps[taken], numbers[taken])
         return True
 
-    def room(self, given: Slice) -> int | None:
-        """Return up to where messages fit; None if room must be made."""
+    def room(self, given: Slice) -> int:
+        """Return up to where messages fit; 0 if room must be made."""
         streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
         if len(self.keys() | {each.key for each in streams}) > MOST_NAMES:
-            return None
+            return 0
         end = len(given)
         for key, places, *_ in streams:
             assert isinstance(key, StreamKey)

@@ -125,8 +125,7 @@ class Collector:
         delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # beyond that of the slice
         late = times - np.where(joints, 0, delay_ns) <= newest - self._late_ns
         end = begin + int(np.argmax(np.append(late[begin:], True)))
-        room = self.waiting.room(given)
-        return begin if room is None else min(end, room)
+        return min(end, self.waiting.room(given))
 
     def take(self, given: Slice) -> list[int]:
         """Take messages up to one that gives something to do; return the stamps of its rounds."""

@@ -24,8 +24,6 @@ def interpolated(
     """
     known, values = rows.stamps, rows.values
     nothing = np.zeros((len(stamps), values.shape[1]))
-    if rows.count == 0:
-        return nothing, nothing, nothing
     origin = values[first]
     span = (known[last] - known[first]) * 1e-9
     share = (stamps - known[first]) * 1e-9 / np.maximum(span, 1e-9)
@@ -85,8 +83,6 @@ def last_moves(
     Relative to the last of the samples (M, n) up to index `first` (N,) that differs; without one,
     `earlier` (n,) holds earlier signs.
     """
-    if len(values) == 0:
-        return np.tile(earlier, (len(now), 1))
     path = continuous(values, revolute)
     now = path[first] + unwrapped(now - path[first], revolute)
     last = _last_outside(path, first, now - MOVED, now + MOVED)

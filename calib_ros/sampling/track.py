@@ -27,8 +27,6 @@ def standing(
     stamps: Stamps, values: FloatArray, still: float, window_ns: int, max_gap_ns: int
 ) -> Stamps:
     """Return the intervals (K, 2) in which the joints of one publisher stood."""
-    if len(stamps) == 0:
-        return np.zeros((0, 2), dtype=np.int64)
     index = np.arange(len(stamps))
     gap = np.concatenate([[True], np.diff(stamps) > max_gap_ns])
     begin = index[gap][np.cumsum(gap) - 1]  # start of the run without gaps
@@ -117,9 +115,8 @@ class Track:
         """Return the newest stamp of each joint (n,), zero if never named."""
         newest = np.zeros(len(self._revolute), dtype=np.int64)
         for columns, rows in self._parts.items():
-            if rows.count:
-                index = list(columns)
-                newest[index] = np.maximum(newest[index], rows.stamps.max())
+            index = list(columns)
+            newest[index] = np.maximum(newest[index], rows.stamps.max())
         return newest
 
     def room(self, columns: tuple[int, ...]) -> int:
@@ -198,9 +195,6 @@ class Track:
         return sorted(self._parts, key=lambda columns: (len(columns), columns))
 
     def _brackets(self, known: Stamps, stamps: Stamps) -> Brackets:
-        nowhere = np.zeros(len(stamps), dtype=np.intp)
-        if len(known) == 0:
-            return nowhere + 1, nowhere, nowhere
         after = np.searchsorted(known, stamps, side='left')
         last = np.minimum(after, len(known) - 1)
         hit = known[last] == stamps
