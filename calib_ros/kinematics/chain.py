@@ -324,10 +324,6 @@ class Chain(Shown):
         end = self.frame(tool).matrix
         return np.asarray((end.T @ flange.reshape(4, -1)).reshape(flange.shape))
 
-    def ends(self, q: FloatArray) -> FloatArray:
-        """Return the frames (n, 4, 3, B) at the ends of the links: axes and origin [m]."""
-        return self.walk.along(q, self.frame('base').matrix)[1]
-
     def random_joints(self, count: int, rng: np.random.Generator) -> FloatArray:
         """Draw joint values (count, n) within the range of each joint."""
         lower, upper = np.array([joint.range for joint in self.joints]).T

@@ -21,7 +21,7 @@ import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.parameter import LENS_KINDS
-from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray, Index
+from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, FloatArray, Index, cross
 from calib_ros.values import SAME
 
 
@@ -145,10 +145,7 @@ class View:
     def by_twist(self, out: FloatArray) -> None:
         """Write the derivatives (6, 2, C) by shift [m] and turn [rad] along the camera's axes."""
         out[:3] = self.by_shift.transpose(1, 0, 2)
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            np.multiply(self.arm[i], out[j], out=out[3 + k])
-            out[3 + k] -= self.arm[j] * out[i]
+        cross(self.arm, self.by_shift, out[3:].transpose(1, 0, 2))
 
     def at_the_board(self, residual: FloatArray) -> FloatArray:
         """Return the shortest shifts (C, 3) [m] in the world for residuals (2, C).

@@ -107,10 +107,7 @@ def angles_between(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def skew(vector: FloatArray) -> FloatArray:
     """Return the matrices (..., 3, 3) of the cross product with (..., 3) vectors."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return np.asarray(np.cross(np.eye(3), vector[..., np.newaxis, :]))
 
 
 def cross(first: FloatArray, second: FloatArray, out: FloatArray | None = None) -> FloatArray:

@@ -286,7 +286,8 @@ def _clean_angle(angle: float) -> float:
 
 def _ends(chain: Chain) -> FloatArray:
     """Return the frames (n, 4, 4) at the ends of the links at zero."""
-    found = chain.ends(np.zeros((len(chain.joints), 1)))[..., 0]
+    ends = chain.walk.along(np.zeros((len(chain.joints), 1)), chain.frame('base').matrix)[1]
+    found = ends[..., 0]
     return se3.transform(np.swapaxes(found[:, :3], 1, 2), found[:, 3])
 
 
