@@ -86,12 +86,8 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
         messages = stored.read(reader, streams)
         count, problem = _feed(session, messages, recorded.deserialise, progress, expected)
-    if problem is not None and count == 0:
-        found = stored.salvage(folder)
-        if found is not None:
-            recorded = recorded._replace(messages_on=_decodable(found.on))
-            _check_joints(session, streams, recorded)
-            count, _ = _feed(session, found.on(streams), recorded.deserialise)
+    if problem is not None and count == 0 and (found := stored.salvage(folder)) is not None:
+        return _salvaged(path, folder, found, session)
     _check_links(streams)
     warnings = session.warnings
     if problem is not None:
