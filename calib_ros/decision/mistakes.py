@@ -46,8 +46,6 @@ from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.settings import LEVER
 
-THEN = ' (the uncorrected arm is then typically'
-
 
 @dataclass(frozen=True, eq=False)
 class Explained:
@@ -66,14 +64,20 @@ class Explained:
         """Tell whether this refuses a result by itself."""
         return not any(each.chain or each.what == ORIENTATIONS.what for each in self.suspects)
 
-    def __str__(self) -> str:
+    @property
+    def reason(self) -> Reason:
+        """Return the reason to refuse a result: the mistakes, then the typical errors."""
         whats = [f'{each.what}: {each.remedy}' for each in self.suspects]
         if np.isnan(self.corrected):
-            return f'{self.where}{whats[0]}'
-        return (
-            f'{self.where}{" -- or ".join(whats)}{THEN} '
-            f'{1e3 * self.corrected:.2f} mm off, not {float(f"{1e3 * self.given:.4g}"):g} mm)'
+            return Reason(Rule.MISTAKE, f'{self.where}{whats[0]}')
+        errors = (
+            f' (the uncorrected arm is then typically {1e3 * self.corrected:.2f} mm off, not '
+            f'{float(f"{1e3 * self.given:.4g}"):g} mm)'
         )
+        return Reason(Rule.MISTAKE, f'{self.where}{" -- or ".join(whats)}', errors)
+
+    def __str__(self) -> str:
+        return str(self.reason)
 
 
 def remarked(problem: Problem, result: Identification) -> Identification:
@@ -86,7 +90,7 @@ def remarked(problem: Problem, result: Identification) -> Identification:
     if found is None:
         return result
     if result.refusals or found.alone:
-        return replace(result, refusals=(Reason(Rule.MISTAKE, str(found)), *result.refusals))
+        return replace(result, refusals=(found.reason, *result.refusals))
     return replace(result, remarks=(str(found), *result.remarks))
 
 

@@ -16,16 +16,17 @@ Rule = Enum(
 
 
 class Reason(str):
-    """The sentence for a reader, with the failed `rule`."""
+    """The sentence for a reader, with the failed `rule`; `short` is without its last part."""
 
-    __slots__ = ('rule',)
+    __slots__ = ('rule', 'short')
     rule: Rule
+    short: str
 
-    def __new__(cls, rule: Rule, text: str) -> Reason:
+    def __new__(cls, rule: Rule, short: str, more: str = '') -> Reason:
         """Return the text with its rule."""
-        reason = super().__new__(cls, text)
-        reason.rule = rule
+        reason = super().__new__(cls, short + more)
+        reason.rule, reason.short = rule, short
         return reason
 
-    def __getnewargs__(self) -> tuple[Rule, str]:  # type: ignore[override]
-        return self.rule, str(self)
+    def __getnewargs__(self) -> tuple[Rule, str, str]:  # type: ignore[override]
+        return self.rule, self.short, self.removeprefix(self.short)

@@ -77,13 +77,12 @@ class Step:
         """Tell whether the step spoils the fit: it mixes two arms, or describes a past one."""
         return self.kind not in FRAMES or not self.unused
 
+    def __str__(self) -> str:
+        return str(self.reason)
+
     @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
-        rule = Rule.MISTAKE if self.held else Rule.MOVED
-        return Reason(Rule.ENCODER if self.kind.startswith('joint') else rule, str(self))
-
-    def __str__(self) -> str:
         where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
         where += f' of set {self.set + 1}' if self.set else ''
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
@@ -94,22 +93,22 @@ class Step:
         size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
         if self.held:
             off = f'the {self.what} held by the chain file is off {size}'
-            return f'{off}: correct it, or remove fixed: true there'
+            return Reason(Rule.MISTAKE, f'{off}: correct it, or remove fixed: true there')
         thing, of = self.thing, f' ({self.what})'
         if self.kind == 'joint':
             thing, of = f'the zero of {self.what}', ''
-        text = f'{thing} moved {size}{of} before {where} ({when})'
+        text, more = f'{thing} moved {size}{of} before {where}', f' ({when})'
         if self.kind in OF_THE_ARM:
-            text = f'{thing} changed before {where} ({when}): poses differ {size}'
+            text, more = f'{thing} changed before {where}', f' ({when}): poses differ {size}'
         if self.kind == 'load':
-            text += '; measure with one load, or fit only the poses before or only those after'
+            more += '; measure with one load, or fit only the poses before or only those after'
         if self.unused:
-            text += f'; measurements {self.unused} carry no weight'
+            more += f'; measurements {self.unused} carry no weight'
         if self.apart:
-            text += (
+            more += (
                 '; errors of the arm may look so, as poses before and after lie apart: mix them'
             )
-        return text
+        return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
 
 
 def find_step(fitted: Fitted) -> Step | None:

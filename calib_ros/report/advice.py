@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 
-from calib_ros.decision.mistakes import THEN
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.settings import EXCEPTION
@@ -34,12 +33,7 @@ class Advice:
     steps: tuple[str, ...]  # what to do; none if it follows from another refusal
     refusal: str = ''  # the sentence of its rule
     again: str = AGAIN  # what to identify next
-
-    @property
-    def in_short(self) -> str:
-        """Return the heading, with the mistake if there is one."""
-        named = self.heading == rules()[Rule.MISTAKE].heading
-        return f'{self.heading}: {self.refusal.partition(THEN)[0]}' if named else self.heading
+    in_short: str = ''  # the heading, with the mistake if there is one
 
 
 ENOUGH = 25  # poses worth judging, and the default of `calib_ros plan`: a convention
@@ -137,17 +131,20 @@ class Situation:
 
 def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tuple[Advice, ...]:
     """Return the refusals in plain words, grouped by rule, consequences last."""
-    found: dict[Rule, list[str]] = {}
+    found: dict[Rule, list[Reason]] = {}
     for each in reasons:
-        found.setdefault(each.rule, []).append(str(each))
+        found.setdefault(each.rule, []).append(each)
     advised: list[Advice] = []
-    following: dict[Rule, list[str]] = {}
+    following: dict[Rule, list[Reason]] = {}
     for rule, texts in found.items():
         causes = (each for each, brought in BRINGS.items() if each in found and rule in brought)
         if (cause := next(causes, rule)) is not rule:
             following.setdefault(cause, []).extend(texts)
             continue
-        refusal = replace(rules()[rule], refusal='; '.join(texts))
+        short = heading = rules()[rule].heading
+        if rule is Rule.MISTAKE:
+            short = f'{heading}: {"; ".join(each.short for each in texts)}'
+        refusal = replace(rules()[rule], refusal='; '.join(texts), in_short=short)
         if situation.auto:
             steps = tuple(each for each in refusal.steps if 'model to auto' not in each)
             refusal = replace(refusal, steps=steps)

@@ -199,10 +199,9 @@ class Identifying:
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)
         self.last = words.summary(result, numbers, given.warnings, first)
-        telling = next((each for each in result.refusals if each.rule in TELLING), '')
-        lost = telling in given.lost
+        telling = next((each.short for each in result.refusals if each.rule in TELLING), '')
         hint = next(iter((*given.warnings, *words.remarks(result))), '')
-        self._advice = (not lost and telling.rpartition(' (')[0]) or telling or first or hint
+        self._advice = telling or first or hint
         self.observability = words.observability_in_words(result)
         self._residuals.publish(
             to_ros.residual_markers(

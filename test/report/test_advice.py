@@ -31,7 +31,7 @@ def test_a_verdict_names_each_of_several_mistakes():
         'several mistakes at once', 'a and b are swapped (--columns a); c counts (sign: -1)'
     )
     found = Explained((both,), 1.0, 2e-3)
-    (told,) = advice.advice([Reason(Rule.MISTAKE, str(found))])
+    (told,) = advice.advice([found.reason])
     assert told.in_short.endswith(f': {both.what}: {both.remedy}')
 
 
