@@ -24,7 +24,7 @@ class Unmodelled(NamedTuple):
 
     At random each joint turns about its axis (slides along it [m], if prismatic), and the axis
     tilts. The axis also wobbles by waves, which the parameters `names` (P,) follow by `followed`
-    (P, T) a unit.
+    (P, T) a unit; waves that are not `shown` by the data are assumed.
     """
 
     turns: float = 0.0
@@ -32,6 +32,7 @@ class Unmodelled(NamedTuple):
     waves: float = 0.0
     names: tuple[str, ...] = ()
     followed: FloatArray = np.zeros((0, 1))
+    shown: bool = False
 
     @property
     def sizes(self) -> dict[str, float]:

@@ -69,12 +69,12 @@ def unmodelled_errors(
     random = moved(chain, every, rows)
     rows = np.concatenate([rows[:count], waved(random[1], units.joints), rows[-1:]])
     products = np.array([gram(rows[:, part_of == k]) for k in range(len(used))])
-    sizes = _sizes(posterior, rows, part_of, products, random)
+    turns, tilts, waves, shown = _sizes(posterior, rows, part_of, products, random)
     rest = [k for k, name in enumerate(names) if name in posterior.priors and k >= own]
     along = share * products.sum(axis=0)[:own, :-1]
     middle = along[:, rest] @ posterior.square[np.ix_(rest, rest)] @ along[:, rest].T
     followed = covariance(factor) @ along[:, count:]
-    found = Unmodelled(*sizes, names[:own], followed)
+    found = Unmodelled(turns, tilts, waves, names[:own], followed, shown)
     return found, covariance(factor, middle)
 
 
@@ -84,8 +84,8 @@ def _sizes(
     part_of: Index,
     products: FloatArray,
     random: Sequence[FloatArray],
-) -> tuple[float, float, float]:
-    """Return the sizes of turns, tilts and waves.
+) -> tuple[float, float, float, bool]:
+    """Return the sizes of turns, tilts and waves, and whether waves show.
 
     From weighted rows (P + T + 1, c, n), those of T waves and the residual last, their `products`
     by part, and rows of `random` turns and tilts.
@@ -97,7 +97,7 @@ def _sizes(
     for _ in range(SEVERAL):
         variances = _variances(products, offsets, precision, counts)
         if not variances.all():
-            return 0.0, 0.0, TYPICAL['drive']
+            return 0.0, 0.0, TYPICAL['drive'], False
         total = np.tensordot(1.0 / variances, products, 1)
         matrix, vector = total[:-1, :-1], total[:-1, :-1] @ offsets + total[:-1, -1]
         waves, found = _size_of_waves(matrix, vector, given)
@@ -114,7 +114,7 @@ def _sizes(
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
     turn, tilt = _random(np.array(kernels), fitted @ root, residual).tolist()
-    return turn, tilt, waves
+    return turn, tilt, waves, found is not None
 
 
 def _size_of_waves(

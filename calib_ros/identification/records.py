@@ -216,10 +216,10 @@ class Record:
             ours = set(names) <= set(chain.parameter_names) and len(set(names)) == len(names)
             if 'unmodelled' in known:
                 more = known['unmodelled']
-                sizes = {key: float(more[key]) for key in lacking.sizes}
+                turns, tilts, waves = (float(more[key]) for key in lacking.sizes)
                 followed = parse_rows(more['followed'], len(names))
-                lacking = Unmodelled(names=names, followed=followed, **sizes)
-                fine = all(0.0 <= size < math.inf for size in sizes.values())
+                lacking = Unmodelled(turns, tilts, waves, names, followed)
+                fine = all(0.0 <= size < math.inf for size in lacking.sizes.values())
                 ours = ours and fine and followed.shape[1] == 8 * len(chain.joints)
             if not (ours and (np.diag(square) > 0.0).all() and freedom > 0.0):
                 raise ValueError('no covariance of this chain')

@@ -17,7 +17,6 @@ from calib_ros.decision.result import Identification
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
-from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.linear_model import COMPARED
 from calib_ros.kinematics.chain_file import table_hash
@@ -253,9 +252,9 @@ def _stated(problem: Problem, poses: Poses) -> str:
 
 def _unmodelled(result: Identification) -> list[str]:
     """Return how far joints turn and tilt as no parameter explains; empty if they do not."""
-    turn, tilt, wave = (1e3 * size for size in result.posterior.unmodelled[:3])
-    seen = wave * (wave != 1e3 * TYPICAL['drive'])  # else assumed
-    tilt = float(np.hypot(tilt, np.sqrt(2.0) * seen))  # two harmonics
+    lacking = result.posterior.unmodelled
+    seen = lacking.waves * lacking.shown  # else assumed
+    turn, tilt = 1e3 * lacking.turns, 1e3 * np.hypot(lacking.tilts, np.sqrt(2.0) * seen)
     text = (
         'Part of the remaining error seems to come from the arm and is not in the model, as if '
         f'joints were off by {turn:.3f} mrad about their axes and {tilt:.3f} mrad across them '

@@ -13,7 +13,6 @@ from plotly import graph_objects
 from calib_ros import Observations, Settings, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
 from calib_ros.decision.comparison import Verdict, compare
-from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.report.figures import against_noise, coverage, cumulated, drives, forest
@@ -84,11 +83,12 @@ def test_noise_as_stated_is_on_the_line(rng, kind):
         assert np.polyfit(expected, found, 1)[0] == pytest.approx(1.0, abs=0.1)
 
 
-@pytest.mark.parametrize(('waves', 'across'), [(3e-4, '0.469'), (TYPICAL['drive'], '0.200')])
-def test_what_joints_do_beyond_the_model_is_told_in_all(solved, waves, across):
-    """Waves of the usual size are assumed, not seen."""
+@pytest.mark.parametrize(('shown', 'across'), [(True, '0.469'), (False, '0.200')])
+def test_what_joints_do_beyond_the_model_is_told_in_all(solved, shown, across):
+    """Waves that do not show are assumed."""
     problem, result = solved
-    lacking = result.posterior.unmodelled._replace(turns=1e-4, tilts=2e-4, waves=waves)
+    sizes = {'turns': 1e-4, 'tilts': 2e-4, 'waves': 3e-4}
+    lacking = result.posterior.unmodelled._replace(**sizes, shown=shown)
     found = replace(result, posterior=replace(result.posterior, unmodelled=lacking))
     said = f'by 0.100 mrad about their axes and {across} mrad across them'
     assert said in page_of(report_of(problem, found)).text
