@@ -233,7 +233,6 @@ class Fit(Shown):
 
     chain: Chain
     normal: Normal
-    iterations: int
     converged: bool
     left: float = 0.0
 
@@ -259,7 +258,7 @@ def minimise(
     """
     normal = normal or normal_equations(chain, names, system)
     if not names:
-        return Fit(chain, normal, 0, True)
+        return Fit(chain, normal, True)
     best, best_chain = normal, chain
     damping, growth, patience, expected = 0.0, 2.0, PATIENCE, 0.0
     iteration, stalled, least_cost, least_left = 0, 0, np.inf, np.inf
@@ -270,7 +269,7 @@ def minimise(
             break
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
-            return Fit(chain, normal, iteration, True, left)
+            return Fit(chain, normal, True, left)
         stalled += 1
         if best.cost < 0.999 * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
@@ -296,7 +295,7 @@ def minimise(
             normal, chain = best, best_chain
             patience = 0
             damping, growth = max(growth * damping, HALF_THE_DIGITS), 2.0 * growth
-    return Fit(best_chain, best, iteration, False)
+    return Fit(best_chain, best, False)
 
 
 def _next(

