@@ -23,14 +23,9 @@ from calib_ros.texts import in_markdown, one_line
 
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
-VALUE = (
-    r'auto|none|mm|cm|deg|rad|[A-Z]{3}|[xyzw]{3,4}|\d+(?:\.\d+)?(?:e-?\d+)?|[a-z]+_?[a-z]*\d\w*'
-    r'|[\w*]+=[^\s;)]*[^\s;),.]|&(?:quot|#x27);\S+?&(?:quot|#x27);'
-)
-TYPED = re.compile(
-    rf'(?<![\w-])--[a-z][a-z0-9-]*(?: (?:{VALUE})(?![\w=-]))?|calib_ros [a-z0-9]+(?!\w)'
-)
-"""An option, with its value as messages write it, or a command."""
+VALUE = r"""(?:auto|none|[cm]m|deg|rad|[xyzw]{3,4})\b|"[^"]*"|'[^']*'|[^\s()]*[\dA-Z*=_][^\s()]*"""
+TYPED = re.compile(rf'((?<![\w-])--[a-z][\w-]*(?: (?:{VALUE})(?<![.,;:]))?|calib_ros [a-z\d]+)')
+"""An option, with a value that is no plain word, or a command."""
 MISSING = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
@@ -193,7 +188,8 @@ def _template(name: str) -> str:
 
 def typed(text: str) -> str:
     """Return a text as HTML, with commands and options as code that does not break at hyphens."""
-    return TYPED.sub(r'<code>\g<0></code>', html.escape(str(_shown(text))))
+    parts = enumerate(map(html.escape, TYPED.split(str(_shown(text)))))
+    return ''.join(f'<code>{part}</code>' if k % 2 else part for k, part in parts)
 
 
 def _shown(value: object) -> object:
