@@ -57,8 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run = getattr(importlib.import_module(f'calib_ros.cli.{module}'), function)
         screen = Screen(options.quiet)
         status: int = run(options, screen)
-        if options.quiet and status and screen.verdict:
-            screen.warn(screen.verdict, 'calib_ros')
+        for reason in screen.reasons if options.quiet and status else ():
+            screen.warn(reason, 'calib_ros')
         sys.stdout.flush()
     except BrokenPipeError:  # the reader has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

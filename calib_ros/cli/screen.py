@@ -31,7 +31,7 @@ class Screen:
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
-        self.verdict = ''
+        self.reasons: list[str] = []  # if quiet: the verdict, and why, with what to do first
         self._bar: Any = None  # the console of a bar: what else is printed there goes above it
 
     def data(self, text: str) -> None:
@@ -48,7 +48,7 @@ class Screen:
 
     def title(self, text: str, good: bool | None = None) -> None:
         """Print a verdict; the colour never says more than the words."""
-        self.verdict = text
+        self.reasons = [text]
         console = None if self.quiet else _console(sys.stdout)
         if console is None:
             self.say(text)
@@ -76,6 +76,7 @@ class Screen:
     def bullet(self, text: str, steps: Sequence[str] = ()) -> None:
         """Print a reason or note, and what to do, in steps if several."""
         if self.quiet:
+            self.reasons += [f'{text} -> {step}' for step in steps[:1]]
             return
         _print(text, '- ')
         for k, step in enumerate(steps):
