@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,19 +17,19 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.apply.verification import Verdict
 from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.misfits import Outlier
-from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import (
     LONGEST,
     CalibrationError,
     ConfigError,
     InputError,
-    TooFewObservationsError,
     shortened,
 )
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History
+from calib_ros.files.loading import Loaded
 from calib_ros.files.rows import (
     Filing,
     Row,
@@ -41,7 +41,6 @@ from calib_ros.files.rows import (
     settings_hash,
 )
 from calib_ros.identification.calibration import Calibration
-from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.progress import Progress
@@ -53,7 +52,7 @@ from calib_ros.ros.inputs import Inputs
 from calib_ros.ros.outputs import Published
 from calib_ros.sampling.account import too_much_lost
 from calib_ros.sampling.sample import Sample, named
-from calib_ros.sampling.session import CalibrationSession, too_few
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
 
@@ -115,21 +114,18 @@ TELLING = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
 class Snapshot(NamedTuple):
     """The input of an identification, and its settings."""
 
-    problem: Problem
+    loaded: Loaded
     settings: Settings
     samples: tuple[Sample, ...]
     numbers: dict[Sample, int]
     origin: dict[str, Any]
     configuration: str
-    warnings: tuple[str, ...]
-    summary: str = ''
-    lost: Sequence[Reason] = ()
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the operator's numbers of outlier samples."""
         frames = named(self.samples)
         known = {(each.stamp_ns, *frames.of(each)): self.numbers[each] for each in self.samples}
-        sets = self.problem.sets
+        sets = self.loaded.problem.sets
         return {
             each: known[each.stamp_ns, sets[each.set].base, sets[each.set].tool]
             for each in outliers
@@ -178,43 +174,40 @@ class Identifying:
             'journal': str(self._archive.journal or ''),
         }
         numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
-        texts = session.warnings, session.summary
-        largest_loss = self._node.get_parameter('largest_loss').value
-        lost = too_much_lost(session.account(), largest_loss) if session.made else ()
+        account, largest_loss = session.account(), self._node.get_parameter('largest_loss').value
+        lost = tuple(too_much_lost(account, largest_loss)) if session.made else ()
+        owners, texts = named(samples).owners, (session.warnings, str(account))
+        loaded = Loaded(problem, asdict(account), *texts, refusals=lost, owners=owners)
         known = numbers, origin, self._configuration()
-        found = Snapshot(problem, session.settings, samples, *known, *texts, lost)
+        found = Snapshot(loaded, session.settings, samples, *known)
         self.progress.begin()
         return found
 
     def run(self, given: Snapshot) -> Answer:
         """Identify; publish only an accepted result."""
-        try:
-            with self.progress.running():
-                result = identify_model(given.problem, given.settings.model, self.progress)
-        except TooFewObservationsError as err:
-            self._advice = next(iter(given.warnings), '')
-            raise too_few(err, given.summary) from err
-        result = replace(result, refusals=(*result.refusals, *given.lost))
+        loaded, settings = given.loaded, given.settings
+        self._advice = next(iter(loaded.warnings), '')  # if poses are too few
+        with self.progress.running():
+            result = loaded.identified(settings.model, self.progress)
         steps = (step for reason in reasons_of(result) for step in reason.steps)
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)
-        self.last = words.summary(result, numbers, given.warnings, first)
+        self.last = words.summary(result, numbers, loaded.warnings, first)
         telling = next((each.short for each in result.refusals if each.rule in TELLING), '')
-        hint = next(iter((*given.warnings, *words.remarks(result))), '')
+        hint = next(iter((*loaded.warnings, *words.remarks(result))), '')
         self._advice = telling or first or hint
         self.observability = words.observability_in_words(result)
         self._residuals.publish(
             to_ros.residual_markers(
                 result,
-                given.problem.sets,
+                loaded.problem.sets,
                 self._node.get_parameter('marker_scale').value,
                 self._node.get_clock().now().to_msg(),
             )
         )
         page = partial(_page, given, result)
         if result.accepted:
-            owners, sets = named(given.samples).owners, given.problem.sets
-            found = Calibration.of(result, given.origin, owners, sets)
+            found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
             self._accepted(
                 found, Published(found.dump(), given.configuration, page), given.samples
             )
@@ -223,7 +216,7 @@ class Identifying:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
-        self.last += self._filer.identified(given.problem, result, given.settings)
+        self.last += self._filer.identified(loaded.problem, result, settings)
         return result.accepted, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:
@@ -261,7 +254,7 @@ def _without_middle(before: str, advice: str, longest: int) -> str:
     """Return a text without its middle: the advice at its end stays whole, or its last clause."""
     text = before + advice
     last = max(text.rfind(mark) for mark in ('; ', ': ')) + 2
-    for end in (len(before), last):
+    for end in (len(before) if advice else 0, last):
         room = longest - len(text) + end - 1
         if longest // 4 < room < end:
             return f'{textwrap.shorten(text[:end], room, placeholder=" ...")} {text[end:]}'
@@ -276,5 +269,6 @@ def _page(given: Snapshot, result: Identification) -> str | None:
     journal, serial = given.origin['journal'], given.origin['robot_serial']
     files = inputs_of(Path(journal) if journal else None)
     origin = Origin(files, serial=serial, settings=given.configuration)
-    poses = poses_of(given.problem, result)
-    return render(identification_report(given.problem, result, poses, origin, given.warnings))
+    problem, warnings = given.loaded.problem, given.loaded.warnings
+    poses = poses_of(problem, result)
+    return render(identification_report(problem, result, poses, origin, warnings))

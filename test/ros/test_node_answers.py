@@ -18,6 +18,7 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.history import History
+from calib_ros.files.loading import Loaded
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain
 from calib_ros.report.advice import rules
@@ -143,7 +144,7 @@ def test_the_page_that_is_saved_has_the_warnings():
     arm, rng = load_chain('ur10e'), np.random.default_rng(0)
     problem = Problem(arm, measure(arm, arm.random_joints(10, rng), rng, 5e-5, 2e-4))
     origin = {'journal': '', 'robot_serial': ''}
-    given = Snapshot(problem, Settings(), (), {}, origin, '', ('the clock jumped',))
+    given = Snapshot(Loaded(problem, {}, ('the clock jumped',)), Settings(), (), {}, origin, '')
     assert 'the clock jumped' in _page(given, identify(problem))
 
 

@@ -109,11 +109,12 @@ def test_a_node_killed_in_its_first_run_goes_on_with_all_its_samples(
 
 SLOW_IDENTIFICATION = """
 import time
-from calib_ros.ros import identifying, node
+from calib_ros.files import loading
+from calib_ros.ros import node
 def identify_model(problem, model, progress):
     print('identifying', flush=True)
     time.sleep(600.0)
-identifying.identify_model = identify_model
+loading.identify_model = identify_model
 close = node.CalibrationNode.close
 def noisy(self):
     print('joining', flush=True)

@@ -9,8 +9,8 @@ import pytest
 from ros_cell import PATIENCE, STOPS, Cell, topics
 from std_msgs.msg import String
 
+from calib_ros.files import loading
 from calib_ros.identification.identification import identify
-from calib_ros.ros import identifying as identifying_module
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def held(monkeypatch):
         assert release.wait(PATIENCE)
         return result
 
-    monkeypatch.setattr(identifying_module, 'identify_model', slow)
+    monkeypatch.setattr(loading, 'identify_model', slow)
     return release, problems
 
 
@@ -60,7 +60,7 @@ STAGES = ['model geometric', 'effects', 'effects: ratio', 'harmonics of elbow_jo
 def stages(monkeypatch):
     """Let identifications of model auto wait at each stage; return a queue that lets them go."""
     release, reached = queue.Queue(), []
-    identify_model = identifying_module.identify_model
+    identify_model = loading.identify_model
 
     def slow(problem, model, progress):
         def at(stage):
@@ -71,7 +71,7 @@ def stages(monkeypatch):
 
         return identify_model(problem, model, at)
 
-    monkeypatch.setattr(identifying_module, 'identify_model', slow)
+    monkeypatch.setattr(loading, 'identify_model', slow)
     return release, reached
 
 
