@@ -83,15 +83,24 @@ class Samples:
             ends = np.append(0, np.cumsum(np.bincount(folds, minlength=count)))
             if (np.diff(folds) < 0).any():
                 samples = self.select(np.argsort(folds, kind='stable'))
-        found, done = np.zeros((count, 2, len(names) + 1, len(names) + 1)), 0
-        for parts in samples.parts(chain, names):
-            width = parts[0].shape[2]
+        model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
+        effects = np.arange(len(names))[model.spread]
+        by_motion = np.argsort(model.order[effects], kind='stable')
+        motions, place = model.order[effects[by_motion]], np.append(model.order, -1)
+        place[:-1] += len(effects)
+        place[effects[by_motion]] = np.arange(len(effects))
+        size, done = len(effects) + model.motions + 1, 0
+        found = np.zeros((count, 2, size, size))
+        for parts, phi in samples._motions(model):
+            width = phi.shape[1]
             cuts = np.clip(ends - done, 0, width).tolist()
             done += width
+            phi = phi[by_motion]
             for fold, (first, last) in enumerate(pairwise(cuts)):
+                block = slice(first, last)
                 for k, rows in enumerate(parts if first < last else ()):
-                    found[fold, k] += gram(rows[..., first:last])
-        return found
+                    _add_products(found[fold, k], rows[..., block], phi[:, block], motions)
+        return found[:, :, place[:, np.newaxis], place]
 
     def sums(
         self, chain: Chain, names: Sequence[str], groups: Index
@@ -122,8 +131,15 @@ class Samples:
         separate orientation there is one part.
         """
         model = ErrorModel(chain, names, self.observations.base, self.observations.tool)
-        turning = np.flatnonzero(model.order < model.rotations)
-        joints, velocity = self.moving(chain)
+        for motions, phi in self._motions(model):
+            parts = tuple(rows[[*model.order, -1]] for rows in motions)
+            for rows in parts:
+                rows[model.spread] *= phi[:, np.newaxis]
+            yield parts
+
+    def _motions(self, model: ErrorModel) -> Iterator[tuple[tuple[FloatArray, ...], FloatArray]]:
+        """Yield blocks of `parts` by motion, (M + 1, c, B), and phi (E, B) of the effects."""
+        joints, velocity = self.moving(model.chain)
         out = None
         for start in range(0, self.count, BLOCK):
             part = slice(start, start + BLOCK)
@@ -133,11 +149,8 @@ class Samples:
             moving = None if velocity is None else velocity[:, part]
             axes, origin, *found, phi = model.linearise(joints[:, part], approach, moving, out)
             out = found[0], found[1]
-            shift = found[0][[*model.order, -1]]
-            turn = np.zeros((len(shift), *found[1].shape[1:]))
-            turn[turning] = found[1][model.order[turning]]
-            for rows in (shift, turn):
-                rows[model.spread] *= phi[:, np.newaxis]
+            shift, turn = found[0], np.zeros_like(found[0])
+            turn[: model.rotations] = found[1][:-1]
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
@@ -149,11 +162,11 @@ class Samples:
                 both = np.concatenate([shift, turn], axis=1) * weights
                 whitening = self.whitening[:, :, part]
                 mixed = np.einsum('rsb,psb->prb', whitening, both, optimize=True)
-                yield (np.ascontiguousarray(mixed),)
+                yield (np.ascontiguousarray(mixed),), phi
                 continue
             shift *= weights / self.sigmas[0]
             turn *= weights / self.sigmas[1]
-            yield (shift, turn) if self.oriented else (shift,)
+            yield ((shift, turn) if self.oriented else (shift,)), phi
 
     @property
     def width(self) -> int:
@@ -206,6 +219,26 @@ def gram(rows: FloatArray) -> FloatArray:
     """Return the products (P, P) of rows (P, c, N)."""
     flat = rows.reshape(len(rows), -1)
     return np.asarray(flat @ flat.T)
+
+
+def _add_products(found: FloatArray, rows: FloatArray, phi: FloatArray, motions: Index) -> None:
+    """Add the products of effects, then motions (M + 1, c, N), to those `found`.
+
+    The rows of effects with phi (E, N), in the order of their `motions` (E,), are never formed:
+    their products are those of phi, weighted by the products of two motions at each sample.
+    """
+    count = len(motions)
+    found[count:, count:] += gram(rows)
+    begins = np.flatnonzero(np.diff(motions, prepend=-1)).tolist()
+    for number, (first, last) in enumerate(pairwise([*begins, count])):
+        weights = np.einsum('pcn,cn->pn', rows, rows[motions[first]])
+        later = [
+            phi[other:end] * weights[motions[other]]
+            for other, end in pairwise([*begins[number:], count])
+        ]
+        products = phi[first:last] @ np.concatenate([*later, weights]).T
+        found[first:last, first:] += products
+        found[last:, first:last] += products[:, last - first :].T
 
 
 def _cached(find: Callable[[Chain, Observations], Both]) -> Callable[[Chain, Observations], Both]:

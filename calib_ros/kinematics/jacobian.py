@@ -64,6 +64,8 @@ class ErrorModel:
         self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
         self.rotations = self._layout.rotations
         """Number of rotations; they come first in the arrays of `linearise`."""
+        self.motions = self.rotations + len(self._layout.shifts)
+        """Number of all motions."""
         self.order = self._layout.order
         """Row of each named parameter in the arrays of `linearise`; of effects, to be multiplied
         by phi."""
