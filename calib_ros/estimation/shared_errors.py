@@ -321,32 +321,41 @@ def _successive(
     names: Sequence[str],
     system: System,
     kernels: Mapping[int, Sequence[tuple[float, float]]],
+    run: int = 64,
 ) -> dict[int, FloatArray]:
     """Return by part J^T K J of errors fading in succession, for (length, size) each.
 
-    K = L + L^T - I, where L sums the stops so far, faded: s_k = x_k + exp(-1 / length) s_(k - 1).
+    In runs of stops: those of one run by a root C of their covariance K = C C^T, with all before
+    it by their sums, faded until then.
     """
     size = len(names)
     found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
-        last: dict[int, FloatArray] = {}
-        number = -1
+        last: dict[int, tuple[FloatArray, int]] = {}
         for numbers, sums in samples.sums(chain, names, samples.observations.stops):
-            later = np.diff(numbers, prepend=number)  # zero within a stop, across blocks
-            number = numbers[-1]
             for part, own in kernels.items():
                 if part >= len(sums):
                     continue
-                lengths, weights = np.array(own).T
-                fading = np.exp(-np.divide.outer(later, lengths))[:, :, np.newaxis]
-                rows = np.ascontiguousarray(sums[part][:-1].T)
-                stops = rows.reshape(len(rows), -1)
-                together = -0.5 * weights.sum() * stops
-                faded = last.setdefault(part, np.zeros((len(own), stops.shape[1])))
-                for stop, total, share in zip(stops, together, fading, strict=True):
-                    faded *= share
-                    faded += stop
-                    total += weights @ faded
-                cross = rows.reshape(-1, size).T @ together.reshape(-1, size)
-                found[part] += cross + cross.T
+                lengths, weights = np.array(own).T[..., np.newaxis]
+                stops = sums[part][:-1].reshape(-1, len(numbers))
+                turned = np.empty_like(stops)
+                faded, time = last.get(part, (np.zeros((len(stops), len(own))), numbers[0]))
+                before, after = [], []
+                for first in range(0, len(numbers), run):
+                    block = slice(first, first + run)
+                    times, rows = numbers[block], stops[:, block]
+                    near = np.exp(
+                        -np.abs(np.subtract.outer(times, times)) / lengths[..., np.newaxis]
+                    )
+                    turned[:, block] = rows @ np.linalg.cholesky(
+                        np.tensordot(weights[:, 0], near, 1)
+                    )
+                    since = np.exp((time - times) / lengths)
+                    before.append(faded)
+                    after.append(rows @ (weights * since).T)
+                    faded, time = since[:, -1] * faded + rows @ near[:, -1].T, times[-1]
+                last[part] = faded, time
+                earlier, later = (np.hstack(each).reshape(size, -1) for each in (before, after))
+                cross = earlier @ later.T
+                found[part] += gram(turned.reshape(size, -1)) + cross + cross.T
     return found
