@@ -344,12 +344,10 @@ def _successive(
                 for first in range(0, len(numbers), run):
                     block = slice(first, first + run)
                     times, rows = numbers[block], stops[:, block]
-                    near = np.exp(
-                        -np.abs(np.subtract.outer(times, times)) / lengths[..., np.newaxis]
-                    )
-                    turned[:, block] = rows @ np.linalg.cholesky(
-                        np.tensordot(weights[:, 0], near, 1)
-                    )
+                    apart = np.abs(np.subtract.outer(times, times))
+                    near = np.exp(-apart / lengths[..., np.newaxis])
+                    root = np.linalg.cholesky(np.tensordot(weights[:, 0], near, 1))
+                    turned[:, block] = rows @ root
                     since = np.exp((time - times) / lengths)
                     before.append(faded)
                     after.append(rows @ (weights * since).T)
