@@ -25,7 +25,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.estimation.considered import Doubts, doubted_products, lengths_of, lenses
+from calib_ros.estimation.considered import (
+    Doubted,
+    Doubts,
+    doubted_products,
+    lengths_of,
+    lenses,
+)
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
@@ -132,10 +138,9 @@ def posterior_of(
 ) -> Posterior:
     """Return the posterior of a fit and of `more` considered effects, linearised at the fit.
 
-    Offsets of the fitted chain from the nominal one are normal about zero. The samples have their
-    weights in the fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations
-    of parameters that rounded joint values move too. Plausible sizes and the device's scale are
-    only evaluated if `judging`.
+    Offsets from the nominal chain are normal about zero. The samples have their weights in the
+    fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations of parameters
+    that rounded joint values move too. Plausible sizes and the device only count if `judging`.
     """
     problem, names, system = fitted.problem, fitted.names, fitted.system
     nominal, every = problem.model, (*names, *more)
@@ -146,12 +151,14 @@ def posterior_of(
     chain = fitted.chain.with_effects(own)
     beside = {name: std for name, std in (rounding or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
-    unsure = bool(lengths) and scale < PRINTED and 'scale' not in known
-    products = doubted_products(whole, every, system, Doubts(beside, lengths, bool(more)), noise)
+    unsure = judging and bool(lengths) and scale < PRINTED and 'scale' not in known
+    if more or beside:
+        doubts = Doubts(beside, lengths, by_device=bool(more))
+        products = doubted_products(whole, every, system, doubts, noise)
+    else:
+        products = Doubted.nothing(fitted.products / noise**2)
     plain, cross, doubtful = products
-    offsets = np.zeros(len(plain) - 1)
-    arms = [(k, n) for k, n in enumerate(names) if not chain.owns_frame(n)]
-    offsets[[k for k, _ in arms]] = [chain.offset(n, nominal) for _, n in arms]
+    offsets = np.append(fitted.offsets, np.zeros(len(plain) - 1 - len(names)))
     reduced = products.reduced
     alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
     vector = matrix @ offsets + reduced[:-1, -1]
@@ -162,8 +169,7 @@ def posterior_of(
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
     beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
     size, slope = evidence.most_probable(beside_it)
-    sought = evidence, matrix, vector, len(every), size, beside_it
-    rival = _rival(*sought) if judging and unsure else None
+    rival = _rival(evidence, matrix, vector, len(every), size, beside_it) if unsure else None
     near = evidence.near(size, slope) if judging else ()
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
@@ -175,7 +181,8 @@ def posterior_of(
     along = (alone @ offsets + plain[:-1, -1])[arm]
     each_alone = [solved(alone[arm, arm], along, each[arm]) for each in precisions]
     mean, covariance = mixed(each_alone, weights)
-    device = _device(alone, cross[:-1], doubtful, evidence.precision(size), len(every))
+    other = alone, cross[:-1], doubtful, evidence.precision(size), len(every)
+    device = _device(*other) if judging else np.zeros((len(every), 0))
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)

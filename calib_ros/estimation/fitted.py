@@ -6,11 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import special
 
 from calib_ros.estimation import identifiability
+from calib_ros.estimation.considered import Doubts, doubted_products
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import CONFIDENT, KNOWN
 from calib_ros.estimation.noise import Noise
@@ -85,6 +87,19 @@ class Fitted:
     def system(self) -> System:
         """Return the samples with their weights in the fit."""
         return self.robust.system
+
+    @cached_property
+    def offsets(self) -> FloatArray:
+        """Return the fitted minus the nominal values (P,); zero for frames."""
+        chain, nominal = self.chain, self.problem.model
+        return np.array(
+            [0.0 if chain.owns_frame(n) else chain.offset(n, nominal) for n in self.names]
+        )
+
+    @cached_property
+    def products(self) -> FloatArray:
+        """Return the products (P + 1, P + 1) of its columns and the residual, without priors."""
+        return doubted_products(self.chain, self.names, self.system, Doubts()).plain
 
 
 def parameter_rows(
