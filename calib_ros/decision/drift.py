@@ -25,6 +25,7 @@ from scipy import fft
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.samples import summed
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index
 
@@ -121,10 +122,7 @@ class Shifts:
 
 def _by_stop(values: FloatArray, begins: Index, weights: FloatArray) -> FloatArray:
     """Return sums over each stop (..., m c, n) of values (..., c, N) with weights (m, N)."""
-    parts = [each * values for each in weights]
-    if len(begins) < values.shape[-1]:
-        parts = [np.add.reduceat(part, begins, axis=-1) for part in parts]
-    return np.asarray(np.concatenate(parts, axis=-2))
+    return np.concatenate([summed(each * values, begins) for each in weights], axis=-2)
 
 
 def _weights(observations: Observations, begins: Index) -> FloatArray:

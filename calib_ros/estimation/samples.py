@@ -111,9 +111,7 @@ class Samples:
             index = groups[first : first + block[0].shape[2]]
             first += len(index)
             begins = np.flatnonzero(np.diff(index, prepend=-1))
-            if len(begins) < len(index):
-                block = tuple(np.add.reduceat(part, begins, axis=2) for part in block)
-            yield index[begins], block
+            yield index[begins], tuple(summed(part, begins) for part in block)
 
     def moving(self, chain: Chain) -> tuple[FloatArray, FloatArray | None]:
         """Return joint values (n, N) at the device's delay, and velocities if it has one."""
@@ -213,6 +211,12 @@ class Samples:
         """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
         for part in self.whitened_residuals(chain):
             yield part, slice(None)
+
+
+def summed(values: FloatArray, begins: Index) -> FloatArray:
+    """Return the sums (..., n) of values (..., N) over successive groups that begin there (n,)."""
+    alone = len(begins) == values.shape[-1]
+    return values if alone else np.add.reduceat(values, begins, axis=-1)
 
 
 def gram(rows: FloatArray) -> FloatArray:

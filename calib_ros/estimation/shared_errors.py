@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import gram
+from calib_ros.estimation.samples import gram, summed
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
@@ -290,8 +290,7 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
             rows = np.zeros((len(names) + 1, width, len(begins)))
             if part < len(pieces[0][1]):
                 whole = np.concatenate([piece[1][part] for piece in pieces], axis=2)
-                added = np.add.reduceat(whole, again, axis=2)
-                rows[:, : added.shape[1]] = added / np.sqrt(count)
+                rows[:, : whole.shape[1]] = summed(whole, again) / np.sqrt(count)
             parts[part].append(rows)
         q = few.observations.joints[begins]
         turned = [*cos_sin(q[:, circular]), q[:, ~circular]]

@@ -107,13 +107,15 @@ def _sizes(
     own = np.s_[: len(precision)]
     mean, root = solved(matrix[own, own], vector[own], precision)
     scale = np.sqrt(variances)[part_of, np.newaxis]
-    every = *random, rows[own], rows[-1:]
-    turned, tilted, fitted, left = ((each / scale).transpose(2, 1, 0) for each in every)
-    residual = left[..., 0] + fitted @ (offsets[own] - mean)
+    left = rows[-1] + np.tensordot(offsets[own] - mean, rows[own], 1)
+    every = *random, np.tensordot(root.T, rows[own], 1), left[np.newaxis]
+    turned, tilted, basis, residual = (
+        np.ascontiguousarray((each / scale).transpose(2, 1, 0)) for each in every
+    )
     whites = rows.any(axis=0).T & (part_of == np.arange(len(variances))[:, np.newaxis, np.newaxis])
     kernels = [*whites[..., np.newaxis] * np.eye(len(part_of))]
     kernels += [each @ np.swapaxes(each, 1, 2) for each in (turned, tilted)]
-    turn, tilt = _random(np.array(kernels), fitted @ root, residual).tolist()
+    turn, tilt = _random(np.array(kernels), basis, residual[..., 0]).tolist()
     return turn, tilt, waves, found is not None
 
 
@@ -169,17 +171,16 @@ def _random(kernels: FloatArray, basis: FloatArray, residual: FloatArray) -> Flo
 
     For the posterior's columns (n, c, P), scaled, and its residuals (n, c).
     """
-    spread = kernels @ basis
-    taken = np.einsum('kncp,ncp->k', spread, basis, optimize=True)
-    values = np.einsum('knij,ni,nj->k', kernels, residual, residual, optimize=True)
     listed = kernels.reshape(len(kernels), -1)
+    taken = listed @ (basis @ np.swapaxes(basis, 1, 2)).ravel()
+    values = listed @ (residual[:, :, np.newaxis] * residual[:, np.newaxis]).ravel()
     pairs, white, arm = listed @ listed.T, np.s_[:-2], np.s_[-2:]
     excess = (values + taken - np.einsum('knii->k', kernels))[arm]
     sizes = np.diag(pairs)  # white kernels have nothing in common
     own = sizes[arm] - (pairs[arm, white] ** 2 / sizes[white]).sum(axis=1)
     if not (excess > special.ndtri(0.5 + 0.5 * CERTAIN) * np.sqrt(2.0 * own)).any():
         return np.zeros(2)
-    flat, spread = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (basis, spread))
+    flat, spread = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (basis, kernels @ basis))
     inner = flat.T @ spread
     cross, both = (x @ x.T for x in (x.reshape(len(kernels), -1) for x in (spread, inner)))
     values -= taken - np.tensordot(inner, inner[white].sum(axis=0))
