@@ -33,14 +33,17 @@ def launched(monkeypatch):
 def ended_by(monkeypatch):
     """Return a function that runs the node with parameters until it ends; it returns the status.
 
-    Signals stay with the tests.
+    Besides, there may be a parameter file. Signals stay with the tests; no node goes on.
     """
     from calib_ros.ros import boundary, node
 
     monkeypatch.setattr(boundary, '_handle_signals', lambda handler: None)
+    monkeypatch.setattr(boundary, '_spin', lambda *_: pytest.fail('the node does not end'))
 
-    def run(*parameters):
-        return node.main(['--ros-args', *(w for given in parameters for w in ('-p', given))])
+    def run(*parameters, file=None):
+        words = ['--params-file', str(file)] if file else []
+        words += [word for given in parameters for word in ('-p', given)]
+        return node.main(['--ros-args', *words])
 
     return run
 

@@ -12,16 +12,12 @@ from ros_cell import Cell
 from calib_ros.errors import CalibrationError, ConfigError, UnknownNameError
 from calib_ros.ros.arguments import (
     NODE,
-    PARAMETERS,
     REMAPPED,
     launch_arguments,
     refuse_unknown,
     ros_arguments,
 )
 from calib_ros.sampling.sources import STANDARD
-
-OTHERS = {'start_type_description_service'}
-"""Parameters that every node has and no operator sets."""
 
 
 def test_what_is_not_given_is_not_passed(launched):
@@ -98,20 +94,6 @@ def test_values_of_another_type_are_refused(name, text, expected):
 def test_a_parameter_file_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(CalibrationError, match='there is no file'):
         ros_arguments({'params_file': str(tmp_path / 'none.yaml')})
-
-
-def test_every_parameter_of_the_node_is_an_argument():
-    with Cell(chain='ur10e') as cell:
-        declared = {
-            name: cell.node.get_parameter(name).value
-            for name in cell.node.get_parameters_by_prefix('')
-            if name not in OTHERS and not name.startswith('qos_overrides.')
-        }
-    assert set(declared) == set(PARAMETERS)
-    assert set(PARAMETERS) < set(launch_arguments())
-    for name, value in declared.items():
-        default = PARAMETERS[name].default
-        assert type(value) is (list if isinstance(default, tuple) else type(default)), name
 
 
 def test_an_argument_that_does_not_exist_is_refused(launched):

@@ -17,7 +17,7 @@ from ros_cell import Cell, Child, topics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import node as node_module
-from calib_ros.ros.arguments import PARAMETERS, refuse_ignored, typed
+from calib_ros.ros.arguments import PARAMETERS, launch_arguments, refuse_ignored, typed
 from calib_ros.settings import STARTUP, Settings
 
 FREE = ('target_filename', 'calibration_filename', 'socket', 'largest_loss', 'marker_scale')
@@ -28,17 +28,24 @@ def declared(node):
     return {name: parameter.value for name, parameter in node.get_parameters_by_prefix('').items()}
 
 
-def test_the_parameter_file_holds_every_parameter_with_its_default(idle):
+def test_every_parameter_is_in_the_file_with_its_default_and_an_argument_of_launch(idle):
     with open(SHIPPED) as file:
         (content,) = yaml.safe_load(file).values()
     shipped = content['ros__parameters']
-    foreign = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
-    plain = {
-        name: value for name, value in declared(idle.node).items() if not name.startswith(foreign)
+    of_every_node = ('qos_overrides.', 'start_type_description_service')
+    own = {
+        name: value
+        for name, value in declared(idle.node).items()
+        if not name.startswith(of_every_node)
     }
-    assert list(shipped) == list(plain)
+    assert set(own) == set(PARAMETERS) < set(launch_arguments())
+    for name, value in own.items():
+        default = PARAMETERS[name].default
+        assert type(value) is (list if isinstance(default, tuple) else type(default)), name
+    del own['use_sim_time']
+    assert list(shipped) == list(own)
     of_this_test = {'chain': '', 'data_dir': ''}
-    assert shipped == plain | of_this_test
+    assert shipped == own | of_this_test
 
 
 @pytest.mark.parametrize(
@@ -209,22 +216,26 @@ def test_a_parameter_file_of_other_nodes_is_refused(tmp_path, keys, applies):
         refuse_ignored(command, node)
 
 
-def test_a_node_does_not_start_with_the_parameters_of_another(tmp_path):
+@pytest.mark.parametrize(
+    ('node', 'given', 'said'),
+    [
+        (
+            '/cell_2/calibration_node',
+            'mode: triggered',
+            'but of /cell_2/calibration_node: use the',
+        ),
+        # ROS gives it no type, and rclpy no name
+        ('/**', 'sources: []', "an empty list []: write [''] or leave it out"),
+    ],
+)
+def test_a_parameter_file_without_effect_ends_the_node(
+    tmp_path, capsys, ended_by, node, given, said
+):
     path = tmp_path / 'parameters.yaml'
-    path.write_text('cell_2: {calibration_node: {ros__parameters: {mode: triggered}}}')
-    with Child('--params-file', path, chain='ur10e', data_dir=tmp_path) as child:
-        assert child.end() == 1
-        assert 'but of /cell_2/calibration_node: use the key /**' in child.output
-
-
-def test_an_empty_list_in_a_parameter_file_is_told(tmp_path):
-    """ROS gives it no type, and rclpy no name."""
-    path = tmp_path / 'parameters.yaml'
-    path.write_text('/**: {ros__parameters: {chain: ur10e, sources: []}}')
-    with Child('--params-file', path, data_dir=tmp_path) as child:
-        assert child.end() == 1
-        assert "an empty list []: write [''] or leave it out" in child.output
-        assert 'Traceback' not in child.output
+    path.write_text(f'{node}: {{ros__parameters: {{{given}}}}}')
+    assert ended_by('chain:=ur10e', f'data_dir:={tmp_path}', file=path) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said in line
 
 
 def test_the_parameter_file_applies_under_a_namespace(tmp_path):
