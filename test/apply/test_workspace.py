@@ -168,7 +168,7 @@ def test_workspace_writes_tables_words_and_figures(run, folder, tmp_path):
 
 
 def test_workspace_places_a_task(run, folder, tmp_path):
-    task = TASK[::4]
+    task = TASK[::2]
     values = np.column_stack([task[:, :3, 3], to_quat(task[:, :3, :3])])
     (tmp_path / 'task.csv').write_text(csv_of(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), values))
     np.testing.assert_allclose(read_poses(tmp_path / 'task.csv'), task, atol=1e-8)
