@@ -154,7 +154,7 @@ def test_the_slider_scales_the_vectors(wide):
     assert 10.0 < drawn / wide.page.evaluate(ends) < 1e4  # times the error itself
 
 
-def test_a_gross_error_does_not_flatten_the_figures(chromium, tmp_path):
+def test_a_gross_error_does_not_flatten_the_figures(unsearched, chromium, tmp_path):
     rows = rows_of(measured())
     rows[3]['x'] += 8.0
     table, out = write_csv(tmp_path / 'measured.csv', rows), tmp_path / 'out'

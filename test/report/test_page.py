@@ -345,7 +345,7 @@ def test_distances_and_outliers_have_pages():
     assert poses.source(int(np.flatnonzero(poses.outlier)[0])) in page.text
 
 
-def test_outliers_held_out_are_listed_too():
+def test_outliers_held_out_are_listed_too(unsearched):
     """They have no weight to lose; the table had those of the fit only."""
     problem = problem_of()
     problem.judging[0].positions[3] += 0.02

@@ -70,7 +70,7 @@ def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     assert ('the error has grown' in in_words(found)) == (verdict == 'does not hold')
 
 
-def test_a_held_out_gross_error_is_counted_where_the_figures_are():
+def test_a_held_out_gross_error_is_counted_where_the_figures_are(unsearched):
     problem = problem_of()
     (held_out,) = problem.judging
     held_out.positions[3] += 0.02
