@@ -16,9 +16,11 @@ BEGINNINGS = (
     *((mark, 'bag') for mark in (b'\x89MCAP', b'SQLite format 3', b'\x28\xb5\x2f\xfd')),
     *((mark, 'image') for mark in (b'\x89PNG', b'\xff\xd8\xff')),
     *((mark, 'report') for mark in (b'%PDF', b'<!doctype html')),
-    (b'<', 'urdf'),
+    (b'&ACCESS', 'native'),
 )
+NATIVE = ('.src', '.mod', '.prg', '.ls', '.tp', '.script', '.urp', '.pgx', '.dtx', '.jbi')
 SUFFIXES = {
+    **dict.fromkeys(NATIVE, 'native'),
     **dict.fromkeys((*RECORDED, '.bag'), 'bag'),
     **dict.fromkeys(URDF_SUFFIXES, 'urdf'),
     **dict.fromkeys(('.yaml', '.yml'), 'chain'),
@@ -32,6 +34,10 @@ WORDS = {
     'bag': ('a bag', 'use identify or verify, or bag2csv to make a table'),
     'table': ('a table', 'use identify or verify, or csv2bag to make a bag'),
     'program': ('a program', 'use compensate'),
+    'native': (
+        "a program in a robot's own language",
+        'write its joint values [rad, m] as a CSV with q1 ... qn, and corrected ones back',
+    ),
     'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
     'urdf': ('a URDF', 'give it as --chain'),
     'result': ('the result of identify', 'use workspace, or give it as --calibration'),
@@ -61,7 +67,7 @@ def kind_of(path: Path) -> str:
     for mark, kind in BEGINNINGS:
         if begin[:16].lower().startswith(mark.lower()):
             return kind
-    kind = _by_suffix(path.name)
+    kind = 'urdf' if b'<robot' in begin else _by_suffix(path.name)
     return 'program' if kind == 'chain' and b'points:' in begin else kind
 
 

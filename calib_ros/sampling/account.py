@@ -31,6 +31,7 @@ class Account:
     dropped: dict[str, int]
     notes: dict[str, int]
     foreign_names: tuple[str, ...]
+    never_named: tuple[str, ...]
 
     def __str__(self) -> str:
         text = f'{self.joint_states} joint states and {self.poses} measurements gave '
@@ -51,8 +52,9 @@ class Account:
                 text += f'; {label}: {parts}'
         if self.foreign_names:
             text += (
-                f'; joint states name {", ".join(self.foreign_names)}: give the chain of this arm '
-                '(--chain) or, if only the names differ, set joint_names (--joint-names)'
+                f'; joint states never name {", ".join(self.never_named)}, but '
+                f'{", ".join(self.foreign_names)}: give the chain of this arm (--chain) or, if '
+                'only the names differ, set joint_names (--joint-names)'
             )
         return text
 

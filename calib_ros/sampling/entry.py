@@ -34,6 +34,7 @@ class JointNames:
         self._layouts: dict[tuple[str, ...], Layout] = {}
         self.foreign: tuple[str, ...] = ()
         """Names received if some of the chain's joints are never named."""
+        self.never: tuple[str, ...] = ()  # these joints
 
     def layout(self, key: tuple[str, ...]) -> Layout:
         """Return the joints of the chain in messages, and the columns of their values.
@@ -51,7 +52,8 @@ class JointNames:
             self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
             named = {name for names in self._layouts for name in names}
             needed = {n for k, n in enumerate(self._names) if k not in self.held}
-            self.foreign = () if needed <= named else tuple(sorted(named))
+            self.never = tuple(sorted(needed - named))
+            self.foreign = tuple(sorted(named)) if self.never else ()
         return self._layouts[key]
 
     def foreign_ones(self, missing: Sequence[int]) -> str:

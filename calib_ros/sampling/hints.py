@@ -123,6 +123,14 @@ def unmeasured(stops: int, between: int) -> list[Hint]:
     return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
 
+def unseen(images: int, measurements: int, reason: str) -> list[Hint]:
+    """Report that a large share of the images is not used, and why the last of them is not."""
+    if not reason or images <= EXCEPTION * measurements:
+        return []
+    words = f'{images} of {measurements} images are not used, the last: {reason}'
+    return [Hint('', words, explains=False)]
+
+
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:
     """Report a large share of lost messages, and the main cause."""
     found = []

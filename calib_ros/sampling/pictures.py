@@ -65,6 +65,7 @@ class Pictures:
         self._queue: deque[tuple[Sample, Future[Sample | Refusal] | None]] = deque()
         self.dropped: Counter[str] = Counter()  # unused images by cause
         self.refused = ''  # why the last image is not used; empty if it is
+        self.reason = ''  # why the last of those dropped is not used
 
     def keep(self, topic: str, size: int, message: Callable[[], Any]) -> int:
         """Keep an image of some bytes; return its number. `message` decodes it."""
@@ -100,7 +101,7 @@ class Pictures:
                 result, self.refused = looked.result(), ''
             self._queue.popleft()
             if isinstance(result, Refusal):
-                self.refused = result.reason
+                self.refused = self.reason = result.reason
                 self.dropped[f'measurements: image {result.cause}'] += sample.count
             else:
                 found.append(result)

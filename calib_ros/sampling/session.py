@@ -23,7 +23,7 @@ from calib_ros.sampling.account import Account
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Part
 from calib_ros.sampling.gathered import Gathered, check_settings, collect, gathered
-from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard
+from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
@@ -225,6 +225,7 @@ class CalibrationSession:
             dict(sorted(self._dropped.items())),
             dict(sorted(notes.items())),
             self._names.foreign,
+            self._names.never,
         )
 
     @property
@@ -246,6 +247,8 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
+        images, reason = self.pictures.dropped.total(), self.pictures.reason
+        found += unseen(images, self.received[POSES], reason)
         found += self._pipeline.hints(self.received[POSES])
         if any(hint.explains for hint in found):
             return found

@@ -9,7 +9,14 @@ from typing import NamedTuple, TypeAlias
 
 from calib_ros.errors import InputError
 from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
-from calib_ros.sampling.messages import CAMERA_INFO, DECODERS, JOINT_STATE, LINKS, short_type
+from calib_ros.sampling.messages import (
+    CAMERA_INFO,
+    DECODERS,
+    JOINT_STATE,
+    LINKS,
+    PICTURES,
+    short_type,
+)
 from calib_ros.sampling.sources import TYPES, Source, parse_source, parse_sources
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.settings import Settings
@@ -62,7 +69,7 @@ def choose(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
             raise _no_topic(f'"{source.camera_info}"', (CAMERA_INFO,), available)
     if all(source.validation for source in sources):
         error = _no_topic('pose topic', tuple(DECODERS), available)
-        raise InputError('; '.join([str(error), *_links(recorded)]))
+        raise InputError('; '.join([str(error), *_others(recorded)]))
     streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
     chosen = {stream.topic: stream for stream in streams if stream.topic in available}
     still = {topic: stream for topic, stream in chosen.items() if stream.still}
@@ -71,13 +78,19 @@ def choose(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     return chosen
 
 
-def _links(recorded: Recorded) -> list[str]:
+def _others(recorded: Recorded) -> list[str]:
+    """Return how to use links and images, which are no measurements of their own."""
     found = []
     for topic, kind in recorded.available.items():
         if kind in LINKS and not topic.endswith(STATIC):
             links = Links(topic, kind=kind)
             _learn(recorded, {topic: Stream(topic, kind, None, links)})
             found.append(str(links))
+        elif kind in PICTURES:
+            found.append(
+                f'images of a board need --sources "{topic} board=board.yaml", with '
+                'eye_in_hand=true if the camera is on the flange'
+            )
     return found
 
 

@@ -69,6 +69,12 @@ def bad_inputs():
         'is a table, but compare takes',
     )
     yield 'a picture as chain', (*chain_of, 'shot.png'), 'shot.png is not UTF-8 text: save it'
+    yield (
+        'a program of KUKA',
+        (*bag_of, 'move.dat'),
+        "move.dat is a program in a robot's own language, but identify takes a table or a bag: wr",
+    )
+    yield 'no program', ('compare', 'start.dtx', 'none'), "start.dtx is a program in a robot's own"
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
     yield (
         'a result as a table',
@@ -92,6 +98,8 @@ def test_bad_input_is_one_clear_line(run, table, tmp_path, arguments, complaint)
     (tmp_path / 'twice.csv').write_text('q1,q2,q3,q4,q5,q6,x,y,z,x\n0,0,0,0,0,0,1,2,3,4\n')
     (tmp_path / 'empty').write_text('')
     (tmp_path / 'broken.yaml').write_text('joints: [\n')
+    (tmp_path / 'move.dat').write_text('&ACCESS RVP\nDEFDAT MOVE\nENDDAT\n')
+    (tmp_path / 'start.dtx').write_text('<?xml version="1.0"?><Database/>')
     (tmp_path / 'shot.png').write_bytes(b'\x89PNG\xff')
     for folder, file in (('folder', ''), ('refused', 'result.json'), ('shots', '1.pgm')):
         (tmp_path / folder).mkdir()

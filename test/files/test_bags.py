@@ -220,6 +220,14 @@ def test_topics_without_messages_make_no_pairs(tmp_path, storage):
         session.problem()
 
 
+def test_a_joint_that_no_message_names_is_told(tmp_path):
+    some = [joint_state(k * 10 * MS, (0.1, 0.2), ('a', 'c')) for k in range(1, 100)]
+    events = [*(('/joint_states', each) for each in some), ('/pose', pose_stamped(505 * MS))]
+    session, _ = session_of(record(tmp_path / 'bag', events))
+    with pytest.raises(InputError, match='joint states never name b, but a, c: give the chain'):
+        session.problem()
+
+
 GOOD = np.eye(6)
 NAN = GOOD.copy()
 NAN[0, 0] = np.nan

@@ -233,6 +233,7 @@ def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_not
     session.finish()  # waits for them
     assert session.account().dropped['measurements: image blurred'] >= pictures.MOST_WAITING
     assert 'the last image is not used: it is blurred' in session.status()
+    assert 'images are not used, the last: it is blurred' in session.summary
 
 
 def test_memory_for_images_is_bounded(monkeypatch):

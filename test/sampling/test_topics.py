@@ -7,6 +7,7 @@ import pytest
 from recorded import (
     MS,
     TYPES,
+    header,
     joint_state,
     observations_of,
     pose_stamped,
@@ -72,6 +73,14 @@ def test_outputs_that_are_all_there_is_are_told(tmp_path):
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
     assert '/calibration_node/corrected_pose (own output)' in str(caught.value)
+
+
+def test_a_recording_of_images_names_the_option_for_them(tmp_path):
+    pixels = np.zeros(1, np.uint8)
+    image = TYPES['sensor_msgs/msg/Image'](header(5 * MS), 1, 1, 'mono8', 0, 1, pixels)
+    path = record(tmp_path / 'bag', [*standing([]), ('/camera/image_raw', image)])
+    with pytest.raises(InputError, match=r'no pose topic .*--sources "/camera/image_raw board='):
+        session_of(path)
 
 
 @pytest.mark.parametrize(
