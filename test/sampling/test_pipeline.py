@@ -4,22 +4,11 @@
 
 import numpy as np
 import pytest
+from arriving import assert_same
 from hypothesis import given, strategies as st
-from streams import (
-    POSE,
-    START,
-    TRACKER,
-    S,
-    hear,
-    joint_state,
-    of_joints,
-    pose,
-    stamps,
-    stops,
-    take,
-)
+from streams import S, hear, stamps, stops
 
-from calib_ros import CalibrationSession, Settings, load_chain
+from calib_ros import CalibrationSession, load_chain
 from calib_ros.sampling.pipeline import STRAY, Gate
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
 
@@ -150,86 +139,58 @@ def passing(gate, messages):
 
 # In a session
 
-
-def messages(rng, count=12):
-    """Return the messages of a shift, of 20 Hz and 100 Hz, in the order of their stamps."""
-    configurations = ARM.random_joints(count, rng)
-    times = np.arange(0.0, 1.6 * count, 0.01)
-    joints = stops(configurations, move=0.8, stand=0.8)(times)
-    where = ARM.forward(joints)
-    found = []
-    for k, time in enumerate(times):
-        stamp_ns = START + round(time * 1e9)
-        found.append(joint_state(stamp_ns, ARM.joint_names, joints[k].tolist()))
-        if k % 5 == 0:
-            found.append(pose(stamp_ns, where[k, :3, 3], where[k, :3, :3]))
-    return found
+TIMES, MEASURED = np.arange(0.0, 12.0, 0.02), np.arange(0.003, 12.0, 0.15)
+MOTION = stops(ARM.random_joints(12, np.random.default_rng(2)), 0.4, 0.6)
+SEEN = ARM.forward(MOTION(MEASURED))
 
 
-def session_of(given, **settings):
-    session = CalibrationSession(ARM, Settings(**settings))
-    come = [
-        of_joints(each) if hasattr(each, 'position') else (TRACKER, POSE, each) for each in given
-    ]
-    take(session, *come)
-    session.finish()
+def played(session, off=0, came=TIMES, seen=MEASURED, count=None):
+    """Let a session hear a recording with stamps some seconds off, or the first of its messages.
+
+    These are `count` of each kind; they come at some times [s].
+    """
+    shift, some = np.int64(off * S), slice(count)
+    joints = came, stamps(TIMES) + shift, MOTION(TIMES)
+    poses = seen, stamps(MEASURED) + shift, SEEN[:, :3, 3], SEEN[:, :3, :3]
+    hear(session, [each[some] for each in joints], [each[some] for each in poses])
     return session
 
 
-def shifted(message, seconds):
-    """Return a message with another stamp."""
-    copy = type(message)(**vars(message))
-    copy.header = type(message.header)(**vars(message.header))
-    copy.header.stamp = type(message.header.stamp)(**vars(message.header.stamp))
-    copy.header.stamp.sec += seconds
-    return copy
-
-
-def assert_same_samples(first, second):
-    assert len(first.samples) == len(second.samples) > 5
-    for one, other in zip(first.samples, second.samples, strict=True):
-        assert one.stamp_ns == other.stamp_ns
-        assert one.count == other.count
-        np.testing.assert_array_equal(one.joints, other.joints)
-        np.testing.assert_array_equal(one.position, other.position)
+@pytest.fixture
+def alone():
+    """Return the samples of the recording that is played once."""
+    session = played(CalibrationSession(ARM))
+    session.finish()
+    assert len(session.samples) == 12
+    return session.samples
 
 
 @pytest.mark.parametrize('off', [10_000, -10_000])
-def test_the_first_messages_may_be_the_stray_ones(rng, off):
-    given = messages(rng)
-    stray = [shifted(message, off) for message in given[:2]]
-    assert_same_samples(session_of(given), session_of([*stray, *given]))
+def test_the_first_messages_may_be_the_stray_ones(alone, off):
+    found = played(played(CalibrationSession(ARM), off, count=1))
+    found.finish()
+    assert_same(found.samples, alone)
 
 
 @pytest.mark.parametrize('off', [-10_000, 10_000])
-def test_a_recording_that_is_played_again_later_or_earlier_gives_its_samples_twice(rng, off):
-    given = messages(rng)
-    again = [shifted(message, off) for message in given]
-    alone, found = session_of(given), session_of([*given, *again])
-    stamps = [sample.stamp_ns for sample in alone.samples]
-    later = [stamp + off * S for stamp in stamps]
-    assert [sample.stamp_ns for sample in found.samples] == stamps + later
+def test_a_recording_that_is_played_again_later_or_earlier_gives_its_samples_twice(alone, off):
+    found = played(played(CalibrationSession(ARM)), off)
+    found.finish()
+    once = [sample.stamp_ns for sample in alone]
+    later = [stamp + off * S for stamp in once]
+    assert [sample.stamp_ns for sample in found.samples] == once + later
     assert not any('far from' in cause for cause in found.account().dropped)
 
 
 @pytest.mark.parametrize('seed', range(3))
 def test_a_recording_played_again_counts_one_jump_however_it_comes(seed):
     """On a busy machine each topic comes in bursts of its own."""
-    rng = np.random.default_rng(seed)
-    motion = stops(ARM.random_joints(12, rng), 0.4, 0.6)
-    times, measured = np.arange(0.0, 12.0, 0.02), np.arange(0.003, 12.0, 0.15)
-    where = ARM.forward(motion(measured))
-    session = CalibrationSession(ARM)
+    rng, session = np.random.default_rng(seed), CalibrationSession(ARM)
     for again, off in enumerate((0, 0, -3600)):
         bursts = [np.cumsum(rng.uniform(0.05, 3.0, 40)) for _ in range(2)]
         came, seen = (
             edges[np.searchsorted(edges, t)]
-            for edges, t in zip(bursts, (times, measured), strict=True)
+            for edges, t in zip(bursts, (TIMES, MEASURED), strict=True)
         )
-        shift = np.int64(off * S)
-        hear(
-            session,
-            (came, stamps(times) + shift, motion(times)),
-            (seen, stamps(measured) + shift, where[:, :3, 3], where[:, :3, :3]),
-        )
+        played(session, off, came, seen)
         assert session.account().notes.get('the clock jumped back', 0) == again
