@@ -128,11 +128,16 @@ def test_a_linear_axis_has_its_own_unit_in_the_header(tmp_path):
         ('q1,q2,x,y,z\nDegrees,Degrees,inches,millimeter,Meters', '90,180,.03937007874,2,.003'),
         ('q1 [deg],q2 [rad],x [mm],y [m],z [cm]', '90,3.141592653589793,1,.002,.3'),
         ('q1 [rad],q2 [rad],x [mm],y,z,rx [deg],ry,rz', '1.5707963268,3.1415926536,1,2,3,90,0,0'),
+        ('Cell\na [deg],b,c [mm],d,e', '90,180,1,2,3'),
+        ('Cell\na,b,c,d,e\ndeg,deg,mm,mm,mm', '90,180,1,2,3'),
     ],
 )
 def test_each_column_has_its_own_unit(tmp_path, head, row):
+    """Whether it is named, or told by its number."""
     (tmp_path / 'cell.csv').write_text(f'{head}\n{row}\n')
-    foreign = Foreign(Layout(rotation_vector='rx' in head))
+    numbers = zip(('q1', 'q2', 'x', 'y', 'z'), ('#1', '#2', '#3', '#4', '#5'), strict=True)
+    columns = dict(numbers) if 'Cell' in head else {}
+    foreign = Foreign(Layout(rotation_vector='rx' in head, columns=columns))
     table = read_table(tmp_path / 'cell.csv', 2, foreign=foreign)
     (found,) = table.fitted
     np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
@@ -160,16 +165,6 @@ def test_contradictory_units_are_refused(tmp_path, head, told):
     layout = Layout(columns={'q2': 'q1', 'x': 'X+Y'} if 'X' in head else {})
     with pytest.raises(InputError, match=told):
         read_table(tmp_path / 'cell.csv', 2, foreign=Foreign(layout))
-
-
-@pytest.mark.parametrize('head', ['a [deg],b,c [mm],d,e', 'a,b,c,d,e\ndeg,deg,mm,mm,mm'])
-def test_units_of_columns_by_their_numbers(tmp_path, head):
-    (tmp_path / 'cell.csv').write_text(f'Cell\n{head}\n90,180,1,2,3\n')
-    columns = dict(zip(('q1', 'q2', 'x', 'y', 'z'), ('#1', '#2', '#3', '#4', '#5'), strict=True))
-    foreign = Foreign(Layout(columns=columns))
-    (found,) = read_table(tmp_path / 'cell.csv', 2, foreign=foreign).fitted
-    np.testing.assert_allclose(found.joints, [[np.pi / 2, np.pi]])
-    np.testing.assert_allclose(found.positions, [[1e-3, 2e-3, 3e-3]])
 
 
 def test_a_line_of_units_below_our_own_columns_is_read(tmp_path):
