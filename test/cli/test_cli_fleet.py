@@ -17,6 +17,8 @@ from calib_ros.cli.main import main
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 
+COMMON = ('--chain', 'ur10e', '--history', 'history', '--serial', '0042')
+
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
@@ -24,21 +26,33 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_identify_and_verify_are_filed(folder, capsys):
+@pytest.fixture
+def calibrated(folder):
+    """Return the folder of a robot of which the first of two nights is identified and filed."""
     plants.write_plant(folder, ['0042'], 2)
-    measured = ['nights/0042/000.csv', 'nights/0042/001.csv']
-    common = ['--chain', 'ur10e', '--history', 'history']
-    identify = ['identify', measured[0], *common, '--out', 'result']
-    assert main(identify) == 1
+    assert main(['identify', 'nights/0042/000.csv', *COMMON, '--out', 'result']) == 0
+    return folder
+
+
+def piped(text):
+    """Return the path of a pipe that holds bytes."""
+    end, begin = os.pipe()
+    os.write(begin, text)
+    os.close(begin)
+    return f'/dev/fd/{end}'
+
+
+def test_identify_and_verify_are_filed(calibrated, capsys):
+    identify = ['identify', 'nights/0042/000.csv', '--out', 'result', '--force']
+    assert main([*identify, *COMMON[:4]]) == 1
     assert 'add --serial' in capsys.readouterr().err
-    identify += ['--serial', '0042', '--force']
-    assert [main(identify), main(identify)] == [0, 0]
-    verify = ['verify', measured[1], *common, '--serial', '0042', '--calibration', 'result']
+    assert main([*identify, *COMMON]) == 0  # once more
+    verify = ['verify', 'nights/0042/001.csv', *COMMON, '--calibration', 'result']
     assert [main([*verify, '--tolerance', '0.5']), main(verify)] == [0, 0]
     rows = History('history').rows('0042')
     assert [row.kind for row in rows] == ['identify', 'verify', 'verify']
     assert {row.verdict for row in rows} == {'accepted', 'PASS', 'holds'}
-    result = json.loads((folder / 'result/result.json').read_text())
+    result = json.loads((calibrated / 'result/result.json').read_text())
     assert rows[0].rms_mm == result['validation']['after']['rms_mm']
     assert rows[0].time == plants.when(0)
 
@@ -54,16 +68,12 @@ def test_identify_and_verify_are_filed(folder, capsys):
 
 def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
     """Of pipes the rest was hashed, which is empty; of a file what it was when all was done."""
-    plants.write_plant(folder, ['A'], 2)
-    common = ['--chain', 'ur10e', '--history', 'history', '--serial', 'A']
-    nights = sorted(Path('nights/A').iterdir())
+    plants.write_plant(folder, ['0042'], 2)
+    nights = sorted(Path('nights/0042').iterdir())
     for k, night in enumerate(nights):
-        end, begin = os.pipe()
-        os.write(begin, night.read_bytes())
-        os.close(begin)
-        assert main(['identify', '--csv', f'/dev/fd/{end}', *common, '--out', f'out{k}']) == 0
-        os.close(end)
-    assert len(History('history').rows('A')) == 2
+        pipe = piped(night.read_bytes())
+        assert main(['identify', '--csv', pipe, *COMMON, '--out', f'out{k}']) == 0
+    assert len(History('history').rows('0042')) == 2
     origin = json.loads(Path('out0/result.json').read_text())['origin']
     assert hashlib.sha256().hexdigest() not in json.dumps(origin)
 
@@ -78,18 +88,16 @@ def test_nights_that_no_file_keeps_are_filed_all_the_same(folder, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(identify, '_identified', while_it_grows)
-        assert main(['identify', str(growing), *common]) == 0
-    assert [main(['identify', str(growing), *common]) for _ in range(2)] == [0, 0]
-    assert len(History('history').rows('A')) == 4
+        assert main(['identify', str(growing), *COMMON]) == 0
+    assert [main(['identify', str(growing), *COMMON]) for _ in range(2)] == [0, 0]
+    assert len(History('history').rows('0042')) == 4
 
 
-def test_the_same_table_read_or_judged_in_another_way_is_another_result(folder):
+@pytest.mark.usefixtures('calibrated')
+def test_the_same_table_read_or_judged_in_another_way_is_another_result():
     """A wrong unit stayed on file, and a correction that does not arrive was never filed."""
-    plants.write_plant(folder, ['0042'], 2)
-    common = ['--chain', 'ur10e', '--history', 'history', '--serial', '0042']
     table = 'nights/0042/001.csv'
-    assert main(['identify', 'nights/0042/000.csv', *common, '--out', 'result']) == 0
-    verify = ['verify', table, *common, '--calibration', 'result', '--tolerance', '0.5']
+    verify = ['verify', table, *COMMON, '--calibration', 'result', '--tolerance', '0.5']
     assert main([*verify, '--length', 'mm']) == Status.NOT_ACCEPTED
     assert main([*verify, '--length', 'm']) == 0
     assert [main(verify), main(verify)] == [0, 0]  # the second time nothing is new
@@ -98,20 +106,11 @@ def test_the_same_table_read_or_judged_in_another_way_is_another_result(folder):
     assert sorted(row.verdict for row in rows) == ['FAIL', 'FAIL', 'PASS', 'PASS']
 
 
-def test_programs_and_logs_through_pipes_make_other_results(folder, monkeypatch):
+@pytest.mark.usefixtures('calibrated')
+def test_programs_and_logs_through_pipes_make_other_results():
     """They were not part of what was filed, so the second result was taken for the first."""
-    plants.write_plant(folder, ['0042'], 2)
-    common = ['--chain', 'ur10e', '--history', 'history', '--serial', '0042']
-    assert main(['identify', 'nights/0042/000.csv', *common, '--out', 'result']) == 0
     table = Path('nights/0042/001.csv')
-    verify = [*common, '--calibration', 'result', '--tolerance', '0.5']
-
-    def piped(text):
-        end, begin = os.pipe()
-        os.write(begin, text)
-        os.close(begin)
-        return f'/dev/fd/{end}'
-
+    verify = [*COMMON, '--calibration', 'result', '--tolerance', '0.5']
     for more in ([], ['--commanded', str(table)]):
         main(['verify', piped(table.read_bytes()), *verify, *more])
     rows = History('history').rows('0042')[1:]
