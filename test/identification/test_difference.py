@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import NOISE, SIGMAS, UR10E as UR
 from measured import bent
 from robots import DATA, needs_data
 
@@ -22,8 +23,6 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import parse_chain
 from calib_ros.kinematics.parameter import Parameter
 
-UR = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
 UR10 = DATA / 'ur10_ipa_leica'
 
 
@@ -33,8 +32,7 @@ def calibrated(true, seed, still=None, **more):
     if still is not None:
         q[:, still] = 1.0
     seen = measure(true, q, rng, *NOISE)
-    sigmas = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}
-    return Calibration.of(identify(Problem(UR, seen, **sigmas, **more)))
+    return Calibration.of(identify(Problem(UR, seen, **SIGMAS, **more)))
 
 
 @pytest.fixture(scope='module')

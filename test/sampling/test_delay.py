@@ -6,22 +6,28 @@ import re
 
 import numpy as np
 import pytest
+from fits import NOISE, UR10E, rms
 from hypothesis import given, strategies as st
 from scipy.signal import find_peaks
 from streams import START, S, hear, stamps, stops, sweep
 
-from calib_ros import CalibrationSession, Settings, load_chain
+from calib_ros import CalibrationSession, Settings
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.sampling.delay import LEAST_MOTION, find_delay, peaks
 
-UR10E = load_chain('ur10e')
-NOISE = (5e-5, 2e-4)
 SECONDS = 40.0
 
 
 def true_cell(seed):
     rng = np.random.default_rng(seed)
     return faulty(UR10E, Cell(), rng), sweep(6, rng, reach=2.0), rng
+
+
+def told(session, joint_times, joints, times, positions, rotations, lag=0.0):
+    """Let a session hear joint values, and poses a lag [s] late, at the times of arrival."""
+    known = joint_times, stamps(joint_times), joints
+    seen = times + max(lag, 0.0) + 0.005, stamps(times + lag), positions, rotations
+    hear(session, known, seen)
 
 
 def recorded(lag, seed=0, oriented=True, seconds=SECONDS, motion=None, **settings):
@@ -33,21 +39,14 @@ def recorded(lag, seed=0, oriented=True, seconds=SECONDS, motion=None, **setting
     times = np.arange(0.05, seconds - 0.3, 0.02)
     seen = measure(true, motion(times), rng, *NOISE, oriented)
     rotations = seen.rotations if oriented else None
-    arrived = times + max(lag, 0.0) + 0.005
-    hear(
-        session,
-        (joint_times, stamps(joint_times), motion(joint_times)),
-        (arrived, stamps(times + lag), seen.positions, rotations),
-    )
+    told(session, joint_times, motion(joint_times), times, seen.positions, rotations, lag)
     session.finish()
     return session, true, motion
 
 
 def error(chain, true, motion):
     """Return the RMS error [m] along the motion, at times in between."""
-    joints = motion(np.linspace(1.0, SECONDS - 1.0, 777))
-    apart = (chain.forward(joints) - true.forward(joints))[:, :3, 3]
-    return np.sqrt((apart**2).sum(axis=1).mean())
+    return rms(chain, true, motion(np.linspace(1.0, SECONDS - 1.0, 777)))
 
 
 @pytest.mark.parametrize(('delay', 'oriented'), [(0.2, False), (-0.05, True)])
@@ -98,11 +97,7 @@ def test_errors_of_time_are_told(jitter, smoothing, said, unsearched):
         joints[k] = joints[k - 1] + (joints[k] - joints[k - 1]) * 0.005 / smoothing
     late = times + jitter * rng.random(len(times))
     session = CalibrationSession(UR10E, Settings(mode='continuous', largest_error=1.0))
-    hear(
-        session,
-        (joint_times, stamps(joint_times), joints),
-        (late + 0.005, stamps(late), seen.positions, seen.rotations),
-    )
+    told(session, joint_times, joints, late, seen.positions, seen.rotations)
     session.finish()
     remarks = [each for each in session.identify().remarks if 'errors grow' in each]
     assert len(remarks) == bool(said)
@@ -121,16 +116,8 @@ def test_a_target_that_was_carried_to_the_arm_stays_in_the_account_alone():
     joints = motion(np.maximum(joint_times - 20.0, 0.0))
     for part in (times < 19.0, times >= 19.0):
         now = (joint_times < 19.0) == part[0]
-        hear(
-            session,
-            (joint_times[now], stamps(joint_times[now]), joints[now]),
-            (
-                times[part] + 0.005,
-                stamps(times[part]),
-                (seen.positions + carried)[part],
-                seen.rotations[part],
-            ),
-        )
+        given = times, seen.positions + carried, seen.rotations
+        told(session, joint_times[now], joints[now], *(each[part] for each in given))
         assert ('are joint states frozen?' in session.status()) == part[0]
     session.finish()
     assert 'joint states stood still' in ''.join(session.warnings)
@@ -148,14 +135,10 @@ def test_joint_states_that_freeze_are_told(last):
     lost = rng.random(len(times)) < 0.1
     places = np.where(lost[:, np.newaxis], 0.0, seen.positions)
     joints = motion(np.minimum(joint_times, end))
-    hear(
-        session,
-        (joint_times, stamps(joint_times), joints),
-        (times + 0.005, stamps(times), places, seen.rotations),
-    )
+    told(session, joint_times, joints, times, places, seen.rotations)
     session.finish()
-    told = [each for each in session.warnings if 'joint states stood still' in each]
-    assert len(told) == (last is not None)
+    frozen = [each for each in session.warnings if 'joint states stood still' in each]
+    assert len(frozen) == (last is not None)
     assert ('are joint states frozen?' in session.status()) == (last is not None)
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import session
+from fits import rms
+from sessions import TRUE, UR5E, session
 from streams import (
     POSE,
     START,
@@ -23,8 +24,8 @@ from streams import (
     take,
 )
 
-from calib_ros import CalibrationSession, Settings, load_chain
-from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros import CalibrationSession, Settings
+from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.account import too_much_lost
@@ -32,8 +33,6 @@ from calib_ros.sampling.entry import Part
 from calib_ros.sampling.messages import PICTURES, Readings
 from calib_ros.sampling.sources import Source
 
-UR5E = load_chain('ur5e')
-TRUE = faulty(UR5E, Cell(), np.random.default_rng(11))
 PERIOD = 2.0
 
 
@@ -90,9 +89,7 @@ def heard(
 
 def error(chain, motion, seconds):
     """Return the RMS error [mm] of an arm along a motion."""
-    joints = motion(np.linspace(0.0, seconds, 500))
-    apart = (chain.forward(joints) - TRUE.forward(joints))[:, :3, 3]
-    return 1e3 * np.sqrt((apart**2).sum(axis=1).mean())
+    return 1e3 * rms(chain, TRUE, motion(np.linspace(0.0, seconds, 500)))
 
 
 @pytest.mark.parametrize('rate', [10.0, 20.0, 100.0])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E
+from fits import NOISE, SIGMAS, UR10E, rms
 from sessions import seen
 
 from calib_ros import CalibrationSession, Chain, Settings, identify
@@ -25,11 +25,9 @@ def growing(samples, **settings):
     return live, said
 
 
-def apart(first, second, rng, count=300):
+def apart(first, second, rng):
     """Return the RMS distance [m] of what two chains predict."""
-    joints = UR10E.random_joints(count, rng)
-    shift = (first.forward(joints) - second.forward(joints))[:, :3, 3]
-    return np.sqrt((shift**2).sum(axis=1).mean())
+    return rms(first, second, UR10E.random_joints(300, rng))
 
 
 @pytest.mark.parametrize(('oriented', 'seed'), [(True, 1), (False, 2)])
