@@ -15,7 +15,6 @@ from calib_ros.files.export import (
     ExportError,
     converted,
     exports,
-    forward_of,
     kinematics_yaml,
     pose_matrix,
 )
@@ -187,13 +186,6 @@ def test_kinematics_tell_a_changed_robot_by_their_hash():
     assert again['calibration'] == {'robot_serial': '2019'}
     other = chain.with_offsets({'elbow_joint.a': 1e-6})
     assert yaml.safe_load(kinematics_yaml(other))['hash'] != first['hash']
-
-
-def test_kinematics_with_prismatic_and_reversed_joints():
-    chain = faulty(scara(), Cell(), np.random.default_rng(1))
-    q = chain.random_joints(50, np.random.default_rng(2))
-    poses = forward_of(kinematics_yaml(chain), chain, q)
-    np.testing.assert_allclose(poses, chain.forward(q), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize('effect', ['ratio', 'backlash'])

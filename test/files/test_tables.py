@@ -45,26 +45,11 @@ def read(tmp_path):
     return read
 
 
-def test_positions_without_orientation(read):
-    fitted, held_out = read(POINTS)
-    np.testing.assert_array_equal(fitted.joints, [[0.1, 0.2], [-0.3, 0.4]])
-    np.testing.assert_array_equal(fitted.positions, [[1, 2, 3], [4.5, 5.5, 6.5]])
-    assert fitted.oriented.tolist() == [False, False]
-    assert len(held_out) == 0
-
-
 def test_columns_in_any_order_with_byte_order_mark_and_windows_lines(read):
     text = '\ufeffz,y,x,q2,q1\r\n3,2,1,0.2,0.1\r\n\r\n'
     fitted, _ = read(text)
     np.testing.assert_array_equal(fitted.joints, [[0.1, 0.2]])
     np.testing.assert_array_equal(fitted.positions, [[1, 2, 3]])
-
-
-def test_rows_marked_test_are_held_out(read):
-    fitted, held_out = read(SPLIT)
-    assert fitted.positions[:, 0].tolist() == [1, 3, 4]
-    assert held_out.positions[:, 0].tolist() == [2, 5]
-    assert held_out.joints[:, 0].tolist() == [2, 5]
 
 
 def test_a_session_that_is_not_there_lists_those_that_are(read):
@@ -73,11 +58,6 @@ def test_a_session_that_is_not_there_lists_those_that_are(read):
     assert caught.value.alternatives == ('A', 'B')
     with pytest.raises(InputError, match='no column "session" to choose "A" from'):
         read(POINTS, 'A')
-
-
-def test_a_blank_quaternion_makes_a_position(read):
-    fitted, _ = read(POSES.replace('0.5,-0.5,0.5,0.5', ',,,'))
-    assert fitted.oriented.tolist() == [True, False]
 
 
 def test_a_path_that_holds_no_file_is_refused(tmp_path):

@@ -358,7 +358,9 @@ def test_outliers_are_named_by_number_and_stamp(cell, recording):
     assert f'1 outlier carries little or no weight: pose 7 ({stamp})' in cell.in_full(answer)
 
 
-def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(cell, recording):
+def test_a_poor_identification_publishes_nothing_and_keeps_the_last_good_one(
+    unsearched, cell, recording
+):
     cell.play(topics(recording))
     texts = cell.listen(String, 'calibration_node/calibration')
     cell.done('identify')
