@@ -18,7 +18,7 @@ from arriving import (
     toured,
 )
 from hypothesis import given, settings, strategies as st
-from streams import START, stamps, stops, sweep
+from streams import START, stamps, sweep
 
 from calib_ros.sampling.buffers import TOO_MANY
 from calib_ros.sampling.slices import NO_ACCIDENT
@@ -128,17 +128,6 @@ def test_a_stop_that_was_taken_back_is_sampled_when_it_comes_again():
     made.forget(samples[3])
     again = play(made, [(time + 10.0, *what) for time, *what in events])
     assert [each.stamp_ns for each in again] == [samples[3].stamp_ns]
-
-
-def test_after_the_clock_jumped_back_new_stops_are_sampled():
-    """As when a simulation begins anew: what was sampled before is kept."""
-    motion, other = tour(), stops(STOPS[::-1] + 0.1)
-    made = collector()
-    events = [*joint_events(motion, 9.5), *pose_events(motion, 9.5)]
-    more = [*joint_events(other, 9.5), *pose_events(other, 9.5, begin=0.007)]
-    samples = play(made, events, [(time + 10.0, *what) for time, *what in more])
-    where = [*STOPS, *(STOPS[::-1] + 0.1)]
-    np.testing.assert_allclose([each.joints for each in samples], where, atol=1e-3)
 
 
 # Buffers
