@@ -13,7 +13,7 @@ from typing import Any
 
 from calib_ros.cli import common, given
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.screen import Screen
+from calib_ros.cli.screen import STATES, Screen
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
@@ -31,7 +31,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
 from calib_ros.report import documents, words
-from calib_ros.report.advice import FAR, GOOD_ARM, Advice
+from calib_ros.report.advice import FAR, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import (
@@ -40,8 +40,7 @@ from calib_ros.report.reports import (
     doubts,
     identification_report,
     reasons_of,
-    somewhere,
-    within_tolerance,
+    standing,
 )
 from calib_ros.sampling.gathered import with_lenses
 from calib_ros.settings import Settings
@@ -126,20 +125,19 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _show_update(found: Recalibration, screen: Screen) -> None:
-    before, after = found.before, found.after
     if found.accepted:
-        screen.title('accepted: the calibration is brought up to date', True)
+        screen.title('Accepted: the calibration is brought up to date', True)
     else:
-        screen.title('NOT accepted: the earlier calibration stays as it was', False)
+        screen.title('Not accepted: the earlier calibration stays as it was', False)
     known = f'{1e3 * found.known_before:.3f} -> {1e3 * found.known_after:.3f} mm'
     screen.table(
-        (
-            ('robot', found.calibration.chain.name),
-            ('new poses', f'{after.count}, each judged by the others'),
-            ('position error', f'RMS {before.rms_mm:.3f} -> {after.rms_mm:.3f} mm'),
-            *_interval(found.comparison),
-            ('arm known to', f'{known} over the joint range (one sigma)'),
-        )
+        {
+            'robot': found.calibration.chain.name,
+            'new poses': f'{found.after.count}, each judged by the others',
+            'position error': words.change((found.before, found.after)),
+            '95 % interval': _intervals(found.comparison),
+            'arm known to': f'{known} over the joint range (one sigma)',
+        }
     )
     why, step = found.refusal()
     if why:
@@ -152,10 +150,10 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
             screen.bullet(perhaps + reason_in_words(reasons))
 
 
-def _interval(judged: Comparison | None) -> tuple[tuple[str, str], ...]:
-    """Return the row with the intervals of the RMS errors; none where they are not known."""
+def _intervals(judged: Comparison | None) -> str:
+    """Return the intervals of the RMS errors; empty where they are not known."""
     likely = [words.between(judged, when) for when in (0, 1)]
-    return (('95 % interval', f'RMS {" -> ".join(likely)} mm'),) if all(likely) else ()
+    return f'RMS {" -> ".join(likely)} mm' if all(likely) else ''
 
 
 def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
@@ -269,14 +267,8 @@ def show(found: Identified, screen: Screen) -> None:
     if found.loaded.read:
         screen.say(found.loaded.read)
     reasons = reasons_of(result)
-    if result.accepted:
-        within = within_tolerance(result.validation or result.fitted, found.wanted, 'is ')
-        gained = f'the calibration makes the arm better{somewhere(result)}{within}'
-        screen.title(f'accepted: {gained}', None if 'not' in within or result.remarks else True)
-    elif reasons[0].heading == GOOD_ARM.heading:
-        screen.title('NOT accepted, nothing to correct: the robot stays as it was')
-    else:
-        screen.title('NOT accepted, nothing is published: the robot stays as it was', False)
+    verdict = standing(result, reasons, found.wanted)
+    screen.title(verdict.heading, STATES.get(verdict.state))
     screen.table(_rows(result))
     _explain(result, reasons, screen)
     for line in words.cameras_in_words(result):
@@ -301,42 +293,30 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         screen.bullet(words.scatter_in_words(result.noise))
 
 
-def _rows(result: Identification) -> tuple[tuple[str, str], ...]:
-    judged = result.validation or result.fitted
-    before, after = judged.figures
-    proof = '' if result.validation else '; on the poses fitted: no proof'
-    measured = words.measured(result)
+def _rows(result: Identification) -> dict[str, str]:
+    judged, effects = result.validation or result.fitted, len(result.chain.effects)
+    before, after = figures = judged.figures
+    fitted, measured = f'{result.rank} parameters fitted', words.measured(result)
+    if effects:
+        fitted += f', {of_them(effects, "effect")}'
     if result.outliers:
         measured += f', {of_them(len(result.outliers), "outlier")} with little or no weight'
-    fitted = f'{result.rank} parameters fitted'
-    if result.chain.effects:
-        fitted += f', {of_them(len(result.chain.effects), "effect")}'
-    second = ('largest error', f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm')
-    if before.rms_mrad is not None and after.rms_mrad is not None:
-        turn = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
-        second = ('orientation error', turn)
-    if before.rms_px is not None and after.rms_px is not None:
-        second = ('corners', f'RMS {before.rms_px:.3f} -> {after.rms_px:.3f} px')
-    valid: tuple[tuple[str, str], ...] = ()
-    if result.accepted and result.region is not None:
-        valid = (('valid', result.region.in_words().removeprefix('valid ')),)
-    return (
-        ('robot', f'{result.chain.name}, {fitted}'),
-        ('fitted to', measured),
-        ('position error', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm{proof}'),
-        *_interval(result.validation),
-        *_with_outliers(judged),
-        second,
-        ('judged by', result.validated_by),
-        *valid,
-    )
-
-
-def _with_outliers(judged: Comparison) -> tuple[tuple[str, str], ...]:
-    if not judged.outliers:
-        return ()
-    before, after = judged.figures_of_all
-    return (('with outliers', f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm'),)
+    corners, turn = words.change(figures, 'px'), words.change(figures, 'mrad')
+    largest = f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm'
+    valid = result.region.in_words() if result.accepted and result.region is not None else ''
+    proof = '' if result.validation else '; on the poses fitted: no proof'
+    return {
+        'robot': f'{result.chain.name}, {fitted}',
+        'fitted to': measured,
+        'position error': f'{words.change(figures)}{proof}',
+        '95 % interval': _intervals(result.validation),
+        'with outliers': words.change(judged.figures_of_all) if judged.outliers else '',
+        'corners': corners,
+        'orientation error': '' if corners else turn,
+        'largest error': '' if corners or turn else largest,
+        'judged by': result.validated_by,
+        'valid': valid.removeprefix('valid '),
+    }
 
 
 def _document(found: Identified) -> str:

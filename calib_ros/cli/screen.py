@@ -13,7 +13,7 @@ import shutil
 import sys
 import textwrap
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
@@ -23,6 +23,7 @@ WIDTH = 80  # columns of help and of non-terminals, by convention
 EVERY_S = 2.0
 """Time between two progress lines, doubled each time if they stay, as in a log. A convention."""
 FIRST_S = EVERY_S / 4.0  # time before a bar appears on a terminal
+STATES = {'good': True, 'bad': False}  # of verdicts; others are neither
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 
@@ -55,22 +56,23 @@ class Screen:
         else:
             console.print(_rich_text(text, STYLES[good]))
 
-    def table(self, rows: Sequence[tuple[str, str]]) -> None:
-        """Print a table of names and values."""
+    def table(self, rows: Mapping[str, str]) -> None:
+        """Print a table of names and values, without empty ones."""
         if self.quiet:
             return
+        rows = {name: value for name, value in rows.items() if value}
         console = _console(sys.stdout)
         if console is not None:
             from rich.box import ROUNDED
             from rich.table import Table
 
             shown = Table(box=ROUNDED, show_header=False, border_style='dim')
-            for name, value in rows:
+            for name, value in rows.items():
                 shown.add_row(_rich_text(name, 'bold'), _rich_text(value))
             console.print(shown)
             return
-        width = max(len(name) for name, _ in rows) + 4
-        for name, value in rows:
+        width = max(map(len, rows)) + 4
+        for name, value in rows.items():
             _print(value, f'  {name}'.ljust(width))
 
     def bullet(self, text: str, steps: Sequence[str] = ()) -> None:

@@ -11,7 +11,7 @@ from dataclasses import replace
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, given
 from calib_ros.cli.kinds import refuse_others
-from calib_ros.cli.screen import Screen
+from calib_ros.cli.screen import STATES, Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
@@ -25,6 +25,7 @@ from calib_ros.report.documents import verification_document
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, likely, remarks, standing, verification_report
+from calib_ros.report.words import change
 from calib_ros.sampling.gathered import gathered
 from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
@@ -83,24 +84,23 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
 def show(found: Verification, screen: Screen) -> None:
     """Print a verdict, six rows, the poses if few, and what to do."""
     before, after = found.comparison.figures
-    orientation, tolerance = 'not measured', 'none given (--tolerance MM)'
-    if before.rms_mrad is not None and after.rms_mrad is not None:
-        orientation = f'RMS {before.rms_mrad:.3f} -> {after.rms_mrad:.3f} mrad'
+    tolerance = 'none given (--tolerance MM)'
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
     elif found.limit is not None:
         tolerance += f': {rounded(1e3 * found.limit)} mm, {ALIKE:g} x former error'
     state, steps = standing(found)
-    screen.title(state.heading, {'good': True, 'bad': False}.get(state.state))
-    rows = {
-        'measured': f'{after.count:,} times at {found.configurations:,} poses',
-        'position error': f'RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm',
-        'largest': f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm',
-        'orientation error': orientation,
-        'poses like these': f'RMS {likely(found)}',
-        'tolerance': tolerance,
-    }
-    screen.table(tuple(rows.items()))
+    screen.title(state.heading, STATES.get(state.state))
+    screen.table(
+        {
+            'measured': f'{after.count:,} times at {found.configurations:,} poses',
+            'position error': change((before, after)),
+            'largest': f'{rounded(before.max_mm)} -> {rounded(after.max_mm)} mm',
+            'orientation error': change((before, after), 'mrad') or 'not measured',
+            'poses like these': f'RMS {likely(found)}',
+            'tolerance': tolerance,
+        }
+    )
     if found.each:
         screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
     for remark in remarks(found):

@@ -68,15 +68,15 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
 
 
 def _show(survey: Survey, screen: Screen) -> None:
-    rows = [('position error', f'at {len(survey.joints):,} random poses of the joint range')]
+    rows = {'position error': f'at {len(survey.joints):,} random poses of the joint range'}
     for label, errors in survey.parts.items():
         s = Spread.of(1e3 * errors)
         rms, most, largest = map(rounded, (s.rms, s.percentile_95, s.max))
         figures = f'RMS {rms}, 95 % below {most}, largest {largest} mm'
-        rows.append((label.removesuffix(' by the calibration'), figures))
+        rows[label.removesuffix(' by the calibration')] = figures
     found = regions(survey.positions, survey.removed)
     for label, sector in (('removes most', found[0]), ('removes least', found[-1])):
-        rows.append((label, f'{sector.words}: RMS {rounded(1e3 * sector.rms)} mm'))
+        rows[label] = f'{sector.words}: RMS {rounded(1e3 * sector.rms)} mm'
     screen.table(rows)
 
 

@@ -50,6 +50,8 @@ def identification_report(
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
     reasons = reasons_of(result)
+    text = filter(None, _text(result, reasons, tolerance))
+    gain = sections.gain(judged) if result.accepted else ''
     limits = interval_of(judged, 1)
     corrected, notes = 'none: not accepted', words.remarks(result)
     if result.accepted:
@@ -58,7 +60,7 @@ def identification_report(
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
-        verdict=_verdict(result, reasons, tolerance),
+        verdict=replace(standing(result, reasons, tolerance), text=tuple(text), gain=gain),
         advice=reasons,
         accuracy=sections.accuracy_section(
             'Accuracy before and after' if result.accepted else 'Accuracy of the correction tried',
@@ -90,26 +92,35 @@ def identification_report(
     )
 
 
-def _verdict(
+def standing(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> Verdict:
-    if not result.accepted:
-        return _refused(reasons)
-    how = 'Each pose is judged by a fit without it; 95 % interval in brackets.'
-    how += ' The whole interval must be within the tolerance.' * (tolerance is not None)
-    where = f'The calibration is {result.region.in_words()}.' if result.region else ''
-    text = tuple(filter(None, (how, *doubts(result), where, f'{NOT_YET}.')))
-    judged = result.validation or result.fitted
-    within = within_tolerance(judged, tolerance)
-    heading = f'Accepted{somewhere(result)}{within}'
-    open_yet = 'not' in within or bool(result.remarks)
-    return Verdict('open' if open_yet else 'good', heading, text, sections.gain(judged))
+    """Return the verdict as a reader sees it first: an arm without visible errors is not bad."""
+    if result.accepted:
+        within = _within(result.validation or result.fitted, tolerance)
+        open_yet = 'not' in within or bool(result.remarks)
+        whole = result.region is None or result.region.whole
+        heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
+        return Verdict('open' if open_yet else 'good', heading)
+    if reasons[0].heading == GOOD_ARM.heading:
+        return Verdict('info', 'Not accepted, nothing to correct: the robot stays as it was')
+    return Verdict('bad', 'Not accepted: the robot stays as it was')
 
 
-def somewhere(result: Identification) -> str:
-    """Return the region of an accepted calibration; empty for everywhere."""
-    whole = result.region is None or result.region.whole
-    return '' if whole else ' near the measured poses'
+def _text(
+    result: Identification, reasons: Sequence[Advice], tolerance: float | None
+) -> Iterator[str]:
+    """Yield what is said below the verdict."""
+    if result.accepted:
+        how = 'Each pose is judged by a fit without it; 95 % interval in brackets.'
+        yield how + ' The whole interval must be within the tolerance.' * (tolerance is not None)
+        yield from doubts(result)
+        yield f'The calibration is {result.region.in_words()}.' if result.region else ''
+        yield f'{NOT_YET}.'
+        return
+    if reasons[0].heading != GOOD_ARM.heading:
+        yield f'Why: {". ".join(each.in_short for each in reasons if each.steps)}.'
+    yield 'No correction was saved or sent to the robot. The figures show the correction tried.'
 
 
 def doubts(result: Identification) -> tuple[str, ...]:
@@ -118,17 +129,15 @@ def doubts(result: Identification) -> tuple[str, ...]:
     return tuple(f'Check before you use it: {each}{end}' for each, end in ends)
 
 
-def within_tolerance(judged: Comparison, tolerance: float | None, verb: str = '') -> str:
+def _within(judged: Comparison, tolerance: float | None) -> str:
     """Return whether the remaining error is within the tolerance [m], if given."""
     if tolerance is None:
         return ''
     wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
     lower, upper = interval_of(judged, 1)
     if upper <= tolerance:
-        return f' and {verb}{wanted}'
-    if lower > tolerance:
-        return f', but {verb}not {wanted}'
-    return f', but {verb}perhaps not {wanted}'
+        return f' and {wanted}'
+    return f', but {"" if lower > tolerance else "perhaps "}not {wanted}'
 
 
 def reasons_of(result: Identification) -> tuple[Advice, ...]:
@@ -151,16 +160,6 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
     poses = sum(map(distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
     return advice(result.refusals, Situation(poses, noise, sigma, bool(result.verdicts)))
-
-
-def _refused(reasons: Sequence[Advice]) -> Verdict:
-    """Return the verdict of a refusal: an arm without visible errors is not a bad one."""
-    tried = 'No correction was saved or sent to the robot. The figures show the correction tried.'
-    if reasons[0].heading == GOOD_ARM.heading:
-        heading = 'Not accepted, nothing to correct: the robot stays as it was'
-        return Verdict('info', heading, (tried,))
-    whys = '. '.join(each.in_short for each in reasons if each.steps)
-    return Verdict('bad', 'Not accepted: the robot stays as it was', (f'Why: {whys}.', tried))
 
 
 def _steps(

@@ -11,7 +11,7 @@ import numpy as np
 from calib_ros.apply.confidence import interval_of
 from calib_ros.apply.verification import Verdict
 from calib_ros.decision.changes import FALSE, changes_in_words
-from calib_ros.decision.comparison import Comparison
+from calib_ros.decision.comparison import Comparison, ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CONFIDENT
@@ -42,13 +42,13 @@ def summary(
     `numbers` of outlier samples name these; `warnings` are of the measurements; `first` is what to
     do first about a refusal.
     """
-    before, after = (result.validation or result.fitted).figures
-    text = f'{measured(result)}, RMS {rounded(before.rms_mm)} -> {rounded(after.rms_mm)} mm ('
+    figures = (result.validation or result.fitted).figures
+    text = f'{measured(result)}, {change(figures)} ('
     if likely := between(result.validation, 1):
         text += f'95 %: {likely} mm; '
     text += f'by {result.validated_by})'
-    if before.rms_px is not None and after.rms_px is not None:
-        text += f', {before.rms_px:.3f} -> {after.rms_px:.3f} px'
+    if pixels := change(figures, 'px'):
+        text += f', {pixels}'
     if count := len(result.outliers):
         where = ', see the report' if numbers is None else f': {_named(result.outliers, numbers)}'
         text += '; 1 outlier carries' if count == 1 else f'; {count} outliers carry'
@@ -64,6 +64,12 @@ def summary(
         return f'accepted: {text}'
     todo = f'To do first: {first} ' if first else ''
     return f'NOT accepted, nothing is published: {"; ".join(result.refusals)}. {todo}{text}'
+
+
+def change(figures: Sequence[ErrorFigures], unit: str = 'mm') -> str:
+    """Return the RMS errors before and after in mm, mrad or px; empty if not measured."""
+    found = [getattr(each, f'rms_{unit}') for each in figures]
+    return '' if None in found else f'RMS {" -> ".join(map(rounded, found))} {unit}'
 
 
 def between(judged: Comparison | None, when: int) -> str:

@@ -166,7 +166,7 @@ def test_a_simulated_arm_has_the_backlash_of_its_chain(run, tmp_path):
 def test_demo_shows_the_whole_way(run, tmp_path):
     status, out, err = run('demo', '--poses', 20, '--out', tmp_path / 'demo')
     assert (status, err) == (0, '')
-    assert 'accepted' in out
+    assert 'Accepted' in out
     assert 'elbow_joint.theta' in out
     there = {path.name for path in (tmp_path / 'demo').iterdir()}
     assert there == {*RESULT_FILES, 'bag', 'bag_truth.yaml'}
@@ -189,7 +189,7 @@ def test_a_calibration_that_is_not_accepted_keeps_the_earlier_one_aside(run, wri
     arguments = ('identify', '--csv', worse, '--chain', 'ur5e', '--out', out, '--force')
     status, said, _ = run(*arguments)
     assert status == Status.NOT_ACCEPTED == 3
-    assert 'NOT accepted' in said
+    assert 'Not accepted' in said
     assert (out / 'calibration.previous.yaml').read_bytes() == accepted
     assert contents(out).keys() == {*RESULT_FILES, 'calibration.previous.yaml'} - {
         'calibration.yaml'
@@ -297,7 +297,7 @@ def test_what_each_device_measures_again_is_judged_in_its_own_frame(of_two, run,
         found['lower_mm'] < found['rms_mm'] < found['upper_mm'] < 0.3 < found['before']['rms_mm']
     )
     status, out, _ = run('identify', *judged, '--previous', of_two)
-    assert (status, out[:8]) == (0, 'accepted')
+    assert (status, out[:8]) == (0, 'Accepted')
 
 
 def test_json_of_a_verdict_alone_is_printed_and_has_no_infinity(of_two, run, tmp_path):

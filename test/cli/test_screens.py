@@ -275,7 +275,7 @@ def test_quiet_says_nothing_but_what_is_asked_for(shown):
     assert shown('identify', 'measured.csv', *UR5E, '--quiet', '--json')[1].startswith('{')
     status, text = shown('identify', 'good_arm.csv', *UR5E, '--quiet')
     assert (status, text.count('\n')) == (3, 2)
-    assert text.startswith('calib_ros: NOT accepted, ')
+    assert text.startswith('calib_ros: Not accepted, ')
     assert '\ncalib_ros: There is nothing to correct that this device could see: ' in text
     assert ' -> To look for smaller errors, ' in text
 
