@@ -258,7 +258,7 @@ who does the work
   --workers N=0  local processes; 0: one per core
   --memory SIZE=2GiB  memory limit of each process
 alarms
-  --years N=100.0  years between false alarms of a robot measured every night
+  --years X=100  years between false alarms of a robot measured every night
 # history fleet._run_history  list results over time
 $ history history/ --robot 0042
 what to list
@@ -366,8 +366,6 @@ def _add_option(group: Group, option: str, text: str) -> None:
     name, _, form = option.partition(' ')
     placeholder, count, default = FORM.findall(form)[0]
     kind = TYPES.get(placeholder, str)
-    if kind is int and '.' in default:
-        kind = float
     given: dict[str, Any] = {'required': True} if name.endswith('!') else {}
     if not form:
         given['action'] = 'store_true'
@@ -383,6 +381,7 @@ def _add_option(group: Group, option: str, text: str) -> None:
     if '=' in form:
         values = [kind(each) for each in default.split(',')]
         given['default'] = values if 'nargs' in given else values[0]
+    text += f' (default: {default.replace(",", " ")})' if default else ''
     action = group.add_argument(name.rstrip('!'), help=text, **given)
     if name.startswith('--chain'):
         action.completer = complete_robots  # type: ignore[attr-defined]

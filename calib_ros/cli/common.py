@@ -82,7 +82,10 @@ def add_settings(parser: argparse.ArgumentParser, names: Sequence[str] = ()) -> 
 def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
     """Add an option for each field of a dataclass that has a text; None stands for a number."""
     for item in items:
-        many = isinstance(item.default, tuple)
+        many, text = isinstance(item.default, tuple), item.metadata['text']
+        if item.default not in ((), '', None):
+            shown = f'{item.default:.4g}' if isinstance(item.default, float) else item.default
+            text += f' (default: {shown})'
         kind = str if many else float if item.default is None else type(item.default)
         group.add_argument(
             f'--{item.name.replace("_", "-")}',
@@ -90,7 +93,7 @@ def add_fields(group: Group, items: Iterable[Field[Any]]) -> None:
             action='append' if many else 'store',
             default=[] if many else item.default,
             metavar='NAME,...' if many else {float: 'X', int: 'N'}.get(kind, 'NAME'),
-            help=item.metadata['text'],
+            help=text,
         )
 
 

@@ -19,9 +19,10 @@ import shlex
 import signal
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from itertools import groupby
-from typing import Any, NoReturn
+from typing import NoReturn
 
 # matrices are small: a second BLAS thread costs more than it gives, especially on a busy cell
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -67,10 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed('interrupted: no half-written file remains', 130)
     except MemoryError:
         return _failed('out of memory: give less data, or close other programs')
-    except OSError as err:
+    except (CalibrationError, OSError) as err:
         return _failed(trouble(err))
-    except CalibrationError as err:
-        return _failed(str(err))
     return status
 
 
@@ -154,9 +153,12 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         added = names.add_parser(
             name,
             add_help=False,
+            usage=_usage(name, command.options),
             description=textwrap.fill(f'{text[0].upper()}{text[1:]}.', help_width()),
             epilog='\n'.join(['examples:', *map(_example, command.examples)]),
-            formatter_class=_Help,
+            formatter_class=partial(
+                argparse.RawDescriptionHelpFormatter, max_help_position=26, width=help_width()
+            ),
         )
         added.example = _example(command.examples[0])
         added.typed = given
@@ -176,42 +178,18 @@ def _example(words: str) -> str:
     return ('  ' + ' \\\n      '.join(parts)).replace('\xa0', ' ')
 
 
-class _Help(argparse.RawDescriptionHelpFormatter):
-    """Help in 80 columns with defaults."""
-
-    def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=26, width=help_width())
-
-    def add_usage(
-        self, usage: Any, actions: Iterable[argparse.Action], groups: Any, prefix: Any = None
-    ) -> None:
-        """Show what is required; the rest are options."""
-        words = ['usage:', self._prog]
-        for each in actions:
-            name = self._metavar(each)
-            if not each.option_strings:
-                words.append(f'[{name}]' if each.nargs == '?' else name)
-            elif each.required:
-                words.append(f'{each.option_strings[-1]} {name}')
-        words.append('[options]')
-        text = textwrap.fill(' '.join(words), help_width(), subsequent_indent='    ')
-        self._add_item(lambda: f'{text}\n\n', [])
-
-    def _metavar(self, action: argparse.Action) -> str:
-        if isinstance(action.metavar, tuple):
-            return ' '.join(action.metavar)
-        return action.metavar or '|'.join(map(str, action.choices or [action.dest.upper()]))
-
-    def _get_help_string(self, action: argparse.Action) -> str:
-        text, default = action.help or '', action.default
-        if default is None or default is False or not action.option_strings:
-            return text
-        if isinstance(default, (list, tuple)):
-            default = ' '.join(f'{each:g}' for each in default)
-        elif isinstance(default, float):
-            default = f'{default:.4g}'
-        shown = default not in ('', argparse.SUPPRESS)
-        return f'{text} (default: {default})' if shown else text
+def _usage(name: str, options: Sequence[str]) -> str:
+    """Return what is required; the rest are options."""
+    words = [f'usage: calib_ros {name}']
+    for line in (each[2:] for each in options if each.startswith('  ')):
+        option, _, form = line.partition('  ')[0].partition(' ')
+        placeholder = form.rstrip('?')
+        if option.endswith('!'):
+            words.append(f'{option[:-1]} {placeholder}')
+        elif placeholder and not option.startswith('--'):
+            words.append(placeholder if placeholder == form else f'[{placeholder}]')
+    text = ' '.join([*words, '[options]'])
+    return textwrap.fill(text, help_width(), subsequent_indent='    ').removeprefix('usage: ')
 
 
 def _overview() -> str:
