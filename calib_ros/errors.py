@@ -107,7 +107,9 @@ def unreadable(path: Path, err: OSError, what: str = '') -> str:
     return f'{text}: {hint}' if hint else text
 
 
-def trouble(err: OSError) -> str:
-    """Return the file the system refused, why, and what to do if known."""
+def trouble(err: Exception) -> str:
+    """Return what an error says; of the system's the file, why, and what to do if known."""
+    if not isinstance(err, OSError):
+        return str(err)
     why = _ADVICE.get(err.errno or 0) or err.strerror or str(err)
     return f'{err.filename}: {why}' if err.filename else why

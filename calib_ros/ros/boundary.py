@@ -67,9 +67,7 @@ class Boundary:
         """Run the work of a service; an error becomes its answer and is logged."""
         try:
             success, text = work()
-        except CalibrationError as err:
-            success, text = False, str(err)
-        except OSError as err:
+        except (CalibrationError, OSError) as err:
             success, text = False, trouble(err)
         except Exception as err:
             self._log()
@@ -183,10 +181,7 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
         _spin(node, executor, stop)
     except (ExternalShutdownException, KeyboardInterrupt):
         pass
-    except (CalibrationError, ParameterException, rclpy_implementation.RCLError) as err:
-        print(f'calibration_node: {err}', file=sys.stderr)
-        status = 1
-    except OSError as err:  # such as a journal of another user
+    except (CalibrationError, OSError, ParameterException, rclpy_implementation.RCLError) as err:
         print(f'calibration_node: {trouble(err)}', file=sys.stderr)
         status = 1
     finally:
