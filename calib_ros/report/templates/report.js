@@ -113,46 +113,38 @@
   }
   window.calibRos = { frames, state, position: (i) => triple('position', i) };  // for tests
 
+  const GAP = [null, null, null];
+  const xyz = (points) => ({ x: points.map((p) => p[0]), y: points.map((p) => p[1]), z: points.map((p) => p[2]) });
   function arm(i) {
-    const found = frames(i);
-    const line = { x: [], y: [], z: [] };
-    const axes = [0, 1, 2].map(() => ({ x: [], y: [], z: [] }));
-    const size = 0.12 * e.reach;
-    found.forEach((T) => {
-      ['x', 'y', 'z'].forEach((c, r) => {
-        line[c].push(T[r][3]);
-        axes.forEach((axis, k) => axis[c].push(T[r][3], T[r][3] + size * T[r][k], null));
-      });
-    });
-    return [line, axes];
+    const found = frames(i).map((T) => T.slice(0, 3)), size = 0.12 * e.reach;
+    const tip = (T, k) => T.map((row) => row[3] + size * row[k]), origin = (T) => T.map((row) => row[3]);
+    const axes = [0, 1, 2].map((k) => xyz(found.flatMap((T) => [origin(T), tip(T, k), GAP])));
+    return [xyz(found.map(origin)), axes];
   }
 
   function vectors() {
-    const out = { x: [], y: [], z: [] }, s = scale() * 1e-3;
+    const out = [], s = scale() * 1e-3;
     const total = e.cells ? e.cells.count.length : count;
     const step = Math.ceil(total / 4000);
     for (let i = 0; i < total; i += step) {
       const p = e.cells ? e.cells.position[i] : triple('position', i);
       const v = e.cells ? e.cells['mean_' + state.when][i] : triple(state.when, i);
       const drawn = Math.min(s, 0.5 * e.reach / (length(v) || 1));  // a gross error must not hide the arm
-      ['x', 'y', 'z'].forEach((c, k) => out[c].push(p[k], p[k] + drawn * v[k], null));
+      out.push(p, p.map((x, k) => x + drawn * v[k]), GAP);
     }
-    return out;
+    return xyz(out);
   }
   const errors = () => (e.cells ? e.cells['rms_' + state.when] : good.map((i) => lengths[state.when][i]));
   const words = (i) => `${source(i)}: ${fixed(lengths.before[i])} mm before, ${fixed(lengths.after[i])} mm after`;
-  const at = (list) => ({
-    x: list.map((i) => floats.position[3 * i]), y: list.map((i) => floats.position[3 * i + 1]),
-    z: list.map((i) => floats.position[3 * i + 2]),
-  });
+  const at = (list) => xyz(list.map((i) => triple('position', i)));
   const dots = () => (e.cells
-    ? { x: e.cells.position.map((p) => p[0]), y: e.cells.position.map((p) => p[1]), z: e.cells.position.map((p) => p[2]),
+    ? { ...xyz(e.cells.position),
         text: e.cells.count.map((c, i) => `${c} ${e.things}, RMS ${fixed(e.cells.rms_before[i])} mm before, ${fixed(e.cells.rms_after[i])} mm after`) }
     : { ...at(good), text: good.map(words), customdata: good });
   const [POINTS, OUTLIERS, VECTORS, ARM, AXES, PICKED] = [0, 1, 2, 3, 4, 7];
 
   function drawSpace() {
-    const none = { x: [], y: [], z: [] };
+    const none = xyz([]);
     const [line, axes] = count ? arm(state.picked < 0 ? Math.floor(count / 2) : state.picked) : [none, [none, none, none]];
     const wide = { type: 'scatter3d', hoverinfo: 'skip', mode: 'lines', showlegend: false };
     const traces = [
@@ -297,15 +289,15 @@
     }
     return found;
   }
-  const clicks = (id) => byId(id).on('plotly_click', (event) => {
-    const i = event.points[0].customdata;
-    if (i !== undefined) pick(i);
+  const drawTraces = (id, traces, layout) => Plotly.react(id, traces, layout, plain).then(() => {
+    byId(id).removeAllListeners('plotly_click');
+    byId(id).on('plotly_click', ({ points: [{ customdata: i }] }) => { if (i !== undefined) pick(i); });
   });
   function drawSession() {
     const layout = base();
     layout.xaxis = { title: { text: e.things + ' in order' } };
     layout.yaxis = { title: { text: label() }, rangemode: 'tozero' };
-    Plotly.react('session', series(number, 'session', {}), layout, plain).then(() => byId('session').removeAllListeners && (byId('session').removeAllListeners('plotly_click'), clicks('session')));
+    drawTraces('session', series(number, 'session', {}), layout);
   }
   function drawJoints() {
     const columns = narrow() ? 1 : Math.min(3, n), rows = Math.ceil(n / columns);
@@ -320,7 +312,7 @@
       series((i) => floats.joints[n * i + k] * e.show[k][0], 'joint' + k, { xaxis: 'x' + s, yaxis: 'y' + s })
         .forEach((trace) => traces.push({ ...trace, showlegend: k === 0 && trace.showlegend !== false }));
     }
-    Plotly.react('joints', traces, layout, plain).then(() => { byId('joints').removeAllListeners('plotly_click'); clicks('joints'); });
+    drawTraces('joints', traces, layout);
   }
 
   later('space', () => {
@@ -333,8 +325,7 @@
     each.addEventListener('change', () => { state.when = each.value; update(); });
   }
   byId('scale').addEventListener('input', update);
-  byId('sort').addEventListener('change', () => { arrange(); list(); });
-  byId('only').addEventListener('change', () => { arrange(); list(); });
+  for (const id of ['sort', 'only']) byId(id).addEventListener('change', () => { arrange(); list(); });
   byId('previous').addEventListener('click', () => { state.page -= 1; list(); });
   byId('next').addEventListener('click', () => { state.page += 1; list(); });
   byId('component').addEventListener('change', (event) => {
