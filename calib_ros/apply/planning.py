@@ -152,11 +152,10 @@ class _Worth:
     ) -> None:
         if criterion not in CRITERIA:
             raise UnknownNameError('criterion', criterion, CRITERIA)
-        if criterion == 'task' and task is None:
-            raise ConfigError('the criterion "task" needs the poses of a task')
-        self._criterion, self._factor = criterion, space.factor
-        self._wanted = None
-        if criterion == 'task' and task is not None:
+        self._criterion, self._factor, self._wanted = criterion, space.factor, None
+        if criterion == 'task':
+            if task is None:
+                raise ConfigError('the criterion "task" needs the poses of a task')
             self._wanted = space.of_task(task)
 
     def of(self, information: FloatArray, rows: FloatArray) -> FloatArray:

@@ -32,15 +32,13 @@ class Survey(Shown):
     """Errors at `joints` (N, n) [rad or m] over the workspace.
 
     `positions` (N, 3) [m] are those of the target in the arm's base frame. The calibration removes
-    `removed` (N,) [m] and `turned` (N,) [rad]; `sigma` (N,) [m] is the standard deviation of the
-    position by the parameters, `remaining` (N,) [m] the expected remaining error, both NaN if
-    unknown.
+    `removed` (N,) [m]; `sigma` (N,) [m] is the standard deviation of the position by the
+    parameters, `remaining` (N,) [m] the expected remaining error, both NaN if unknown.
     """
 
     joints: FloatArray
     positions: FloatArray
     removed: FloatArray
-    turned: FloatArray
     sigma: FloatArray
     remaining: FloatArray
 
@@ -61,9 +59,8 @@ class Survey(Shown):
 def survey(arm: Calibration, count: int, rng: np.random.Generator) -> Survey:
     """Survey the errors at random configurations within the joint limits."""
     joints = arm.chain.random_joints(count, rng)
-    removed, turned = arm.removed(joints)
-    positions, sigma = in_base(arm.chain, joints)[:, :3, 3], arm.sigma(joints)
-    return Survey(joints, positions, removed, turned, sigma, arm.remaining(joints))
+    positions, (removed, _) = in_base(arm.chain, joints)[:, :3, 3], arm.removed(joints)
+    return Survey(joints, positions, removed, arm.sigma(joints), arm.remaining(joints))
 
 
 def in_base(chain: Chain, joints: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -193,19 +193,16 @@ def counts(found: Sequence[Standing]) -> dict[str, int]:
 
 def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
     """Return metrics in the text format of Prometheus; `ended` is the time of the run [s]."""
-
-    def by_robot(value: Callable[[Standing, Row], float | None]) -> dict[str, float | None]:
-        labels = (each.robot.serial.translate(ESCAPES) for each in found)
-        values = (value(each, each.last) if each.last else None for each in found)
-        return {f'{{serial="{label}"}}': x for label, x in zip(labels, values, strict=True)}
-
-    def changed(one: Standing, _: Row) -> float | None:
-        return one.watched.changes[-1].time.timestamp() if one.watched.changes else None
-
     states = {f'{{state="{state}"}}': number for state, number in counts(found).items()}
     unread = sum(len(each.errors) for each in found)
-    rms, measured = by_robot(lambda _, row: row.rms_mm), by_robot(lambda _, r: r.time.timestamp())
-    since, changes = by_robot(changed), 'First night after the last change of the arm.'
+    rms, measured, since = {}, {}, {}
+    for each in found:
+        label = f'{{serial="{each.robot.serial.translate(ESCAPES)}"}}'
+        if each.last is not None:
+            rms[label], measured[label] = each.last.rms_mm, each.last.time.timestamp()
+        for change in each.watched.changes[-1:]:
+            since[label] = change.time.timestamp()
+    changes = 'First night after the last change of the arm.'
     tables: tuple[tuple[str, str, Mapping[str, float | None]], ...] = (
         ('fleet_robots', 'Robots by state.', states),
         ('fleet_unreadable_inputs', 'Inputs that could not be used.', {'': unread}),

@@ -99,13 +99,11 @@ def configuration_yaml(chain: str, settings: Settings, **more: str) -> str:
 
 def verification_document(found: Verification) -> dict[str, Any]:
     """Return a verdict and its figures as plain values."""
-    of_poses_like_these = 'rms', 'lower', 'upper'
-    names = ('tolerance', 'limit', *of_poses_like_these)
-    lengths = {name: getattr(found, name) for name in names}
-    known = {name: 1e3 * m for name, m in lengths.items() if m is not None and math.isfinite(m)}
+    names = ('tolerance', 'limit', 'rms', 'lower', 'upper')  # the last three of poses like these
+    lengths = {f'{name}_mm': getattr(found, name) for name in names}
     return {
         'verdict': found.verdict,
-        **{f'{name}_mm': known.get(name) for name in lengths},
+        **{k: 1e3 * m if m is not None and m < math.inf else None for k, m in lengths.items()},
         'confidence': found.confidence,
         'poses': found.configurations,
         'poses_needed': found.needed,

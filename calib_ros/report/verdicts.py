@@ -158,10 +158,8 @@ def verification_report(
     chain: Chain, found: Verification, poses: Poses, origin: Origin, warnings: Sequence[str] = ()
 ) -> Report:
     """Return the report of a verification of a calibrated chain."""
-    between = interval_mm(1e3 * found.lower, 1e3 * found.upper)
     text = [
-        'The RMS position error over poses like these, each counted once, is '
-        f'{rounded(1e3 * found.rms)} mm ({100.0 * found.confidence:g} % interval: {between} mm).'
+        f'The RMS position error over poses like these, each counted once, is {likely(found)}.'
     ]
     if found.fitted:
         text.append('The interval allows for the refitted frames.')

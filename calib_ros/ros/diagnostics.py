@@ -44,13 +44,9 @@ class Diagnostics:
         tried = self._boundary.tried
         tried('the rates', self._inputs.look)
         account = tried('the account', self._session.account)
-        level, words = DiagnosticStatus.OK, ''
-        figures: dict[str, Any] = {}
-        if account is not None:
-            judged = tried('judging', lambda: self._judged(account))
-            level, words = judged or (level, words)
-            figures = tried('the figures', lambda: {**self._figures(account), **answers()})
-        figures = figures or {}
+        judged = account and tried('judging', lambda: self._judged(account))
+        found = account and tried('the figures', lambda: {**self._figures(account), **answers()})
+        level, words = judged or (DiagnosticStatus.OK, '')
         if failed := self._boundary.failed:
             level = DiagnosticStatus.ERROR
             words = ''.join(f'{text}; ' for text in failed.values()) + words
@@ -60,7 +56,7 @@ class Diagnostics:
             hardware_id=self._serial,
             level=level,
             message=f'{words}{status}',
-            values=[KeyValue(key=key, value=str(value)) for key, value in figures.items()],
+            values=[KeyValue(key=key, value=str(value)) for key, value in (found or {}).items()],
         )
         message = DiagnosticArray(status=[line])
         message.header.stamp = self._node.get_clock().now().to_msg()

@@ -29,7 +29,6 @@ def test_what_is_removed_is_what_the_nominal_arm_misses(cell, arm):
     assert found.removed.mean() > 1e-3
     assert np.abs(found.removed - missed).max() < 3e-4  # a few sigma
     turn = arm.removed(found.joints)[1]
-    np.testing.assert_array_equal(turn, found.turned)
     assert 5e-4 < turn.mean() < 5e-3
 
 
