@@ -130,18 +130,15 @@ TILTED = range(len(CORNERS) // 2)
 """Corners of the plane x = z of the cube, in order around it."""
 
 
-@dataclass(frozen=True, eq=False)
-class TestPoses:
+class IsoPoses(NamedTuple):
     """Joint values (5, n) [rad or m] of the test poses P1 to P5, and the edge [m] of the cube.
 
     All have one orientation if `oriented`.
     """
 
-    __test__ = False  # no test class
-
     joints: FloatArray
     edge: float
-    oriented: bool = True
+    oriented: bool
 
 
 class _Cubes(NamedTuple):
@@ -157,7 +154,7 @@ class _Cubes(NamedTuple):
 
 def iso_9283_poses(
     design: Design, rng: np.random.Generator, visibility: Visibility | None = None
-) -> TestPoses:
+) -> IsoPoses:
     """Return five poses to verify an arm in the largest cube found (ISO 9283:1998, 6.10.2).
 
     The arm reaches the cube and the device sees it, beside the z axis of the base; its edges are
@@ -196,7 +193,7 @@ def iso_9283_poses(
         )
     best = np.where(lost, np.inf, np.abs(away).max(axis=(1, 2))).argmin()
     joints = np.concatenate([cubes.middle[[best]], found.joints.reshape(size)[best]])
-    return TestPoses(joints, edge, part == slice(6))
+    return IsoPoses(joints, edge, part == slice(6))
 
 
 def _at(

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -58,8 +58,7 @@ NEEDED = 1 + len(TILTED)
 DECIDING = 10 * MOST_ENTRIES  # largest number of configurations reported as deciding
 
 
-@dataclass(frozen=True)
-class Attained:
+class Attained(NamedTuple):
     """Accuracy before and after [mm] and repeatability [mm] of a configuration (ISO 9283)."""
 
     cycles: int

@@ -68,22 +68,11 @@ def in_base(chain: Chain, joints: FloatArray) -> FloatArray:
     return se3.invert(chain.frame('base').matrix) @ chain.forward(joints)
 
 
-@dataclass(frozen=True)
-class Spread:
-    """RMS, mean, percentiles and maximum of an error [m]."""
-
-    rms: float
-    mean: float
-    median: float
-    percentile_95: float
-    max: float
-
-    @classmethod
-    def of(cls, errors: FloatArray) -> Spread:
-        """Return the figures of errors (N,)."""
-        median, high = np.quantile(errors, [0.5, 0.95])
-        found = (np.sqrt(np.mean(errors**2)), errors.mean(), median, high, errors.max())
-        return cls(*map(float, found))
+def spread(errors: FloatArray) -> dict[str, float]:
+    """Return figures of errors (N,) by name."""
+    rms, (median, high) = np.sqrt(np.mean(errors**2)), np.quantile(errors, [0.5, 0.95])
+    found = map(float, (rms, errors.mean(), median, high, errors.max()))
+    return dict(zip(('RMS', 'mean', 'median', '95 % below', 'max'), found, strict=True))
 
 
 @dataclass(frozen=True)

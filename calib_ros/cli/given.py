@@ -5,10 +5,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeAlias
 
 from calib_ros.cli.common import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.kinds import refuse_others
@@ -39,18 +39,14 @@ from calib_ros.settings import Settings
 WRITTEN = 'give the folder written by identify --out'
 
 
-class Unread(NamedTuple):
-    """What is to be read, measurements first; without files if any comes through a pipe."""
+Unread: TypeAlias = dict[Path, list[tuple[str, int, int]]]
+"""Paths to read, measurements first, with their files: sizes [bytes] and times of change [ns]."""
 
-    paths: tuple[Path, ...]
-    files: tuple[tuple[str, int, int], ...]  # with sizes [bytes] and times of change [ns]
 
-    @classmethod
-    def of(cls, *paths: Path) -> Unread:
-        """Return the files at some paths as they are now."""
-        each = [files_of(path) for path in paths]
-        found = ((str(file), file.stat()) for files in each if all(each) for file in files)
-        return cls(paths, tuple((name, now.st_size, now.st_mtime_ns) for name, now in found))
+def _files(paths: Iterable[Path]) -> Unread:
+    """Return the files at some paths as they are now; those of a pipe are none."""
+    now = {path: [(str(file), file.stat()) for file in files_of(path)] for path in paths}
+    return {path: [(f, s.st_size, s.st_mtime_ns) for f, s in each] for path, each in now.items()}
 
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
@@ -75,7 +71,7 @@ def history_of(options: argparse.Namespace) -> tuple[History, Unread] | None:
         raise InputError('--history files results by serial number: add --serial')
     values = map(vars(options).get, ('csv', 'detections', 'measured', *OF_TABLES))
     paths = dict.fromkeys(value for value in values if isinstance(value, Path))
-    return History(options.history), Unread.of(*paths)
+    return History(options.history), _files(paths)
 
 
 def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Calibration:
@@ -101,10 +97,10 @@ def filing_of(
     *judged_by: object,
 ) -> Filing:
     """Return what is filed with a result: by its files, or by the samples where these changed."""
-    settings, measured = settings_hash(nominal, settings_of(options), *judged_by), unread.paths[0]
+    settings, (measured, *_) = settings_hash(nominal, settings_of(options), *judged_by), unread
     read, changed = [samples_hash(sets)], None
-    if unread.files and unread == Unread.of(*unread.paths):
-        read = [each.sha256 for each in inputs_of(*unread.paths)]
+    if all(unread.values()) and unread == _files(unread):
+        read = [each.sha256 for each in inputs_of(*unread)]
         changed = datetime.fromtimestamp(measured.stat().st_mtime, timezone.utc)
     for name in (*OF_TABLES[1:], 'joints_preset'):  # a session is told apart anyway
         value = vars(options).get(name)  # the same table in other units is another result

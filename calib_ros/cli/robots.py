@@ -25,7 +25,6 @@ from calib_ros.kinematics.chain_file import (
 
 
 def _robots(options: argparse.Namespace, screen: Screen) -> int:
-    del options
     lines = [f'{"--chain":21}{"joints":>6}  {"DH table":10}{"length":>8}']
     for name in shipped_robots():
         chain = load_chain(name)

@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 from calib_ros.apply import workspace
-from calib_ros.apply.workspace import Spread, Survey, in_base, regions, task_of
+from calib_ros.apply.workspace import Survey, in_base, regions, task_of
 from calib_ros.cli import common, given
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -70,8 +70,7 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
 def _show(survey: Survey, screen: Screen) -> None:
     rows = {'position error': f'at {len(survey.joints):,} random poses of the joint range'}
     for label, errors in survey.parts.items():
-        s = Spread.of(1e3 * errors)
-        rms, most, largest = map(rounded, (s.rms, s.percentile_95, s.max))
+        rms, _, _, most, largest = map(rounded, workspace.spread(1e3 * errors).values())
         figures = f'RMS {rms}, 95 % below {most}, largest {largest} mm'
         rows[label.removesuffix(' by the calibration')] = figures
     found = regions(survey.positions, survey.removed)

@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import Placements, Sector, Spread, Survey, in_base, regions
+from calib_ros.apply.workspace import Placements, Sector, Survey, in_base, regions, spread
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
@@ -28,7 +28,7 @@ def workspace_report(
     arm: Calibration, found: Survey, origin: Origin, placed: Placements | None = None
 ) -> Report:
     """Return the report of a survey, and of the placements of a task, if any."""
-    spreads = [(label, Spread.of(1e3 * errors)) for label, errors in found.parts.items()]
+    spreads = [(label, spread(1e3 * errors)) for label, errors in found.parts.items()]
     first, last = spreads[0][1], spreads[-1][1]
     text = [f'The calibration removes {_sizes(first)} over random poses of the joint range.']
     rest = 'The remaining error is unknown: the file has no uncertainties.'
@@ -48,8 +48,8 @@ def workspace_report(
             'accuracy',
             'Position errors [mm]',
             (f'At {len(found.joints):,} random poses of the joint range.', rest),
-            head=('', 'RMS', 'mean', 'median', '95 % below', 'max'),
-            rows=tuple((label, *map(rounded, astuple(s))) for label, s in spreads),
+            head=('', *first),
+            rows=tuple((label, *map(rounded, each.values())) for label, each in spreads),
         ),
         steps=(
             *((BEYOND,) if arm.region is not None and not arm.region.whole else ()),
@@ -61,8 +61,8 @@ def workspace_report(
     )
 
 
-def _sizes(errors: Spread) -> str:
-    return f'{rounded(errors.rms)} mm RMS (at most {rounded(errors.max)} mm)'
+def _sizes(errors: dict[str, float]) -> str:
+    return f'{rounded(errors["RMS"])} mm RMS (at most {rounded(errors["max"])} mm)'
 
 
 def _worst(found: Survey) -> Iterator[Section]:

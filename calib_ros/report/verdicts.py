@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 from calib_ros.apply.verification import DECIDING, Verification
 from calib_ros.estimation.levels import ALIKE, NEARER
@@ -224,6 +224,6 @@ def _by_configuration(found: Verification) -> Section:
         head=('pose', 'cycles', *names),
         rows=tuple(
             (f'P{k}', str(cycles), *('' if x is None else rounded(x) for x in values))
-            for k, (cycles, *values) in enumerate(map(astuple, found.each), 1)
+            for k, (cycles, *values) in enumerate(found.each, 1)
         ),
     )

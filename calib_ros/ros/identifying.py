@@ -14,8 +14,6 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from visualization_msgs.msg import MarkerArray
 
-from calib_ros.apply.verification import Verdict
-from calib_ros.decision.comparison import ErrorFigures
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
@@ -35,14 +33,12 @@ from calib_ros.files.rows import (
     Row,
     identified,
     inputs_of,
-    judged,
     measured_at,
     samples_hash,
     settings_hash,
 )
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.progress import Progress
 from calib_ros.report import words
 from calib_ros.report.reports import reasons_of
@@ -68,36 +64,20 @@ class Filer:
         if place and not serial:
             raise ConfigError('a history needs the serial number of the robot: set serial as well')
 
-    def identified(self, problem: Problem, result: Identification, settings: Settings) -> str:
-        """File an identification; return why that was not possible, or empty text."""
-        return self._file(lambda: identified(result, self._about(problem, settings)))
-
-    def validated(
+    def file(
         self,
-        session: CalibrationSession,
-        figures: tuple[ErrorFigures, ErrorFigures],
-        verdict: Verdict,
+        problem: Callable[[], Problem],
+        settings: Settings,
+        row: Callable[[Filing], Row],
+        *judged: str,
     ) -> str:
-        """File the validation of a session's calibration, as `identified`."""
-        calibration = session.calibration
-        assert calibration is not None  # required for the figures
-        chain = calibration.chain
-
-        def row() -> Row:
-            about = self._about(session.problem(), session.settings, table_hash(chain))
-            return judged(chain, *figures, verdict, about)
-
-        return self._file(row)
-
-    def _about(self, problem: Problem, settings: Settings, *more: str) -> Filing:
-        sets = problem.all_sets
-        hashed = settings_hash(self._nominal, settings, *more)
-        return Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
-
-    def _file(self, row: Callable[[], Row]) -> str:
+        """File the row of a result; return why that was not possible, or empty text."""
         try:
             if self._history is not None:
-                self._history.file(row())
+                sets = problem().all_sets
+                hashed = settings_hash(self._nominal, settings, *judged)
+                about = Filing(self.serial, measured_at(sets), samples_hash(sets), hashed)
+                self._history.file(row(about))
         except (CalibrationError, OSError) as err:
             return f'{NOT_FILED} in the history: {err}'
         return ''
@@ -216,7 +196,9 @@ class Identifying:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
-        self.last += self._filer.identified(loaded.problem, result, settings)
+        self.last += self._filer.file(
+            lambda: loaded.problem, settings, partial(identified, result)
+        )
         return result.accepted, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:

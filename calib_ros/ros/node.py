@@ -33,8 +33,10 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.cameras import cameras_of
 from calib_ros.files.programs import read_joints
+from calib_ros.files.rows import judged
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibration import recalibrate, years_since
+from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
@@ -293,11 +295,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return True, f'pose {len(self.session.samples) + 1} removed'
 
     def _on_validate(self, request: Any) -> Answer:
-        found = self.session.validate()
-        calibration = self.session.calibration
-        assert calibration is not None  # required to judge
-        verdict, text = words.verdict(calibration, found, self.session.reused())
-        filed = self._filer.validated(self.session, found.figures, verdict)
+        session, found = self.session, self.session.validate()
+        assert session.calibration is not None  # required to judge
+        verdict, text = words.verdict(session.calibration, found, session.reused())
+        chain = session.calibration.chain
+        row = partial(judged, chain, *found.figures, verdict)
+        filed = self._filer.file(session.problem, session.settings, row, table_hash(chain))
         return verdict == 'holds', text + filed
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:

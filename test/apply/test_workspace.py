@@ -119,11 +119,11 @@ def test_the_worst_region_is_found_and_named(rng):
 
 def test_figures_of_a_spread(rng):
     errors = rng.uniform(0.0, 1.0, 100_000)
-    found = workspace.Spread.of(errors)
-    assert found.rms == pytest.approx(1.0 / np.sqrt(3.0), abs=0.01)
-    assert (found.mean, found.median) == pytest.approx((0.5, 0.5), abs=0.01)
-    assert found.percentile_95 == pytest.approx(0.95, abs=0.01)
-    assert found.max == errors.max()
+    found = workspace.spread(errors)
+    assert found['RMS'] == pytest.approx(1.0 / np.sqrt(3.0), abs=0.01)
+    assert (found['mean'], found['median']) == pytest.approx((0.5, 0.5), abs=0.01)
+    assert found['95 % below'] == pytest.approx(0.95, abs=0.01)
+    assert found['max'] == errors.max()
 
 
 def test_a_map_holds_the_rms_of_each_cell(rng):
