@@ -27,6 +27,7 @@ from calib_ros.estimation.evidence import Mixed, Posterior
 from calib_ros.estimation.joint_errors import NOTHING
 from calib_ros.estimation.levels import KNOWN, UNUSUAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
@@ -188,21 +189,20 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     ends = sets[0].base, sets[0].tool
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
-    judge, count = _Judge(posterior, *ends, freedom), len(posterior.names)
-    measured_rows, drawn_rows = (judge.rows(each) for each in (measured, drawn))
-    near, far = (
-        _sizes(rows[..., :count], posterior.square) for rows in (measured_rows, drawn_rows)
-    )
-    order, limit = np.argsort(far), float(near.max())
-    own, inside = judge.products(measured_rows), far[order] <= limit
-    inner = own + judge.products(drawn_rows[order[inside]])
+    judge = _Judge(posterior, *ends, freedom)
+    rows = judge.rows(np.concatenate([drawn, measured]))
+    sizes = _sizes(rows[: len(posterior.names)], posterior.square)
+    far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())
+    order = np.argsort(far)
+    own, inside = judge.products(rows[..., SOME_POSES:]), far[order] <= limit
+    inner = own + judge.products(rows[..., order[inside]])
     doubts = judge.of_the_arm(posterior.doubted)
     if not max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts)) < RISK:
         return None
     shells = order[~inside]
     for first in range(0, len(shells), SHELL):
         shell = shells[first : first + SHELL]
-        added = judge.products(drawn_rows[shell])
+        added = judge.products(rows[..., shell])
         if not judge.risk(added, inner + added, doubts) < RISK:
             break
         inner, limit = inner + added, float(far[shell[-1]])
@@ -219,9 +219,8 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
 
 
 def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the expected sizes (N,) of rows (N, c, P) times errors of squares (P, P)."""
-    flat = rows.reshape(-1, rows.shape[2])
-    squares = ((flat @ square) * flat).sum(axis=1).reshape(len(rows), -1).sum(axis=1)
+    """Return the expected sizes (N,) of rows (P, c, N) times errors of squares (P, P)."""
+    squares = np.einsum('pcn,pcn->n', np.tensordot(square, rows, 1), rows)
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
@@ -243,16 +242,15 @@ class _Judge:
         self._offsets = posterior.offsets[self._arm]
 
     def rows(self, joints: FloatArray) -> FloatArray:
-        """Return the position rows (N, 3, P + F) at joint values (N, n).
+        """Return the position rows (P + F, 3, N) at joint values (N, n).
 
-        Columns are those of the posterior's names, then of further frame parameters.
+        Of the posterior's names, then of further frame parameters.
         """
-        return self._model.jacobian(joints)[:, :3]
+        return self._model.shifts(joints)
 
     def products(self, rows: FloatArray) -> FloatArray:
         """Return products (K, K) of the columns of frames, then of the arm."""
-        flat = rows[..., self._own].reshape(-1, len(self._own))
-        return np.asarray(flat.T @ flat)
+        return gram(rows[self._own])
 
     def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
         """Return plausible offsets, as in `Posterior.doubted`, for the arm only."""

@@ -25,7 +25,7 @@ from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
 from calib_ros.estimation.leastsquares import System, normal_equations
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import Samples, gram
+from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of
@@ -116,8 +116,8 @@ def doubted_products(
     few = replace(system.spread(most), prior=None)
     products = share * _products(chain, columns, few, doubts)
     extra = np.column_stack(system.separation_rows(chain, columns))
-    own = [*range(len(columns)), -1]
-    products[np.ix_(own, own)] += share * (extra.T @ extra)
+    own = len(columns) + 1
+    products[:own, :own] += share * (extra.T @ extra)
     every = np.eye(len(products))
     row = {str(name): k for k, name in enumerate(columns)}
 
@@ -125,9 +125,8 @@ def doubted_products(
         return every[:, [row[str(name)] for name in sizes]] * [*sizes.values()]
 
     grown = scaled(doubts.lengths).sum(axis=1, keepdims=True)[:, : len(doubts.lengths)]
-    kept = np.column_stack([every[:, : len(names)], grown, every[:, -1]])
-    fields = every[:, len(columns) : -1]
-    mixing = np.column_stack([kept, scaled(doubts.sizes), fields])
+    kept = np.column_stack([every[:, : len(names)], grown, every[:, own - 1]])
+    mixing = np.column_stack([kept, scaled(doubts.sizes), every[:, own:]])
     mixed = mixing.T @ (products / noise**2) @ mixing
     first, rest = np.s_[: kept.shape[1]], np.s_[kept.shape[1] :]
     doubtful = mixed[rest, rest]
@@ -157,7 +156,7 @@ def lengths_of(chain: Chain, system: System) -> tuple[Chain, dict[str, float], f
 
 
 def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doubts) -> FloatArray:
-    """Return products of columns, smooth device errors, waves and residual."""
+    """Return products of columns, residual, waves and smooth device errors."""
     unmodelled = doubts.unmodelled
     fields = bends(system.sets) if doubts.by_device else []
     waves = 8 * len(chain.joints) if unmodelled.waves else 0
@@ -170,9 +169,11 @@ def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doub
             block = slice(first, first := first + parts[0].shape[2])
             joints = samples.observations.joints[block]
             for number, rows in enumerate(parts):
-                bent = bend[:, :, block] * (number == 0)  # distortion does not turn
                 more = [unmodelled.columns(chain, columns, joints, rows)[-waves:]] if waves else []
-                found += gram(np.concatenate([rows[:-1], bent, *more, rows[-1:]]))
+                bent = [bend[:, :, block]] if number == 0 else []  # distortion does not turn
+                flat = [each.reshape(len(each), -1) for each in (rows, *more, *bent)]
+                products = np.block([[one @ other.T for other in flat] for one in flat])
+                found[: len(products), : len(products)] += products
     return found
 
 

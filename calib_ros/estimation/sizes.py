@@ -44,11 +44,11 @@ def mixed(
     solutions: Sequence[tuple[FloatArray, FloatArray]], weights: Sequence[float]
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (P,) and covariance (P, P) of a weighted mixture of means and roots."""
-    means = np.array([mean for mean, _ in solutions])
-    mean = np.average(means, axis=0, weights=weights)
-    away = [np.outer(each - mean, each - mean) for each in means]
-    squares = [root @ root.T + more for (_, root), more in zip(solutions, away, strict=True)]
-    return mean, np.average(squares, axis=0, weights=weights)
+    shares = np.divide(weights, np.sum(weights))
+    mean = shares @ [each for each, _ in solutions]
+    parts = [np.column_stack([root, each - mean]) for each, root in solutions]
+    root = np.concatenate([np.sqrt(w) * part for w, part in zip(shares, parts, strict=True)], 1)
+    return mean, root @ root.T
 
 
 def _factor(scaled: FloatArray) -> FloatArray:
