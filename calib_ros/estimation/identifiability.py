@@ -129,12 +129,11 @@ def structurally_independent(
         rows.append(extra(anywhere, names)[0])
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
     rows.append(np.eye(len(names))[lens])
-    every = np.concatenate(rows)
-    first = np.asarray(np.linalg.qr(every, mode='r'))
+    first = np.asarray(np.linalg.qr(np.concatenate(rows), mode='r'))
     least = [HALF_THE_DIGITS if Parameter(n).kind in FRAME_KINDS else EXCEPTION for n in names]
     strong = independent(first, names, np.array(least))
     order = sorted(range(len(names)), key=lambda k: names[k] not in strong)
-    factor = np.asarray(np.linalg.qr(every[:, order], mode='r'))
+    factor = np.asarray(np.linalg.qr(first[:, order], mode='r'))
     found = independent(factor, [names[k] for k in order])
     return tuple(name for name in names if name in found)
 

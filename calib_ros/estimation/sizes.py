@@ -95,12 +95,12 @@ class Evidence:
         """
         size, width = self._typical.copy(), np.log(SPREAD) ** -2
         if self._own.sum() == self._member.sum():
-            mean, variance = self._means(size - np.log(LEAST_SIZE))
+            mean, variance = self._means(self._weight(size - np.log(LEAST_SIZE)))
             surely = np.maximum(np.abs(mean) - 2.0 * np.sqrt(variance), 0.0)
             self._lengthen(surely**2, 1.0, size)
         for _ in range(ROUNDS):
             weight = self._weight(size)
-            mean, variance = self._means(size)
+            mean, variance = self._means(weight)
             gamma = (self._member - weight * variance).sum(axis=1)
             slope = weight @ mean**2 - gamma - width * (size - self._typical)
             step = np.clip(slope / (2.0 * np.maximum(gamma, 0.0) + width), -1.0, 1.0)
@@ -175,16 +175,16 @@ class Evidence:
     def widen(self, size: FloatArray) -> None:
         """Set the variances to the mean over the tails of the prior, for log sizes (G,)."""
         for _ in range(ROUNDS):
-            mean, variance = self._means(size)
+            mean, variance = self._means(self._weight(size))
             last = self._tails
             self._lengthen(mean**2 + variance, 0.0, size, TAILS - 1.0)
             if np.abs(np.log(self._tails / last)).max(initial=0.0) < SETTLED:
                 break
 
-    def _means(self, size: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return means and variances (P,) for log sizes (G,)."""
-        mean, root = solved(self._matrix, self._vector, self.precision(size))
-        return mean, (root**2).sum(axis=1)
+    def _means(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return means and variances (P,) for inverse variances (G, P) by group."""
+        mean, root = solved(self._matrix, self._vector, self._given + weight.sum(axis=0))
+        return mean, np.einsum('pk,pk->p', root, root)
 
     def precision(self, size: FloatArray) -> FloatArray:
         """Return the prior precision (P,) of the parameters for log sizes (G,)."""

@@ -107,7 +107,7 @@ def _starts(chain: Chain, observations: Observations) -> Iterator[Iterator[Chain
     if observations.plane:
         yield _on_plane(chain, arm, observations)
         return
-    yield closed_forms(chain, observations)
+    yield closed_forms(chain, observations, arm)
     cube = Rotation.create_group('O').as_matrix()
     yield (_complete(chain, arm, observations, rotation) for rotation in cube)
 
