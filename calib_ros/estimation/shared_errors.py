@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import gram, summed
+from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
 from calib_ros.values import LARGEST
@@ -273,25 +273,23 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
     counts, places, times, joints = [], [], [], []
     circular = np.array([joint.type == 'revolute' for joint in chain.joints])
     for number, samples in enumerate(system.sets):
-        all_numbers = samples.observations.stops
-        chosen = all_numbers // run % share == 0
+        numbers = samples.observations.stops
+        chosen = numbers // run % share == 0
         if samples.weights is not None:
             chosen &= samples.weights > 0.0
         if not chosen.any():
             continue
-        few = samples.select(chosen)
-        numbers = all_numbers[chosen]
-        pieces = list(few.sums(chain, names, numbers))
-        index = np.concatenate([piece[0] for piece in pieces])
-        again = np.flatnonzero(np.diff(index, prepend=-1))  # stops across the end of a block
+        few, numbers = samples.select(chosen), numbers[chosen]
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         count = np.diff([*begins, len(numbers)]).astype(float)
-        for part, width in enumerate(widths):
-            rows = np.zeros((len(names) + 1, width, len(begins)))
-            if part < len(pieces[0][1]):
-                whole = np.concatenate([piece[1][part] for piece in pieces], axis=2)
-                rows[:, : whole.shape[1]] = summed(whole, again) / np.sqrt(count)
-            parts[part].append(rows)
+        rows = [np.zeros((len(names) + 1, width, len(begins))) for width in widths]
+        for index, block in few.sums(chain, names, numbers):
+            first = int(np.searchsorted(numbers[begins], index[0]))  # one stop may span blocks
+            for summed, added in zip(rows, block, strict=False):
+                summed[:, : added.shape[1], first : first + len(index)] += added
+        for part, summed in zip(parts, rows, strict=True):
+            summed /= np.sqrt(count)
+            part.append(summed)
         q = few.observations.joints[begins]
         turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
         places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
