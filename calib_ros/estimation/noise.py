@@ -95,7 +95,7 @@ def noise_of(
     by_priors = plain @ extra.T
     covariance = np.array([*parts, by_priors @ by_priors.T])
     if neighbours.middles:
-        alone = np.diag(identifiability.covariance(factor, sum(middles, extra.T @ extra)))
+        alone = np.sum(plain @ sum(middles, extra.T @ extra) * plain, axis=1)
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
     size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))

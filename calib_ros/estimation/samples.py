@@ -233,14 +233,13 @@ def _add_products(found: FloatArray, rows: FloatArray, phi: FloatArray, motions:
     """
     count = len(motions)
     found[count:, count:] += gram(rows)
-    begins = np.flatnonzero(np.diff(motions, prepend=-1)).tolist()
-    for number, (first, last) in enumerate(pairwise([*begins, count])):
-        weights = np.einsum('pcn,cn->pn', rows, rows[motions[first]])
-        later = [
-            phi[other:end] * weights[motions[other]]
-            for other, end in pairwise([*begins[number:], count])
-        ]
-        products = phi[first:last] @ np.concatenate([*later, weights]).T
+    ends = [*np.flatnonzero(np.diff(motions, prepend=-1)).tolist(), count]
+    weighted = np.empty((len(found), rows.shape[2]))
+    for number, (first, last) in enumerate(pairwise(ends)):
+        weights = np.einsum('pcn,cn->pn', rows, rows[motions[first]], out=weighted[count:])
+        for other, end in pairwise(ends[number:]):
+            np.multiply(phi[other:end], weights[motions[other]], out=weighted[other:end])
+        products = phi[first:last] @ weighted[first:].T
         found[first:last, first:] += products
         found[last:, first:last] += products[:, last - first :].T
 
