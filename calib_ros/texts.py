@@ -80,17 +80,16 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
         ) from err
 
 
-def csv_lines(text: str, where: str) -> io.TextIOBase:
-    """Return the lines of a table for csv, which reads lines of any length."""
-    lines = io.TextIOWrapper(io.BytesIO(text.encode()), encoding='utf-8', newline='')
-    longest, most = max(map(len, lines), default=0), MOST_ENTRIES**2
-    if longest > most:
-        raise InputError(
-            f'{where} has a line of {longest} characters, more than {most}: is it a table?'
-        )
-    lines.seek(0)
+def csv_lines(text: str, where: str) -> Iterator[str]:
+    """Yield the lines of a table for csv, which reads lines of any length."""
+    most = MOST_ENTRIES**2
     csv.field_size_limit(most)  # of the whole process
-    return lines
+    for line in io.TextIOWrapper(io.BytesIO(text.encode()), encoding='utf-8', newline=''):
+        if len(line) > most:
+            raise InputError(
+                f'{where} has a line of {len(line)} characters, more than {most}: is it a table?'
+            )
+        yield line
 
 
 def dump_json(value: Any, indent: str = '') -> str:

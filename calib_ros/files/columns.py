@@ -72,7 +72,7 @@ class Columns:
         """Return numbers (N, len(names)), NaN for empty cells; errors name them as `called`."""
         found = np.zeros((len(self.lines), len(names)))
         for k, name in enumerate(names):
-            found[:, k] = self.values[name] if name in self.values else _numbers(self.texts(name))
+            found[:, k] = self.values[name] if name in self.values else _numbers(self.words[name])
         for row, k in np.argwhere(np.isinf(found))[:1].tolist():
             raise self._no_number(row, (called or names)[k], self.texts(names[k])[row])
         return found
@@ -143,20 +143,17 @@ def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] =
     """Return columns of blocks of rows that may end early; further ones are `#1`, `#2` ..."""
     lines: list[int] = []
     columns: list[list[str]] = []  # of each block
-    blank: list[str] = []
     for block in filter(None, blocks):
         lines += [line for line, _ in block]
-        cells = zip_longest(*(cells for _, cells in block), fillvalue='')
+        cells = zip_longest(*[cells for _, cells in block], fillvalue='')
         columns.append([BETWEEN.join(column) for column in cells])
-        blank.append(BETWEEN * (len(block) - 1))
-        if any(column.count(BETWEEN) != len(block) - 1 for column in columns[-1]):
-            raise _with_zeros(path, next(n for n, row in block if BETWEEN in ''.join(row)))
     width = max([len(header), *map(len, columns)])
     names = [*header, *(f'#{k + 1}' for k in range(len(header), width))]
     words = {}
     for k, name in enumerate(names):
-        parts = zip(columns, blank, strict=True)
-        words[name] = BETWEEN.join(part[k] if k < len(part) else no for part, no in parts)
+        words[name] = BETWEEN.join(
+            part[k] if k < len(part) else BETWEEN * part[0].count(BETWEEN) for part in columns
+        )
     return Columns(path, np.array(lines, dtype=np.intp), words)
 
 
@@ -228,6 +225,8 @@ def csv_blocks(
 
     `above` lines precede the text.
     """
+    if (place := text.find(BETWEEN)) >= 0:
+        raise _with_zeros(path, above + 1 + text.count('\n', 0, place))
     reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
     line, block = 0, list[Row]()
     try:
@@ -249,15 +248,24 @@ def csv_blocks(
         yield block
 
 
-def _numbers(texts: Sequence[str]) -> FloatArray:
-    """Return the numbers (N,) in cells, NaN if blank, infinity if there is none."""
-    if not any(texts):
-        return np.full(len(texts), np.nan)
-    try:
-        found = np.fromiter(map(float, texts), float, len(texts))
-    except (ValueError, OverflowError):
-        return np.fromiter(map(_number, texts), float, len(texts))
-    return np.where(np.isfinite(found), found, np.inf)
+def _numbers(text: str) -> FloatArray:
+    """Return the numbers (N,) in joined cells, NaN if blank, infinity if there is none.
+
+    They are read in parts: numpy takes four bytes for a character.
+    """
+    if not text.strip(BETWEEN):
+        return np.full(text.count(BETWEEN) + 1, np.nan)
+    found, begin = [], 0
+    while begin <= len(text):
+        end = text.find(BETWEEN, begin + MOST_ENTRIES**2)
+        part = text[begin : end if end >= 0 else None]
+        begin += len(part) + 1
+        try:  # a line of numbers, behind one because no line may be empty
+            numbers = np.loadtxt([f'0{BETWEEN}{part}'], delimiter=BETWEEN, comments=None)[1:]
+            found.append(np.where(np.isfinite(numbers), numbers, np.inf))
+        except ValueError:
+            found.append(np.array([_number(cell) for cell in part.split(BETWEEN)]))
+    return np.concatenate(found)
 
 
 def _number(text: str) -> float:
