@@ -33,6 +33,7 @@ from scipy import special
 
 from calib_ros.decision.comparison import Comparison
 from calib_ros.errors import InputError
+from calib_ros.estimation.configurations import successive
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.se3 import FloatArray, Index
 
@@ -62,7 +63,7 @@ def rms_interval(
 
     `group` (N,) are the configurations, each counted once; with a single one they are (0, inf).
     """
-    moments = moments_of(errors, np.unique(group, return_inverse=True)[1])
+    moments = moments_of(errors, successive(group))
     if len(moments) < 2:
         return 0.0, np.inf
     rms = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
@@ -94,9 +95,8 @@ def freedom_of(moments: FloatArray) -> float:
 
 def moments_of(errors: FloatArray, group: Index) -> FloatArray:
     """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
-    each = (errors[:, :, np.newaxis] * errors[:, np.newaxis]).reshape(-1, 9)
-    sums = np.stack([np.bincount(group, column) for column in each.T], axis=1)
-    return sums.reshape(-1, 3, 3) / np.bincount(group)[:, np.newaxis, np.newaxis]
+    sums = [np.bincount(group, first * second) for first in errors.T for second in errors.T]
+    return np.stack(sums, axis=1).reshape(-1, 3, 3) / np.bincount(group)[:, None, None]
 
 
 SLOPES = (0.5, 2.0)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from calib_ros.estimation.configurations import successive
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations, numbered
 from calib_ros.estimation.samples import residual_arrays, seen_residuals
@@ -180,8 +181,8 @@ def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -
     """Return the mean squared errors (2, K) of K configurations, for errors (N, 3) of pairs."""
     squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
     known = ~np.isnan(squares).any(axis=0)
-    _, group, sizes = np.unique(configurations[known], return_inverse=True, return_counts=True)
-    return np.stack([np.bincount(group, row) / sizes for row in squares[:, known]])
+    group = successive(configurations[known])
+    return np.stack([np.bincount(group, row) for row in squares[:, known]]) / np.bincount(group)
 
 
 def log_gain(

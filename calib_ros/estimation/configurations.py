@@ -27,6 +27,11 @@ def distinct(numbers: Index) -> int:
     return int(np.count_nonzero(np.bincount(numbers)))
 
 
+def successive(numbers: Index) -> Index:
+    """Return configuration numbers (N,) in the same order, but without gaps."""
+    return np.asarray((np.cumsum(np.bincount(numbers) > 0) - 1)[numbers])
+
+
 def stops(joints: FloatArray) -> Index:
     """Return the stop number (N,) of consecutive joint values (N, n)."""
     moved = np.zeros(len(joints), dtype=np.intp)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.errors import InputError
-from calib_ros.estimation.configurations import configurations, stops
+from calib_ros.estimation.configurations import configurations, stops, successive
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.shown import Shown
@@ -167,8 +167,7 @@ class Observations(Shown):
             few = np.broadcast_to(array[:1], (count, *array.shape[1:])) if alike else array[mask]
             vars(chosen)[name] = few
         if 'configurations' in vars(self):  # slow to compute
-            numbers = self.configurations[mask]
-            vars(chosen)['configurations'] = (np.cumsum(np.bincount(numbers) > 0) - 1)[numbers]
+            vars(chosen)['configurations'] = successive(self.configurations[mask])
         return chosen
 
     def spread(self, most: int = SOME_POSES) -> Observations:

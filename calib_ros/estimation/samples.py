@@ -47,11 +47,12 @@ class Samples:
         self.count = len(observations)
         self.joints = np.ascontiguousarray(observations.joints.T)
         self.positions = np.ascontiguousarray(observations.positions.T)
-        self.rotations = np.ascontiguousarray(observations.rotations.transpose(2, 1, 0))
         approach = observations.approach
         self.approach = None if approach is None else np.ascontiguousarray(approach.T)
         self.distances = observations.distances
         self.oriented = bool(observations.oriented.any()) and self.distances is None
+        turned = observations.rotations.transpose(2, 1, 0)
+        self.rotations = np.ascontiguousarray(turned) if self.oriented else turned
         width = 3 if self.distances is None else 1
         self.rows = width * self.count + 3 * int(observations.oriented.sum()) * self.oriented
         self.sigmas = (sigma_position, sigma_orientation)

@@ -299,7 +299,7 @@ def _devices(columns: Columns, kind: Index) -> Codes:
 def _turned(columns: Columns, quat: FloatArray | None, placed: Flags) -> tuple[Flags, FloatArray]:
     """Return which poses (N,) are oriented, and the rotations (N, 3, 3)."""
     if quat is None:
-        return np.zeros(len(placed), bool), np.tile(np.eye(3), (len(placed), 1, 1))
+        return np.zeros(len(placed), bool), np.broadcast_to(np.eye(3), (len(placed), 3, 3))
     check_quaternions(columns, quat)
     oriented = placed & ~np.isnan(quat[:, 0])
     if not oriented.all():
