@@ -32,7 +32,7 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 from scipy import special
 
-from calib_ros.estimation.leastsquares import STEP_TOLERANCE, Fit, System, minimise
+from calib_ros.estimation.leastsquares import PATIENCE, STEP_TOLERANCE, Fit, System, minimise
 from calib_ros.estimation.levels import ALIKE, SURE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.kinematics.chain import Chain
@@ -151,9 +151,10 @@ def reweighted(
 ) -> Robust:
     """Fit with the weights of a loss, from a start that is good enough to detect gross errors.
 
-    Fits are repeated to a `tolerance` until the weights converge. With the distances (N,) of all
-    samples by a `simpler` model, samples that it explains are no gross errors: a richer model has
-    to explain them too.
+    Fits are repeated to a `tolerance` until the weights converge: the more often they swing, the
+    smaller their steps, lest they go round for ever. With the distances (N,) of all samples by a
+    `simpler` model, samples that it explains are no gross errors: a richer model has to explain
+    them too.
     """
 
     def judged(chain: Chain) -> tuple[FloatArray, ...]:
@@ -163,7 +164,7 @@ def reweighted(
         return tuple(np.minimum(d, s) for d, s in zip(found, simpler, strict=True))
 
     distances = judged(chain)
-    settled = False
+    settled, swung = False, 0
     last: list[FloatArray] = []
     weights: list[FloatArray] = []
     for _ in range(ROUNDS):
@@ -173,7 +174,12 @@ def reweighted(
         )
         if settled:
             break
-        last, weights = weights, _damp_oscillation(found, weights, last)
+        swings = _swing(found, weights, last)
+        swung += swings
+        share = min(1.0, PATIENCE / (swung + 1.0)) * (0.5 if swings else 1.0)
+        if weights:
+            found = [share * f + (1.0 - share) * w for f, w in zip(found, weights, strict=True)]
+        last, weights = weights, found
         system = system.weighted(weights)
         fit = minimise(chain, names, system, tolerance)
         chain = fit.chain
@@ -185,17 +191,15 @@ def reweighted(
     return Robust(fit, system, distances, settled, loss)
 
 
-def _damp_oscillation(
-    found: list[FloatArray], last: list[FloatArray], before: list[FloatArray]
-) -> list[FloatArray]:
-    """Return the weights found (N,), set by set, averaged with the last ones if they oscillate.
+def _swing(
+    found: Sequence[FloatArray], last: Sequence[FloatArray], before: Sequence[FloatArray]
+) -> bool:
+    """Tell whether weights (N,), set by set, go back; empty lists are not found yet.
 
-    A sample at the edge may lose weight, come nearer, regain it, and so on for ever. Empty lists
-    are weights not found yet.
+    A sample at the edge may lose weight, come nearer, regain it, and so on.
     """
     steps = zip(found, last, before, strict=True) if before else ()
-    swings = sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0
-    return [0.5 * (f + b) for f, b in zip(found, last, strict=True)] if swings else found
+    return sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0
 
 
 def weights_of(distance: FloatArray, loss: str) -> FloatArray:

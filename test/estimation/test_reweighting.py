@@ -19,8 +19,12 @@ from calib_ros.estimation.samples import Samples
 from calib_ros.kinematics import se3
 
 
-def test_weights_that_swing_come_to_rest(monkeypatch):
-    """A pose that comes near without weight, and goes far with it, has no rest at either end."""
+@pytest.mark.parametrize('steep', [2.0, 20.0])
+def test_weights_that_swing_come_to_rest(steep, monkeypatch):
+    """A pose that comes near without weight, and goes far with it, has no rest at either end.
+
+    Steep, it is far with any weight that halves leave: they go round and round.
+    """
     _, true, seen = measured_arm(0, 40)
     system = Problem(UR10E, seen, **SIGMAS).system([seen])
     weight = 1.0
@@ -32,14 +36,14 @@ def test_weights_that_swing_come_to_rest(monkeypatch):
 
     def far(*_):
         distances = np.ones(40)
-        distances[0] = INNER + 2.0 * weight
+        distances[0] = INNER + steep * weight
         return (distances,)
 
     monkeypatch.setattr(robust, 'minimise', minimised)
     monkeypatch.setattr(robust, 'distances_of', far)
     found = robust.reweighted(true, ['tool.x'], system, 'redescending')
     assert found.settled
-    assert weight == pytest.approx(0.5, abs=1e-3)
+    assert weight == pytest.approx((OUTER - INNER) / (OUTER - INNER + steep), abs=1e-3)
 
 
 def test_the_weights_are_those_of_the_losses():
