@@ -80,6 +80,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     if imitated:
         refusals.insert(0, Reason(Rule.MISTAKE, lens))
         lens = ''
+    if another and (unlike := _sessions(problem, result)):
+        refusals.insert(0, Reason(Rule.MISTAKE, unlike))
     if refusals and sigmas:
         first = another and not imitated
         refusals.insert(0 if first else len(refusals), Reason(Rule.MISTAKE, sigmas))
@@ -105,6 +107,32 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
     start = replace(chain, base=found.frame('base'), tool=found.frame('tool'), frames=())
     names = [*parameters_of('base'), *parameters_of('tool')]
     return fit_to_arm(start, names, found, joints, iterations=12)[1]
+
+
+def _sessions(problem: Problem, result: Identification) -> str:
+    """Return that sessions with frames of their own fit far better alone: another arm in each."""
+    sessions: list[list[Observations]] = []
+    for each in problem.sets:
+        mine = [s for s in sessions if any(each.base == o.base or each.tool == o.tool for o in s)]
+        sessions = [s for s in sessions if s not in mine]
+        sessions.append([o for s in mine for o in s] + [each])
+    moved = {each.rule for each in result.refusals} & {Rule.ENCODER, Rule.MOVED}
+    if len(sessions) < 2 or result.noise.consistent or moved:
+        return ''
+    worst = 0.0
+    for first, *more in ([o.spread(SOME_POSES) for o in s] for s in sessions):
+        try:
+            alone = fit(replace(problem, observations=first, more=more, held_out=()))[2]
+        except (InputError, np.linalg.LinAlgError):
+            return ''  # too few to tell
+        worst = max(worst, alone.noise.position)
+    if worst > NEARER * result.noise.position:
+        return ''
+    return (
+        f'the sessions are not of one arm: alone each fits {result.noise.position / worst:.1f} '
+        'times as well or better. Is it the same robot, and did nothing happen to it in between? '
+        'Identify each alone (--session) and compare them'
+    )
 
 
 def _motion(problem: Problem, result: Identification) -> str:

@@ -71,6 +71,17 @@ def test_a_sister_is_named():
     assert 'the arm is a ur10, not a ur10e: --chain ur10' in remark
 
 
+@pytest.mark.parametrize(('seed', 'alike'), [(0, True), (1, False)])
+def test_two_robots_in_two_sessions_are_not_averaged(seed, alike):
+    """The mean of two arms was accepted, 15 times as far off as each arm alone."""
+    second = replace(seen_of(arm(seed), 2, 40), base='base_B', tool='tool_B')
+    lever = replace(seen_of(arm(0), 3, 40), tool='tool_lever')
+    result = identify(Problem(UR, seen_of(arm(0), 1, 40), more=(lever, second)))
+    assert result.accepted == alike
+    said = [each.rule for each in result.refusals if 'the sessions are not of one arm' in each]
+    assert said == ([] if alike else [Rule.MISTAKE])
+
+
 @pytest.mark.parametrize('sigma', [0.05, 5e-3])
 @pytest.mark.parametrize('oriented', [True, False])
 def test_sigmas_in_millimetres_are_named(sigma, oriented):
