@@ -145,7 +145,9 @@ class Information(Shown):
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
         """Return gain, changes, their covariance and its rank for columns (P, k)."""
         inner = columns.T @ self.matrix @ columns
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
+        own = np.diag(inner)
+        known = own > 0.0  # rounding leaves less than nothing of what far poses tell
+        scale = known / np.sqrt(np.where(known, own, 1.0))
         covariance = scale[:, np.newaxis] * linalg.pinvh(inner * np.outer(scale, scale), rtol=1e-9)
         covariance = covariance * scale
         seen = columns.T @ self.vector

@@ -112,8 +112,11 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
     return any(each.beyond(*limits) for each in result.parameters)
 
 
-def explained(problem: Problem) -> Explained | None:
-    """Return what explains the measurements much better than the given input, if anything."""
+def explained(problem: Problem, far: bool = False) -> Explained | None:
+    """Return what explains the measurements much better than the given input, if anything.
+
+    With `far` only if the arm as given, in its best frames, is further off than faulty arms.
+    """
     sets = tuple(
         _as_poses(problem, each)
         for each in problem.sets
@@ -129,7 +132,7 @@ def explained(problem: Problem) -> Explained | None:
     if not any(each.socket for each in sets):
         sets, where = _unlike(problem, chain, sets)
     given = in_frames(problem, chain, sets)
-    if given is None:
+    if given is None or (far and given.error <= _largest(problem)):
         return None
     found = (
         _of_a_dead_column(problem, chain, given)

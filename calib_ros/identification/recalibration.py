@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.decision import changes
+from calib_ros.decision import changes, mistakes
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
 from calib_ros.decision.comparison import Comparison, residuals
 from calib_ros.decision.validation import left_out
@@ -67,10 +67,18 @@ def recalibrate(
     `years` have passed. `growth` is the standard deviation [m] of the drift of lengths in a year;
     of angles twice that [rad]. `new` are frames of moved devices and of remounted targets.
 
-    Raises InputError if the calibration has no covariance, or does not know a frame.
+    Raises InputError if the calibration has no covariance, or does not know a frame, or if the
+    poses do not fit the arm at all; the message names the mistake that explains them, if any.
     """
     require(Calibration, previous=previous)
-    found, arm = _recalibrated(previous, problem, years, growth, new)
+    if mistake := mistakes.explained(problem, far=True):
+        raise InputError(f'the new poses do not fit the arm at all: {mistake}')
+    try:
+        found, arm = _recalibrated(previous, problem, years, growth, new)
+    except np.linalg.LinAlgError as err:
+        raise InputError(
+            'the new poses do not fit the arm at all: check the arm, joint values and units'
+        ) from err
     if found.accepted or found.reused or found.scale is not None:
         return found
     for number, pose, rest in _without_one(problem, arm):

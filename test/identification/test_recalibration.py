@@ -242,6 +242,37 @@ def test_another_arm_is_not_mended_by_8_poses(earlier):
     assert found.refusal()[1] == 'identify again'
 
 
+def test_new_poses_in_other_units_are_named(earlier):
+    true, previous = earlier
+    seen = problem(true, 15, 1)
+    wrong = replace(seen.observations, positions=1e3 * seen.observations.positions)
+    with pytest.raises(InputError, match='in mm, not metres: --length mm'):
+        recalibrate(previous, replace(seen, observations=wrong), 0.1)
+
+
+def test_new_poses_of_which_half_are_in_other_units_are_refused(earlier):
+    true, previous = earlier
+    seen = problem(true, 15, 1)
+
+    def half(factor):
+        positions = seen.observations.positions.copy()
+        positions[7:] *= factor
+        return replace(seen, observations=replace(seen.observations, positions=positions))
+
+    assert not recalibrate(previous, half(1e3), 0.1).accepted
+    with pytest.raises(InputError, match='check the arm, joint values and units'):
+        recalibrate(previous, half(1e6), 0.1)
+
+
+def test_swapped_columns_of_new_poses_are_named(earlier):
+    true, previous = earlier
+    seen = problem(true, 10, 1)
+    swapped = seen.observations.joints[:, [0, 2, 1, 3, 4, 5]]
+    wrong = replace(seen, observations=replace(seen.observations, joints=swapped))
+    with pytest.raises(InputError, match='shoulder_lift_joint and elbow_joint are swapped'):
+        recalibrate(previous, wrong, 0.1)
+
+
 def test_what_is_needed_is_asked_for(earlier):
     true, previous = earlier
     few = problem(true, 8, 1)
