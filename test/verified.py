@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A UR10e, calibrated, and measurements by which it is verified."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from calib_ros.apply import simulation
@@ -25,6 +27,12 @@ def cell():
 def measured(true, joints, repeats=3, noise=NOISE, seed=1):
     rng = np.random.default_rng(seed)
     return simulation.measure(true, np.repeat(joints, repeats, axis=0), rng, *noise)
+
+
+def with_errors(arm, errors):
+    """Return observations whose position errors by the calibrated arm are (N, 3) [m]."""
+    seen = measured(arm.chain, UR.random_joints(len(errors), np.random.default_rng(2)), 1, (0, 0))
+    return replace(seen, positions=seen.positions + errors)
 
 
 def in_words(found):

@@ -31,6 +31,7 @@ from scipy.spatial import cKDTree
 from calib_ros.apply.candidates import TILTED
 from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
+from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
@@ -38,6 +39,8 @@ from calib_ros.estimation.identifiability import excited
 from calib_ros.estimation.leastsquares import System, minimise, triangular_factor
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.robust import OUTLIER
 from calib_ros.estimation.samples import Samples
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
@@ -97,7 +100,8 @@ class Verification(Shown):
     """Degrees of freedom of that error."""
     verdict: Verdict
     """Without a tolerance 'holds' and 'does not hold' instead of PASS and FAIL, or 'no verdict' if
-    the former error is unknown; no verdict either if fitted measurements look good."""
+    the former error is unknown; no verdict either if fitted measurements look good, or if a
+    `mistake` explains them."""
     needed: int | None
     """Number of configurations that would decide with the same RMS error, if undecided; None if
     even DECIDING would not."""
@@ -111,8 +115,11 @@ class Verification(Shown):
     """Share of the measurements that the calibration was fitted to (`Calibration.reused`)."""
     uncorrected: bool = False
     """Whether all measurements were taken at the joint values of the program as it was given."""
-    odd: int | None = None
-    """Configuration without which the others would be within the limit."""
+    odd: tuple[int, ...] = ()
+    """Configurations without which the others would be within the limit: few that are far off, or
+    all before or after some moment."""
+    mistake: mistakes.Explained | None = None
+    """What explains measurements that are further off than any arm."""
 
     @property
     def configurations(self) -> int:
@@ -174,20 +181,24 @@ def verify(
     numbers = np.unique(np.geomspace(count, max(count, DECIDING), 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
+    mistake: mistakes.Explained | None = None
+    if rms > Settings.largest_error:
+        mistake = mistakes.explained(Problem(arm.before, sets[0], more=sets[1:]), far=True)
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
-    limit, odd = tolerance or arm.limit, None
+    limit = tolerance or arm.limit
+    odd: tuple[int, ...] = ()
     if limit is not None:
         verdict = _decided(limit, lower, upper, numbers)
         odd = _odd(moments, lost, limit, confidence)
-    if reused and verdict[0] != 'FAIL':
+    if mistake or (reused and verdict[0] != 'FAIL'):
         verdict = ('no verdict', None)
     if tolerance is None:
         verdict = (STANDS.get(verdict[0], verdict[0]), verdict[1])
     if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, reused, uncorrected, odd)
+    known = (commanded is not None, fitted, reused, uncorrected, odd, mistake)
     return Verification(comparison, tolerance, limit, confidence, group, *found, *known)
 
 
@@ -229,16 +240,30 @@ def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
     return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
 
 
-def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> int | None:
-    """Return the worst configuration if the others alone are within a limit exceeded with it."""
-    worst = int(np.trace(moments, axis1=1, axis2=2).argmax())
-    uppers = []
-    for some in (moments, np.delete(moments, worst, axis=0)):
-        if (count := len(some) - lost) < NEEDED:
-            return None
-        freedom = freedom_of(some) * np.array([count])
-        uppers += rms_limits(_rms(some, lost), freedom, confidence)[1].tolist()
-    return worst if uppers[1] <= limit < uppers[0] else None
+def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tuple[int, ...]:
+    """Return the configurations without which the others are within a limit exceeded with them.
+
+    Outliers, or all on one side of the moment that best divides errors of two sizes.
+    """
+
+    def limits(which: Index) -> tuple[float, float]:
+        if (count := len(which) - lost) < NEEDED:
+            return 0.0, np.inf
+        freedom = freedom_of(moments[which]) * np.array([count])
+        (lower,), (upper,) = rms_limits(_rms(moments[which], lost), freedom, confidence)
+        return float(lower), float(upper)
+
+    squares = np.trace(moments, axis1=1, axis2=2)
+    every, before, sums = np.arange(len(squares)), np.arange(1, len(squares)), np.cumsum(squares)
+    after = before[::-1]
+    sizes = np.log(sums[:-1] / before), np.log((sums[-1] - sums[:-1]) / after)
+    moment = 1 + int(np.argmin(before * sizes[0] + after * sizes[1]))
+    outliers = np.flatnonzero(squares > OUTLIER**2 * np.median(squares))
+    for bad in (outliers, every[:moment], every[moment:]):
+        beyond = bad is outliers or limits(bad)[0] > limit
+        if beyond and limits(np.setdiff1d(every, bad))[1] <= limit < limits(every)[1]:
+            return tuple(bad.tolist())
+    return ()
 
 
 def _decided(

@@ -206,11 +206,11 @@ def judged(
 
 
 def verified(chain: Chain, found: Verification, about: Filing) -> Row:
-    """Return the row of a verification; without freedom, and so in no chart, of fitted poses."""
+    """Return the row of a verification; without freedom, so in no chart, of unfit poses."""
     before, after = found.comparison.figures
     figures = before, replace(after, rms_mm=1e3 * found.rms)
     limits = found.lower, found.upper
-    freedom = None if found.reused else found.freedom
+    freedom = None if found.reused or found.mistake else found.freedom
     return _row(about, 'verify', chain, found.verdict, figures, limits, rms_freedom=freedom)
 
 

@@ -7,11 +7,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from calib_ros.apply.verification import DECIDING, Verification
 from calib_ros.estimation.levels import ALIKE, NEARER
 from calib_ros.identification.records import reused_in_words
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
+from calib_ros.kinematics.se3 import norms
 from calib_ros.report import sections
 from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.explorer import explorer
@@ -19,7 +22,7 @@ from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
-from calib_ros.shown import rounded
+from calib_ros.shown import rounded, some
 
 SOMETHING_MOVED = (
     'Check that measuring device, target and robot have not moved since the calibration; if one '
@@ -64,10 +67,16 @@ REUSED = (
     Verdict('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
 )
+MISTAKEN = (
+    Verdict('open', 'No verdict: the measurements do not fit the arm'),
+    ('Check what is named in the robot and in the data, correct it, and verify again.',),
+)
 
 
 def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
     """Return the verdict as a reader sees it first, and what to do next."""
+    if found.mistake:
+        return MISTAKEN
     if found.reused and found.verdict == 'no verdict':
         return REUSED
     state, steps = STANDINGS[found.verdict]
@@ -131,14 +140,13 @@ def hints(found: Verification) -> list[str]:
             'is not active, or this is the corrected program: give the program as it was before '
             'calib_ros compensate'
         )
-    if found.verdict == 'does not hold':
+    if found.verdict == 'does not hold' and not found.odd:
         lines.append('the error has grown since the calibration was made')
     rms = 1e-3 * found.comparison.figures[1].rms_mm
-    if found.odd is not None and found.each:
-        lines.append(
-            f'pose {found.odd + 1} alone is {rounded(found.each[found.odd].after)} mm off; the '
-            'others are within the limit: measure it again'
-        )
+    if found.mistake:
+        lines.append(str(found.mistake))
+    elif found.odd:
+        lines.append(_apart(found))
     elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
         lines.append(
             'no arm is so far off: check units and columns of the measurements (--length, '
@@ -152,6 +160,22 @@ def hints(found: Verification) -> list[str]:
             'give --new-base, and --new-tool for a new target'
         )
     return lines
+
+
+def _apart(found: Verification) -> str:
+    """Return which poses are beyond the limit while the others are within it."""
+    first, last = found.odd[0] + 1, found.odd[-1] + 1
+    names = f'poses {", ".join(some([str(k + 1) for k in found.odd]))} alone are up to'
+    if first == last:
+        names = f'pose {first} alone is'
+    elif last - first < len(found.odd):
+        names = f'poses {first} to {last} alone are up to'
+    which = np.isin(found.group, found.odd)
+    away = rounded(1e3 * norms(found.comparison.after.position[which]).max())
+    return (
+        f'{names} {away} mm off; the others are within the limit: measure again, or find what '
+        'moved, was changed or was hit there'
+    )
 
 
 def verification_report(

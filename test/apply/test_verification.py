@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from designs import design_of
 from scipy import stats
-from verified import NOISE, UR, in_words, measured
+from verified import NOISE, UR, in_words, measured, with_errors
 
 from calib_ros.apply import simulation, verification
 from calib_ros.apply.candidates import iso_9283_poses
@@ -30,12 +30,6 @@ _UNIT = ['(mean', '+', '3', 'sigma)']
 def program():
     """Return the joint values of the five test poses."""
     return iso_9283_poses(design_of(UR), np.random.default_rng(0)).joints
-
-
-def with_errors(arm, errors):
-    """Return observations whose position errors by the calibrated arm are (N, 3) [m]."""
-    seen = measured(arm.chain, UR.random_joints(len(errors), np.random.default_rng(2)), 1, (0, 0))
-    return replace(seen, positions=seen.positions + errors)
 
 
 # Test poses
@@ -217,7 +211,8 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
 def test_what_no_arm_can_be_off_is_of_other_units(cell, arm, program, scale, told):
     seen = measured(cell[0], program)
     text = in_words(verify(arm, [replace(seen, positions=scale * seen.positions)], 1e-3))
-    assert ('check units and columns of the measurements (--length' in text) is told
+    assert ('the positions are in mm, not metres' in text) is told
+    assert ('--length mm' in text) is told
 
 
 def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm):
@@ -232,11 +227,11 @@ def test_one_pose_that_alone_exceeds_the_limit_is_named(arm):
     errors = np.random.default_rng(0).normal(scale=1e-5, size=(9, 3))
     errors[4] += [0.0, 0.01, 0.0]
     text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
-    assert (found.verdict, found.odd) == ('FAIL', 4)
+    assert (found.verdict, found.odd) == ('FAIL', (4,))
     assert 'pose 5 alone is 9.99' in text
     for fine in (errors[:4], errors * 0.0):
-        assert verify(arm, [with_errors(arm, np.tile(fine, (2, 1)))], 1e-4).odd is None
-    assert verify(arm, [with_errors(arm, errors[2:7])], 1e-4).odd is None  # too few others
+        assert verify(arm, [with_errors(arm, np.tile(fine, (2, 1)))], 1e-4).odd == ()
+    assert verify(arm, [with_errors(arm, errors[2:7])], 1e-4).odd == ()  # too few others
 
 
 def test_repeats_do_not_count_as_more_configurations(arm):

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from designs import design_of
 from measured import rows_of, write_csv
-from verified import UR, in_words, measured
+from verified import UR, in_words, measured, with_errors
 
 from calib_ros import load_calibration
 from calib_ros.apply.candidates import Visibility
 from calib_ros.apply.verification import verify
 from calib_ros.cli.common import Status
 from calib_ros.files.programs import joints_csv, read_joints
+from calib_ros.report.verdicts import standing
 
 
 @pytest.fixture
@@ -109,3 +110,41 @@ def test_the_serial_number_comes_with_the_calibration(cell, folder, run):
     assert 'result is the calibration of the robot with serial "0007"; this one is "0008"' in err
     run(*VERIFY, 'result', '--out', 'verified')
     assert '- Serial number: 0007\n' in (folder / 'verified' / 'report.md').read_text()
+
+
+def test_a_few_poses_among_many_that_exceed_the_limit_are_named(arm):
+    errors = np.random.default_rng(0).normal(scale=1e-5, size=(40, 3))
+    errors[[3, 17, 30]] += [0.0, 0.01, 0.0]
+    text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
+    assert (found.verdict, found.odd) == ('FAIL', (3, 17, 30))
+    assert 'poses 4, 18, 31 alone are up to 10.0' in text
+
+
+@pytest.mark.parametrize(
+    ('bad', 'words'),
+    [
+        (np.s_[25:], 'poses 26 to 40 alone are up to'),
+        (np.s_[:12], 'poses 1 to 12 alone are up to'),
+        (np.s_[::2], ''),
+    ],
+)
+def test_a_moment_from_which_errors_are_within_or_beyond_the_limit_is_named(arm, bad, words):
+    errors = np.random.default_rng(0).normal(scale=1e-5, size=(40, 3))
+    errors[bad] += np.random.default_rng(1).normal(scale=2e-4, size=errors[bad].shape)
+    text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
+    assert found.verdict == 'FAIL'
+    assert found.odd == (tuple(np.arange(40)[bad]) if words else ())
+    assert words in text
+
+
+def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, arm):
+    seen = measured(cell[0], UR.random_joints(10, np.random.default_rng(3)), 1)
+    for wrong, words in (
+        (replace(seen, positions=1e3 * seen.positions), 'in mm, not metres: --length mm'),
+        (replace(seen, joints=np.degrees(seen.joints)), 'are in degrees, not radians'),
+    ):
+        for tolerance in (None, 1e-3):
+            found = verify(arm, [wrong], tolerance)
+            assert found.verdict == 'no verdict'
+            assert words in in_words(found)
+            assert standing(found)[0].state == 'open'
