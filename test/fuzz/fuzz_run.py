@@ -5,14 +5,15 @@
     python test/fuzz/fuzz_run.py [--seconds 180] [--jobs 2] [--targets table,urdf] [--seed 0]
 
 Each target runs in a process of its own: by atheris, which is led by the branches that an input
-reaches, or, where there is no atheris for this Python, by hypothesis, which only varies the
-seeds. What breaks the contract is kept in `test/fuzz/failures`; put it into `test/fuzz/corpus`
+reaches, or, where there is no atheris for this Python, by chance, which only varies the seeds.
+What breaks the contract is kept in `test/fuzz/failures`; put it into `test/fuzz/corpus`
 with its mend, and every test run replays it.
 """
 
 import argparse
 import hashlib
 import importlib.util
+import random
 import resource
 import shutil
 import subprocess
@@ -66,7 +67,7 @@ def fuzz(name, seconds, seed):
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
     FAILURES.mkdir(exist_ok=True)
     led = importlib.util.find_spec('atheris') is not None
-    return (by_atheris if led else by_hypothesis)(name, seconds, seed)
+    return (by_atheris if led else by_chance)(name, seconds, seed)
 
 
 def by_atheris(name, seconds, seed):
@@ -91,37 +92,22 @@ def by_atheris(name, seconds, seed):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def by_hypothesis(name, seconds, seed):
-    import fuzz_targets
-    from fuzz_variants import variants
-    from hypothesis import HealthCheck, Phase, given, seed as seeded, settings
+def by_chance(name, seconds, seed):
+    from fuzz_targets import corpus, keep_contract
+    from fuzz_variants import variant
 
+    rng, seeds = random.Random(seed), corpus(name)
     until, runs = time.monotonic() + seconds, 0
-
     while time.monotonic() < until:
-
-        @seeded(seed + runs)
-        @settings(
-            max_examples=200,
-            database=None,
-            deadline=None,
-            phases=[Phase.generate],
-            suppress_health_check=list(HealthCheck),
-        )
-        @given(variants(fuzz_targets.corpus(name)))
-        def keeps(data):
-            if time.monotonic() > until:
-                return
-            try:
-                fuzz_targets.keep_contract(name, data)
-            except BaseException:
-                digest = hashlib.sha256(data).hexdigest()[:12]
-                (FAILURES / f'{name}-{digest}').write_bytes(data)
-                raise
-
-        keeps()
-        runs += 200
-    print(f'{runs} runs at most')
+        data = variant(rng, seeds)
+        runs += 1
+        try:
+            keep_contract(name, data)
+        except BaseException:
+            digest = hashlib.sha256(data).hexdigest()[:12]
+            (FAILURES / f'{name}-{digest}').write_bytes(data)
+            raise
+    print(f'{runs} runs')
     return 0
 
 
