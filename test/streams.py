@@ -16,7 +16,6 @@ MS = 1_000_000
 S = 1_000_000_000
 START = 1_717_171_717 * S  # beyond what a float64 holds to the nanosecond
 POSE = 'geometry_msgs/msg/PoseStamped'
-POINT = 'geometry_msgs/msg/PointStamped'
 TRANSFORM = 'geometry_msgs/msg/TransformStamped'
 RANGE = 'sensor_msgs/msg/Range'
 TRACKER = Source('measured_pose')
@@ -72,10 +71,6 @@ def pose(stamp_ns, position, rotation=None):
     turn = xyzw(np.eye(3) if rotation is None else rotation)
     both = SimpleNamespace(position=xyz(position), orientation=turn)
     return SimpleNamespace(header=header(stamp_ns), pose=both)
-
-
-def point(stamp_ns, position):
-    return SimpleNamespace(header=header(stamp_ns), point=xyz(position))
 
 
 def transform(stamp_ns, position, child, rotation=None):

@@ -14,6 +14,8 @@ from launching import ROOT, nodes, parameters_of
 from calib_ros.errors import ConfigError
 from calib_ros.ros.arguments import rviz_config
 
+QUIET = {'rviz': 'false', 'diagnostics': 'false'}
+
 
 def test_a_cell_has_all_that_belongs_to_it(launched, tmp_path, monkeypatch):
     ends = []
@@ -65,15 +67,13 @@ def test_the_chain_of_a_parameter_file_holds_beside_a_urdf(launched, tmp_path):
     urdf, path = tmp_path / 'robot.urdf', tmp_path / 'node.yaml'
     urdf.write_text('<robot name="arm"/>')
     path.write_text('/**: {ros__parameters: {chain: ur10e}}')
-    quiet = {'rviz': 'false', 'diagnostics': 'false'}
-    actions, _ = launched('cell.launch.py', urdf=str(urdf), params_file=str(path), **quiet)
+    actions, _ = launched('cell.launch.py', urdf=str(urdf), params_file=str(path), **QUIET)
     words = nodes(actions)['calibration_node']['ros_arguments']
     assert parameters_of(words)['chain'] == 'ur10e'
 
 
 def test_a_node_that_was_killed_goes_on_with_its_samples(launched):
-    quiet = {'rviz': 'false', 'diagnostics': 'false'}
-    actions, context = launched('cell.launch.py', chain='ur10e', serial='0012', **quiet)
+    actions, context = launched('cell.launch.py', chain='ur10e', serial='0012', **QUIET)
     assert set(nodes(actions)) == {'calibration_node'}
     for _ in range(2):  # it may be killed again
         handler = next(each for each in actions if type(each).__name__ == 'RegisterEventHandler')
