@@ -51,29 +51,21 @@ def message(kind, stamp_ns, bodies):
     return STORE.types[kind](head, 3, found) if kind == MOCAP else STORE.types[kind](head, found)
 
 
-def write(path, events, storage='mcap', defined=True):
-    """Write (topic, message) in the order given, with the definitions that a recorder adds."""
+def write(path, events, storage='mcap', defined=None):
+    """Write (topic, message) in the order given, with the definitions that a recorder adds.
+
+    Bodies may be defined by another text.
+    """
     with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
         connections = {}
         for k, (topic, each) in enumerate(events):
             kind = each.__msgtype__
             if topic not in connections:
                 text, digest = STORE.generate_msgdef(kind, ros_version=2)
-                connections[topic] = writer.add_connection(
-                    topic, kind, msgdef=text if defined else '', rihs01=digest
-                )
+                if defined is not None and kind != JOINT_STATE:
+                    text = defined
+                connections[topic] = writer.add_connection(topic, kind, msgdef=text, rihs01=digest)
             writer.write(connections[topic], k + 1, STORE.serialize_cdr(each, kind))
-    return path
-
-
-def defined_by(path, text, come):
-    """Write a bag that defines the bodies by a text."""
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        joints = writer.add_connection('/joint_states', JOINT_STATE, typestore=STORE)
-        bodies = writer.add_connection('/bodies', MOCAP, msgdef=text, rihs01='RIHS01_0')
-        for k, (_, each) in enumerate(standing([])):
-            writer.write(joints, k + 1, STORE.serialize_cdr(each, JOINT_STATE))
-        writer.write(bodies, 1000, STORE.serialize_cdr(come, MOCAP))
     return path
 
 
@@ -152,7 +144,7 @@ def test_the_line_that_is_proposed_is_of_use_whatever_a_body_is_called(tmp_path,
 
 def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
     _, come = measured(rng, MOCAP)
-    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=False)
+    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined='')
     with pytest.raises(InputError, match=f'does not define {MOCAP}'):
         session_of(path, sources=(line(MOCAP),))
 
@@ -166,8 +158,8 @@ def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
     ],
 )
 def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
-    (come,) = measured(rng, MOCAP, [105])[1]
-    path = defined_by(tmp_path / 'bag', text, come)
+    _, come = measured(rng, MOCAP, [105])
+    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=text)
     with pytest.raises(InputError, match=f'defines {MOCAP} by what cannot be read'):
         session_of(path, sources=(line(MOCAP),))
 
@@ -182,7 +174,7 @@ def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
     ],
 )
 def test_another_message_of_that_name_is_told(tmp_path, rng, text):
-    (come,) = measured(rng, MOCAP, [105])[1]
-    path = defined_by(tmp_path / 'bag', text, come)
+    _, come = measured(rng, MOCAP, [105])
+    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=text)
     _, warnings = session_of(path, sources=(line(MOCAP),))
     assert 'a message on /bodies cannot be decoded' in ' '.join(warnings)
