@@ -85,7 +85,7 @@ def bumped_twice_and_scattered(clean, true, rng):
         (0, POSES, True, bumped_twice_and_scattered),
     ],
 )
-def test_gross_errors_are_named_and_harm_nothing(seed, count, oriented, spoil):
+def test_gross_errors_are_named_and_harm_nothing(unsearched, seed, count, oriented, spoil):
     """Nothing else is named, and the fit is that of the other samples."""
     rng, true, clean, unseen = cell(seed, oriented, count)
     seen, wrong = spoil(clean, true, rng)
