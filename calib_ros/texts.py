@@ -121,7 +121,7 @@ def parse_yaml(text: str, where: str, error: type[CalibrationError] = ConfigErro
     import yaml
 
     try:
-        _weigh(yaml.parse(text, _loader()), where, error)
+        _Scales(yaml.parse(text, _loader()), where, error).weigh()
         documents = [each for each in yaml.load_all(text, _loader()) if each is not None]
     except CalibrationError:
         raise
@@ -163,40 +163,35 @@ def _loader() -> Any:
     return Loader
 
 
-def _weigh(events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
-    """Refuse documents that would not fit into memory.
+class _Scales:
+    """Refuses documents that would not fit into memory with their aliases expanded.
 
     Scalar events have a value, lists and mappings a tag, aliases only an anchor, ends none.
     """
-    scales = _Scales(events, where, error)
-    for event in events:
-        if hasattr(event, 'anchor'):
-            scales.node(event, 0)
-        else:
-            scales.anchors.clear()
-
-
-class _Scales:
-    """Counts the nodes of documents with expanded aliases."""
 
     def __init__(self, events: Iterator[Any], where: str, error: type[CalibrationError]) -> None:
         self._events, self._where, self._error = events, where, error
-        self.anchors: dict[str, tuple[int, int]] = {}
+        self._anchors: dict[str, tuple[int, int]] = {}
 
-    def node(self, event: Any, above: int) -> tuple[int, int]:
+    def weigh(self) -> None:
+        for event in self._events:
+            if hasattr(event, 'anchor'):
+                self._node(event, 0)
+
+    def _node(self, event: Any, above: int) -> tuple[int, int]:
         """Return the number of values of a node, and its levels."""
         if hasattr(event, 'value'):
             nodes, height = 1 + len(event.value) // 20, 0
         elif hasattr(event, 'tag'):
             nodes, height = self._collection(event, above)
-        elif event.anchor in self.anchors:
-            nodes, height = self.anchors[event.anchor]
+        elif event.anchor in self._anchors:
+            nodes, height = self._anchors[event.anchor]
         else:
             raise self._error(f'{self._where}: alias "{event.anchor}" is not defined before it')
         if above + height > DEEPEST:
             raise self._error(f'{self._where} is nested deeper than {DEEPEST} levels')
         if event.anchor:
-            self.anchors[event.anchor] = nodes, height
+            self._anchors[event.anchor] = nodes, height
         return nodes, height
 
     def _collection(self, event: Any, above: int) -> tuple[int, int]:
@@ -210,7 +205,7 @@ class _Scales:
                 if key in keys:
                     raise self._error(f'{self._where}: key "{key}" appears twice')
                 keys.add(key)
-            more, levels = self.node(inner, above + 1)
+            more, levels = self._node(inner, above + 1)
             nodes, height = nodes + more, max(height, levels + 1)
             if nodes > MOST_NODES:
                 raise self._error(f'{self._where} has more than {MOST_NODES} values')
