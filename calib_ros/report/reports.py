@@ -52,7 +52,6 @@ def identification_report(
     reasons = reasons_of(result)
     text = filter(None, _text(result, reasons, tolerance))
     gain = sections.gain(judged) if result.accepted else ''
-    limits = interval_of(judged, 1)
     corrected, notes = 'none: not accepted', words.remarks(result)
     if result.accepted:
         corrected = table_hash(result.chain)
@@ -74,7 +73,7 @@ def identification_report(
             intervals=result.validation is not None,
         ),
         picture=sections.distribution(poses),
-        steps=_steps(result, reasons, limits, tolerance),
+        steps=_steps(result, reasons, tolerance),
         remarks=(*warnings, *notes),
         identity=sections.identity_of(
             result.chain,
@@ -163,17 +162,15 @@ def reasons_of(result: Identification) -> tuple[Advice, ...]:
 
 
 def _steps(
-    result: Identification,
-    reasons: Sequence[Advice],
-    limits: tuple[float, float],
-    tolerance: float | None,
+    result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> tuple[str, ...]:
     if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
         return ()
     if not result.accepted:
         return (reasons[0].again,)
-    beyond = tolerance is not None and limits[0] > tolerance
-    undecided = tolerance is not None and limits[0] <= tolerance < limits[1]
+    lower, upper = interval_of(result.validation or result.fitted, 1)
+    beyond = tolerance is not None and lower > tolerance
+    undecided = tolerance is not None and lower <= tolerance < upper
     found = {
         'First check what is named above. If it is true, remove the cause and identify again.': (
             bool(result.remarks)

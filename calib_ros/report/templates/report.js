@@ -144,8 +144,7 @@
   const [POINTS, OUTLIERS, VECTORS, ARM, AXES, PICKED] = [0, 1, 2, 3, 4, 7];
 
   function drawSpace() {
-    const none = xyz([]);
-    const [line, axes] = count ? arm(state.picked < 0 ? Math.floor(count / 2) : state.picked) : [none, [none, none, none]];
+    const [line, axes] = arm(state.picked < 0 ? Math.floor(count / 2) : state.picked);
     const wide = { type: 'scatter3d', hoverinfo: 'skip', mode: 'lines', showlegend: false };
     const traces = [
       { type: 'scatter3d', mode: 'markers', name: e.things, ...dots(), hoverinfo: 'text',
@@ -171,7 +170,7 @@
       else if (e.cells && point.curveNumber === POINTS) byId('picked').textContent = point.text;
     });
   }
-  const drawn = (id) => count > 0 && !waiting.has(id) && byId(id).data;
+  const drawn = (id) => !waiting.has(id) && byId(id).data;
 
   function update() {
     byId('scale-value').textContent = scale() + ' ×';
