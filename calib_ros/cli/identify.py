@@ -51,7 +51,6 @@ RESULT_FILES = (
     *('calibration.yaml', 'result.json', 'report.html', 'report.md', 'residuals.csv'),
     *('before_after.png', 'settings.yaml'),
 )
-OF_BAGS = ('joint_topics', 'sources', 'joint_names', 'frame_id')
 OF_UPDATES = ('new_base', 'new_tool')
 NOT_OF_UPDATES = ('history', 'tolerance', 'pdf', 'model', 'fixed', 'priors')
 
@@ -193,7 +192,8 @@ def _source(options: argparse.Namespace) -> str:
         raise InputError(
             'give a bag, or a table, or --detections FILE; a table and --detections go together'
         )
-    for name in OF_BAGS if source == 'table' else common.OF_TABLES:
+    of_bags = (*common.SETTINGS['bags: what is read'], 'frame_id')
+    for name in of_bags if source == 'table' else common.OF_TABLES:
         if getattr(options, name):
             instead = ': add eye_in_hand=true to its --sources' if name == 'eye_in_hand' else ''
             option = f'--{name.replace("_", "-")}'

@@ -43,6 +43,7 @@ def bad_inputs():
         yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be positive'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
     yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
+    yield 'useless delay', (*good, '--delay', '0.1'), '--delay does not apply to a table'
     yield 'useless session', (*bag_of, 'folder', '--session', 'A'), 'does not apply to a bag\n'
     yield 'useless side', (*bag_of, 'folder', '--eye-in-hand'), ': add eye_in_hand=true to its --'
     names = ('--joint-names', 'a,a,b,c,d,e,f')
