@@ -123,7 +123,8 @@ def _salvaged(
         if total is not None and not (total == found.count and problem == stored.NOT_CLOSED):
             lost = f'{max(0, total - found.count)} of {total} messages are lost'
         used = f'{count} messages could be read and are used, {lost}'
-        warnings = (*warnings, f'{path} is damaged ({shortened(problem)}): {used}')
+        why = shortened(problem or 'is a file of it missing?')
+        warnings = (*warnings, f'{path} is damaged ({why}): {used}')
     return Replayed(total, found.count, warnings)
 
 

@@ -182,8 +182,9 @@ def salvage(path: Path) -> Salvage | None:
 
 
 def _files(path: Path, kinds: Sequence[str] = UNPACKED) -> tuple[Path, ...]:
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return tuple(file for file in files if file.suffix in kinds)
+    files = path.iterdir() if path.is_dir() else [path]
+    ordered = sorted(files, key=lambda file: (len(file.name), file.name))  # bag_9 before bag_10
+    return tuple(file for file in ordered if file.suffix in kinds)
 
 
 def _open(file: Path) -> sqlite3.Connection:

@@ -1,8 +1,10 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import re
 import shutil
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +61,35 @@ def test_of_a_truncated_bag_the_rest_is_used(tmp_path, long_bags, storage, metad
     np.testing.assert_array_equal(whole.stamps_ns[index], part.stamps_ns)
     np.testing.assert_array_equal(whole.positions[index], part.positions)
     np.testing.assert_array_equal(whole.joints[index], part.joints)
+
+
+@storages
+def test_of_a_split_bag_a_missing_file_is_told(tmp_path, long_bags, storage):
+    path = shutil.copytree(long_bags[0] / storage, tmp_path / 'bag')
+    (file,) = (each for each in path.iterdir() if each.suffix != '.yaml')
+    text = (path / 'metadata.yaml').read_text()
+    text = text.replace(f'  - {file.name}\n', f'  - {file.name}\n  - bag_1{file.suffix}\n')
+    text = re.sub(r'(?m)^  message_count: [0-9]+', '  message_count: 1000000', text)
+    (path / 'metadata.yaml').write_text(text)
+    _, (warning,) = session_of(path)
+    assert 'damaged (is a file of it missing?): ' in warning
+
+
+@storages
+def test_the_files_of_a_split_bag_that_was_not_closed_are_in_order(tmp_path, storage):
+    for k in (0, 9, 10):
+        made = recording(20)
+        stamps, later = made.poses.stamps_ns, k * 10**11
+        made = replace(
+            made, joint_stamps_ns=made.joint_stamps_ns + later, poses=made.poses.at(stamps + later)
+        )
+        write_bag(tmp_path / 'part', made, storage)
+        (file,) = (each for each in (tmp_path / 'part').iterdir() if each.suffix != '.yaml')
+        (tmp_path / 'bag').mkdir(exist_ok=True)
+        file.rename(tmp_path / 'bag' / f'bag_{k}{file.suffix}')
+        shutil.rmtree(tmp_path / 'part')
+    session, _ = session_of(tmp_path / 'bag')
+    assert session.account().notes == {}
 
 
 @storages
