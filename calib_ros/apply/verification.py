@@ -284,11 +284,10 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
-    if not 0.0 < (1.0 if tolerance is None else tolerance) < np.inf or not 0.5 < confidence < 1.0:
-        raise ConfigError(
-            'tolerance must be positive, and finite, and confidence between 0.5 and 1, not '
-            f'{tolerance} and {confidence}'
-        )
+    if tolerance is not None and not 0.0 < tolerance < np.inf:
+        raise ConfigError(f'tolerance must be positive and finite, not {tolerance} m')
+    if not 0.5 < confidence < 1.0:
+        raise ConfigError(f'confidence must be between 0.5 and 1, not {confidence}')
     for each in sets:
         chain.joint_values(each.joints)
         if each.distances is not None or each.socket:

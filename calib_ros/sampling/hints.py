@@ -95,7 +95,8 @@ def ended(seconds: float) -> Hint:
     words = f'measurements go on for {seconds:.0f} s without joint states'
     return Hint(
         f'{words}: does the driver run?',
-        f'{words}: does the driver run, and name the joints as before? Repeat these poses',
+        f'{words}: does the driver run, and name the joints as before? Do the clocks agree? Then '
+        'repeat these poses',
     )
 
 

@@ -182,7 +182,7 @@ class CalibrationSession:
     @property
     def _different(self) -> str:
         """Return that one device measured in different frames, if it matters."""
-        frames = ', '.join(self._frames.different)
+        frames = ', '.join(name or 'one without name' for name in self._frames.different)
         return frames and f'poses came in different frames ({frames})'
 
     @property

@@ -345,9 +345,14 @@ def test_what_cannot_be_verified_is_refused(cell, arm):
     true = cell[0]
     joints = UR.random_joints(6, np.random.default_rng(0))
     seen = measured(true, joints)
-    for tolerance, confidence in ((0.0, 0.95), (1e-3, 0.4), (1e-3, 1.0), (np.nan, 0.95)):
-        with pytest.raises(ConfigError, match='tolerance must be positive'):
-            verify(arm, [seen], tolerance, confidence)
+    for tolerance in (0.0, np.nan, np.inf):
+        with pytest.raises(ConfigError, match=f'tolerance must be positive .* not {tolerance} m'):
+            verify(arm, [seen], tolerance, 0.95)
+    for confidence in (0.4, 1.0, 95.0):
+        with pytest.raises(
+            ConfigError, match=f'confidence must be .* 0.5 and 1, not {confidence}'
+        ):
+            verify(arm, [seen], None, confidence)
     with pytest.raises(InputError, match='4 poses were measured; at least 5'):
         verify(arm, [measured(true, joints[:4])], 1e-3)
     with pytest.raises(InputError, match='6 poses were measured; at least 7'):

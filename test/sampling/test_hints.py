@@ -181,6 +181,7 @@ def test_measurements_that_go_on_without_joint_states_are_told(seconds):
     )
     assert int(found[1]) == pytest.approx(seconds, abs=0.5)
     assert f'{found[1]} s without joint states: does the driver run?' in made.status()
+    assert 'Do the clocks agree?' in made.summary  # both zones of time look like this
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,13 @@ def renamed(tracked, frames):
     return source, kind, make
 
 
+def test_measurements_with_and_without_a_frame_are_told():
+    made = CalibrationSession(UR5E)
+    drive(made, 16, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), ''))])
+    with pytest.raises(InputError, match=r'different frames \(one without name, tracker\)'):
+        made.problem()
+
+
 @pytest.mark.parametrize('where', [0, 100])
 def test_a_stray_frame_is_counted_and_the_others_are_identified(where):
     """Also of the first measurement, which would make a sample of its own."""
