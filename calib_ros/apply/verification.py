@@ -186,7 +186,7 @@ def verify(
         mistake = mistakes.explained(Problem(arm.before, sets[0], more=sets[1:]), far=True)
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
-    limit = tolerance or arm.limit
+    limit = tolerance or arm.limit(sets)
     odd: tuple[int, ...] = ()
     if limit is not None:
         verdict = _decided(limit, lower, upper, numbers)

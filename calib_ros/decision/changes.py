@@ -138,8 +138,9 @@ class Information(Shown):
         sizes, directions = linalg.eigh(square / np.outer(scale, scale))
         root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
         inner = np.eye(len(scale)) + root.T @ self.matrix @ root
-        factor = linalg.cholesky(inner, lower=True)
-        left = linalg.solve_triangular(factor, root.T, lower=True)
+        values, axes = linalg.eigh(inner)
+        # less than one only by rounding, of poses far away
+        left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T
         return left.T @ (left @ self.vector), left.T @ left
 
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:

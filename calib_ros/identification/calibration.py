@@ -206,14 +206,14 @@ class Calibration(Shown):
             )
         return left
 
-    @property
-    def limit(self) -> float | None:
-        """Return the RMS error [m] of new poses up to which it holds, if known."""
-        return None if self.residual is None else ALIKE * self.residual
-
-    def holds(self, rms: float) -> bool | None:
-        """Tell whether the RMS error [m] of new poses agrees with the earlier one, if known."""
-        return None if self.limit is None else rms <= self.limit
+    def limit(self, sets: Sequence[Observations] = ()) -> float | None:
+        """Return the RMS error [m] of new poses up to which it holds there, if known."""
+        if self.residual is None:
+            return None
+        expected = [self.remaining(each.spread().joints) for each in sets]
+        known = np.concatenate(expected or [np.array([self.residual])])
+        sizes = np.nan_to_num(known, nan=self.residual)
+        return ALIKE * float(np.sqrt(np.mean(sizes**2)))
 
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that this calibration was fitted to, if known."""

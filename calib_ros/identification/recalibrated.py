@@ -55,8 +55,8 @@ class Recalibration(Shown):
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
         better = self.after.rms_mm <= self.refitted * self.before.rms_mm
-        agrees = better or self.calibration.holds(1e-3 * self.after.rms_mm)
-        fits = self.unexplained > changes.FALSE and bool(agrees)
+        agrees = better or 1e-3 * self.after.rms_mm <= (self.calibration.limit() or 0.0)
+        fits = self.unexplained > changes.FALSE and agrees
         return fits and self.determined and not (self.reused or self.scale)
 
     @property

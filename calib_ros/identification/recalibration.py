@@ -67,18 +67,13 @@ def recalibrate(
     `years` have passed. `growth` is the standard deviation [m] of the drift of lengths in a year;
     of angles twice that [rad]. `new` are frames of moved devices and of remounted targets.
 
-    Raises InputError if the calibration has no covariance, or does not know a frame, or if the
-    poses do not fit the arm at all; the message names the mistake that explains them, if any.
+    Raises InputError if the calibration has no covariance, or does not know a frame, or if a
+    mistake explains the poses.
     """
     require(Calibration, previous=previous)
     if mistake := mistakes.explained(problem, far=True):
         raise InputError(f'the new poses do not fit the arm at all: {mistake}')
-    try:
-        found, arm = _recalibrated(previous, problem, years, growth, new)
-    except np.linalg.LinAlgError as err:
-        raise InputError(
-            'the new poses do not fit the arm at all: check the arm, joint values and units'
-        ) from err
+    found, arm = _recalibrated(previous, problem, years, growth, new)
     if found.accepted or found.reused or found.scale is not None:
         return found
     for number, pose, rest in _without_one(problem, arm):

@@ -58,7 +58,7 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
         ),
     ),
     'holds': (
-        Verdict('good', f'The calibration holds: at most {ALIKE:g} times its former error'),
+        Verdict('good', f'The calibration holds: at most {ALIKE:g} times the expected error'),
         (TOLERANCE,),
     ),
     'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
@@ -140,8 +140,6 @@ def hints(found: Verification) -> list[str]:
             'is not active, or this is the corrected program: give the program as it was before '
             'calib_ros compensate'
         )
-    if found.verdict == 'does not hold' and not found.odd:
-        lines.append('the error has grown since the calibration was made')
     rms = 1e-3 * found.comparison.figures[1].rms_mm
     if found.mistake:
         lines.append(str(found.mistake))
@@ -191,7 +189,7 @@ def verification_report(
         names = ('Tolerance', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
         if found.tolerance is None:
             size = rounded(1e3 * found.limit)
-            names = (f'{ALIKE:g} times the former error', size, 'it holds', 'it no longer holds')
+            names = (f'{ALIKE:g} times the expected error', size, 'it holds', 'it no longer holds')
         what, size, good, bad = names
         text.append(
             f'{what}: {size} mm. If the whole interval is within it: '

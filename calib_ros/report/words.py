@@ -16,6 +16,7 @@ from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.noise import Noise
+from calib_ros.estimation.observations import Observations
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import reused_in_words
@@ -152,8 +153,10 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     )
 
 
-def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
-    """Return whether a calibration holds at the last stops, and why."""
+def checked(
+    previous: Calibration, found: Recalibration, sets: Sequence[Observations] = ()
+) -> tuple[bool, str]:
+    """Return whether a calibration holds at the last stops, those of sets, and why."""
     text = f'RMS {found.before.rms_mm:.3f} mm at the last {found.before.count} poses'
     if found.changed:
         reasons = changes_in_words(found.changed)
@@ -167,13 +170,16 @@ def checked(previous: Calibration, found: Recalibration) -> tuple[bool, str]:
             f'{text}, more than the calibration in use and noise explain; no change of a few '
             'parameters explains it: call ~/clear, measure new poses and call ~/identify'
         )
-    if previous.holds(_least_and_most(found.comparison, 0)[0]) is False:
+    if _least_and_most(found.comparison, 0)[0] > (previous.limit(sets) or np.inf):
         return False, _lost(previous, text)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
 
 def verdict(
-    calibration: Calibration, found: Comparison, reused: float = 0.0
+    calibration: Calibration,
+    found: Comparison,
+    reused: float = 0.0,
+    sets: Sequence[Observations] = (),
 ) -> tuple[Verdict, str]:
     """Return whether a calibration holds on samples, of which a share is `reused`, and why.
 
@@ -182,17 +188,18 @@ def verdict(
     nominal, now = found.figures
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
     text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
-    if calibration.residual is None:
+    limit = calibration.limit(sets)
+    if limit is None:
         text = f'no verdict, the calibration has no former error: {text}'
         return 'no verdict', f'{text}; judge with calib_ros verify --tolerance'
     least, most = _least_and_most(found, 1)
-    if not calibration.holds(least):
+    if least > limit:
         return 'does not hold', _lost(calibration, text)
-    text += f'; it had {1e3 * calibration.residual:.3f} mm'
+    text += f'; it had {1e3 * (calibration.residual or 0.0):.3f} mm'
     if warning := reused_in_words(reused):
         text = f'RMS {now.rms_mm:.3f} mm on {now.count} poses measured since'
         return 'no verdict', f'no verdict: {warning}; {text}'
-    if not calibration.holds(most):
+    if most > limit:
         text = f'too few poses to tell whether the calibration holds: {text}; measure more'
         return 'UNDECIDED', text
     return 'holds', f'the calibration holds: {text}'

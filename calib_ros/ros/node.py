@@ -296,17 +296,18 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _on_validate(self, request: Any) -> Answer:
         session, found = self.session, self.session.validate()
-        assert session.calibration is not None  # required to judge
-        verdict, text = words.verdict(session.calibration, found, session.reused())
-        chain = session.calibration.chain
-        row = partial(judged, chain, *found.figures, verdict)
-        filed = self._filer.file(session.problem, session.settings, row, table_hash(chain))
+        calibration, sets = session.since()
+        verdict, text = words.verdict(calibration, found, calibration.reused(sets), sets)
+        row = partial(judged, calibration.chain, *found.figures, verdict)
+        known = table_hash(calibration.chain)
+        filed = self._filer.file(session.problem, session.settings, row, known)
         return verdict == 'holds', text + filed
 
     def _on_check(self, found: tuple[Calibration, Problem]) -> Answer:
         calibration, problem = found
         years = years_since(calibration.record)
-        return words.checked(calibration, recalibrate(calibration, problem, years))
+        updated = recalibrate(calibration, problem, years)
+        return words.checked(calibration, updated, problem.all_sets)
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

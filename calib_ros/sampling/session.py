@@ -338,23 +338,18 @@ class CalibrationSession:
 
         Returns the errors of the nominal chain in its frames, and of the calibration.
         """
-        calibration, sets = self._since()
+        calibration, sets = self.since()
         return compare(calibration.before, calibration.chain, sets)
-
-    def reused(self) -> float:
-        """Return the share of later samples that the calibration was fitted to."""
-        calibration, sets = self._since()
-        return calibration.reused(sets)
 
     def recent(self) -> tuple[Calibration, Problem]:
         """Return the calibration, and the last stops since then as a problem."""
-        calibration, sets = self._since(NO_ACCIDENT)
+        calibration, sets = self.since(NO_ACCIDENT)
         cameras = {each.camera for each in sets if each.pixels is not None}
         seen = {name: lens for name in cameras if (lens := calibration.chain.frame(name).lens)}
         return calibration, Gathered(sets, lenses=seen).problem(self.chain, self.settings)
 
-    def _since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
-        """Return the calibration, and the poses measured since in its frames."""
+    def since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
+        """Return the calibration, and the samples since then in its frames, the last `most`."""
         calibration = self.calibration
         if calibration is None:
             raise InputError('there is no calibration to judge: identify or load one first')

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from designs import design_of
 from measured import rows_of, write_csv
-from verified import UR, in_words, measured, with_errors
+from verified import NOISE, UR, in_words, measured, with_errors
 
-from calib_ros import load_calibration
+from calib_ros import Calibration, Problem, identify, load_calibration
 from calib_ros.apply.candidates import Visibility
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.apply.verification import verify
 from calib_ros.cli.common import Status
 from calib_ros.files.programs import joints_csv, read_joints
@@ -148,3 +149,20 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
             assert found.verdict == 'no verdict'
             assert words in in_words(found)
             assert standing(found)[0].state == 'open'
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_a_calibration_holds_where_it_was_not_measured_if_no_worse_than_expected(seed):
+    """Two joints stood nearly still; then they move, and nothing else has changed."""
+    rng = np.random.default_rng(seed)
+    true = faulty(UR, Cell(), rng)
+    q = UR.random_joints(60, rng)
+    q[:, 1:3] = q[0, 1:3] + 0.05 * rng.normal(size=(60, 2))
+    seen = measure(true, q, rng, *NOISE)
+    arm = Calibration.of(identify(Problem(UR, seen, sigma_position=5e-5, sigma_orientation=2e-4)))
+    found = verify(arm, [measure(true, UR.random_joints(40, rng), rng, *NOISE)], None)
+    assert found.lower > 1.5 * arm.residual
+    assert found.verdict == 'holds'
+    near = verify(arm, [measure(true, q[:30] + 0.01, rng, *NOISE)], None)
+    assert near.verdict == 'holds'
+    assert near.limit < 1.2 * 1.5 * arm.residual

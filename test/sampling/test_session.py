@@ -270,8 +270,9 @@ def test_samples_that_were_fitted_are_known_again():
     made = session(samples())
     made.identify()
     made.adopt(parse_calibration(made.calibration.dump(), 'file'), ())
-    assert made.reused() == 1.0
-    found, words = verdict(made.calibration, made.validate(), made.reused())
+    calibration, sets = made.since()
+    assert calibration.reused(sets) == 1.0
+    found, words = verdict(calibration, made.validate(), 1.0, sets)
     assert found == 'no verdict'
     assert 'the calibration was fitted to these measurements' in words
 
