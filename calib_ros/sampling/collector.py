@@ -241,7 +241,7 @@ class Collector:
         self._round(begin)  # end earlier stops
         before, dropped = len(self.maker.fresh), self.dropped.copy()
         plan = Schedule(self._settled_ns, self._sampled_ns)
-        plan.sample(begin, newest)
+        plan.add(newest, '', begin)
         self._carry_out(plan)
         count = len(self.maker.fresh) - before
         if count:

@@ -113,16 +113,8 @@ class Schedule:
             self.ends.append(until)
             self.why.append(why)
             self.begins.append(begin)
-
-    def sampled(self, until: int) -> None:
-        """Skip the rest of a stop."""
-        self.add(until, SAMPLED)
-        self.sampled_ns = max(self.sampled_ns, self.done_ns)
-
-    def sample(self, begin: int, end: int) -> None:
-        """Make a sample of a stop."""
-        self.add(end, '', begin)
-        self.sampled_ns = end
+        if why in ('', SAMPLED):
+            self.sampled_ns = max(self.sampled_ns, self.done_ns)
 
     @property
     def stops(self) -> list[int]:
@@ -145,7 +137,7 @@ class Schedule:
                 continue
             self.add(begin, MOVING)
             if begin <= self.sampled_ns:
-                self.sampled(min(end, until))
+                self.add(min(end, until), SAMPLED)
                 continue
             if settings.mode == 'triggered':
                 self.add(min(end, until), 'not requested')
@@ -156,8 +148,8 @@ class Schedule:
             if last - begin < shortest:
                 self.add(last, 'the stop was too short')
                 continue
-            self.sample(begin, last)
-            self.sampled(min(end, until))
+            self.add(last, '', begin)
+            self.add(min(end, until), SAMPLED)
         self.add(until, MOVING)
 
 
