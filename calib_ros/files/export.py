@@ -40,6 +40,7 @@ from calib_ros.kinematics.chain import (
     JointType,
 )
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.kinematics.urdf import with_common_normals
@@ -83,7 +84,10 @@ def exports(
     range. `origin` is recorded. Raises ExportError if a file read back differs from the chain.
     """
     q = anywhere(chain)
-    arm, of_file = (replace(chain, effects=_couplings(each)) for each in (nominal, chain))
+    arm, of_file = (  # of the effects a chain file holds couplings
+        replace(chain, effects=tuple(e for e in each.effects if group_of(e[0]) == 'coupling'))
+        for each in (nominal, chain)
+    )
     others = [each for each in nominal.effects if each not in arm.effects]
     wanted = arm.forward(q)
     lost, of_file_lost = (
@@ -118,11 +122,6 @@ def exports(
         text = _csv(best, f'{nominal.convention} {what}{of_table}', error, digest)
         found.append(Export(name, text, error))
     return tuple(found)
-
-
-def _couplings(chain: Chain) -> tuple[tuple[str, float], ...]:
-    """Return the effects that a chain file holds."""
-    return tuple(e for e in chain.effects if Parameter(e[0]).effect[0] == 'coupling')
 
 
 def anywhere(chain: Chain) -> FloatArray:

@@ -244,7 +244,8 @@ class _Table:
                     self.notes.append(f'lengths are in {unit}, as its head says')
                     length = unit
         joints = [name for name in self._expressions if JOINT.fullmatch(name) and name[0] != 's']
-        slides = [name for name in joints if self._slides(name)]
+        types = [] if self._chain is None else [joint.type for joint in self._chain.joints]
+        slides = [name for name in joints if types[int(name[1:]) - 1 :][:1] == ['prismatic']]
         turns = [name for name in joints if name not in slides]
         lengths = self._told('length', length, (*POSITION, 'distance'), (*slides, *SIGMAS[:3]))
         angles = self._told('angle', layout.angle, (*TURNS, *IN_TURN), SIGMAS[3:])
@@ -308,11 +309,6 @@ class _Table:
                 'header says: write these columns in one unit'
             )
         return found.pop() if found else ''
-
-    def _slides(self, ours: str) -> bool:
-        """Return whether a column is of a prismatic joint."""
-        joints = () if self._chain is None else self._chain.joints
-        return any(each.type == 'prismatic' for each in joints[int(ours[1:]) - 1 :][:1])
 
 
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:

@@ -138,7 +138,10 @@ def _sheet(
     path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
-    decimal = layout.decimal or _decimal(rows, content.separator, notes)
+    commas = any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells)
+    decimal = layout.decimal or (',' if commas and content.separator != ',' else '.')
+    if decimal == ',' and not layout.decimal:
+        notes.append('numbers have decimal commas (--decimal)')
     at, header = _header(path, rows, names, known)
     used = [k for name in names if not name.startswith('#') for k in places(header, name)]
     used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
@@ -281,14 +284,6 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
     if best != 'comma':
         notes.append(f'cells are separated by {best}s (--separator)')
     return SEPARATORS[best]
-
-
-def _decimal(rows: Sequence[Row], separator: str, notes: list[str]) -> str:
-    commas = any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells)
-    if separator == ',' or not commas:
-        return '.'
-    notes.append('numbers have decimal commas (--decimal)')
-    return ','
 
 
 def _cells(path: Path, text: str, separator: str) -> list[Row]:

@@ -136,7 +136,6 @@ class Pipeline:
         # a stamp ahead by more than `lateness` would settle what has not arrived; joint states up
         # to `max_gap` apart belong together
         self.gate = Gate(max(settings.lateness + settings.max_gap, Settings.lateness))
-        self.notes: Counter[str] = Counter()
         self._delay_ns = round(settings.delay * 1e9)
         self._newest = {JOINTS: 0, POSES: 0}
 
@@ -202,7 +201,8 @@ class Pipeline:
                 newest = np.maximum(np.maximum.accumulate(times), self._newest[kind])
                 self._newest[kind] = int(newest[-1])
                 if back := int((times < newest).sum()):  # nothing is lost by it
-                    self.notes[f'{kind} with a stamp older than the one before'] += back
+                    note = f'{kind} with a stamp older than the one before'
+                    self.collector.notes[note] += back
         self.clocks.take(given.pieces)
         rounds = self.collector.take(given)
         if rounds:

@@ -211,7 +211,7 @@ class CalibrationSession:
         if self.settings.mode != 'continuous' and fitted:
             distinct = len(np.unique(configurations(np.array(fitted))))
         collector = self._collector
-        notes = self._pipeline.notes + collector.notes
+        notes = collector.notes.copy()
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
         return Account(
