@@ -350,10 +350,8 @@ class Collector:
         self._known.forget(sample.stamp_ns - round(1e9 * sample.delay))
 
     def _count_causes(self, cause: Index) -> None:
-        for k, text in enumerate(CAUSES[1:], start=1):
-            count = int((cause == k).sum())
-            if count:
-                self.dropped[f'measurements: {text}'] += count
+        for k, count in sorted(Counter(cause[cause > 0].tolist()).items()):
+            self.dropped[f'measurements: {CAUSES[k]}'] += count
 
     def start_anew(self) -> None:
         """Continue after the clock jumped back: finish earlier messages, keep the samples."""

@@ -129,6 +129,12 @@ def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
 
 def check_settings(chain: Chain, settings: Settings) -> None:
     """Refuse settings with a ConfigError that no identification of a chain could use."""
+    names = settings.joint_names or chain.joint_names
+    if not len(names) == len({*names}) == len(chain.joints):
+        raise ConfigError(
+            f'joint_names must be {len(chain.joints)} different names, one for each of '
+            f'{", ".join(chain.joint_names)}; not {", ".join(names)}'
+        )
     if settings.mode == 'continuous' and any(
         each.board for each in parse_sources(settings.sources)
     ):

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.result import Identification
-from calib_ros.errors import ConfigError, InputError, TooFewObservationsError
+from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -60,11 +60,6 @@ class CalibrationSession:
         self.on_sample = on_sample or (lambda sample: None)
         self.on_removed = on_removed or (lambda sample: None)
         self.joint_names = self.settings.joint_names or chain.joint_names
-        if not len(self.joint_names) == len({*self.joint_names}) == len(chain.joints):
-            raise ConfigError(
-                f'joint_names must be {len(chain.joints)} different names, one for each of '
-                f'{", ".join(chain.joint_names)}; not {", ".join(self.joint_names)}'
-            )
         check_settings(chain, self.settings)
         self.recording = True
         self.calibration: Calibration | None = None  # the last one accepted or loaded
@@ -80,6 +75,7 @@ class CalibrationSession:
         self._frames = FrameNames(settings.frame_id)
         self._names = JointNames(self.joint_names, self.chain.held)
         self._entry = Entry(self._names, self._frames, len(self.chain.joints))
+        self.received = self._entry.received  # messages by kind
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
         self.pictures.clear()
         self.samples: list[Sample] = []
@@ -110,11 +106,6 @@ class CalibrationSession:
         """Make samples of all waiting messages; no more will arrive."""
         self._pipeline.finish()
         self._settle(wait=True)
-
-    @property
-    def received(self) -> Counter[str]:
-        """Return the number of messages received, by kind."""
-        return self._entry.received
 
     @property
     def latest(self) -> tuple[int, Sequence[float]] | None:
