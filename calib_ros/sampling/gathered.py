@@ -86,41 +86,27 @@ def _seen(posed: Observations, samples: Sequence[Sample]) -> Observations:
 
 
 def _observations(samples: Sequence[Sample], posed: bool) -> Observations:
-    count = len(samples)
-    oriented = np.array([sample.rotation is not None for sample in samples])
-    rotations = np.tile(np.eye(3), (count, 1, 1))
-    covariance = np.full((count, 6, 6), np.nan)
-    positions = np.zeros((count, 3))
-    for k, sample in enumerate(samples):
-        if sample.position is not None:
-            positions[k] = sample.position
-        if sample.rotation is not None:
-            rotations[k] = sample.rotation
-        if sample.covariance is not None:
-            covariance[k] = sample.covariance
-    distances = None
-    if samples[0].distance is not None:
-        distances = np.array([sample.distance for sample in samples], dtype=np.float64)
-
-    def optional(name: str) -> FloatArray | None:
+    def filled(name: str, missing: FloatArray | float) -> FloatArray:
         rows = [getattr(sample, name) for sample in samples]
-        if all(row is None for row in rows):
-            return None
-        still = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
-        return np.array([still if row is None else row for row in rows], dtype=np.float64)
+        return np.array([missing if row is None else row for row in rows], dtype=np.float64)
 
+    def optional(name: str, missing: FloatArray | float) -> FloatArray | None:
+        none = all(getattr(sample, name) is None for sample in samples)
+        return None if none else filled(name, missing)
+
+    still = np.zeros(samples[0].joints.shape)  # at rest, approach unknown
     found = Observations(
         np.array([sample.stamp_ns for sample in samples], dtype=np.int64),
-        np.array([sample.joints for sample in samples], dtype=np.float64),
-        positions,
-        rotations,
-        oriented,
-        None if np.isnan(covariance).all() else covariance,
-        optional('approach'),
-        distances,
-        optional('velocity'),
-        optional('acceleration'),
-        optional('delay'),
+        filled('joints', still),
+        filled('position', np.zeros(3)),
+        filled('rotation', np.eye(3)),
+        np.array([sample.rotation is not None for sample in samples]),
+        optional('covariance', np.full((6, 6), np.nan)),
+        optional('approach', still),
+        optional('distance', np.nan),
+        optional('velocity', still),
+        optional('acceleration', still),
+        filled('delay', 0.0),
         socket=samples[0].socket,
         plane=samples[0].plane,
     )
