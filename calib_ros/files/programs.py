@@ -46,8 +46,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     Columns of held joints may be missing.
     """
     found = read_columns(path, ())
-    names = _header_of(found, chain)
-    program = _program(found, chain, names)
+    names, program = _program(found, chain)
     values, _ = joint_values(chain, program)
     check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ')
     return values
@@ -82,34 +81,23 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
         )
 
 
-def _header_of(found: Columns, chain: Chain) -> tuple[str, ...]:
-    """Return the columns of all joints; those of held ones may be missing."""
+def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], Program]:
+    """Return the columns of all joints, and the program; those of held ones may be missing."""
     joints = chain.joint_names
     *names, more = joint_columns(len(joints) + 1)
 
     def needed(names: Sequence[str]) -> list[str]:
         return [name for k, name in enumerate(names) if k not in chain.held]
 
-    for others in (list(joints), [name.upper() for name in names]):
-        if set(needed(others)) <= set(found.header) and not set(needed(names)) <= set(
-            found.header
-        ):
-            names = others
+    ways = (names, [*joints], [name.upper() for name in names])
+    names = next((each for each in ways if {*needed(each)} <= {*found.header}), names)
     if {more, more.upper()} & {*with_rows(found, needed(names)).header}:
         raise InputError(
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
-    return tuple(names)
-
-
-def _program(found: Columns, chain: Chain, names: Sequence[str]) -> Program:
-    """Return the joint values of columns, by the joints' names."""
-    given = {
-        name: column
-        for name, column in zip(chain.joint_names, names, strict=True)
-        if column in found.header
-    }
-    return Program(tuple(given), found.block(list(given.values())))
+    pairs = zip(joints, names, strict=True)
+    given = {joint: column for joint, column in pairs if column in found.header}
+    return tuple(names), Program(tuple(given), found.block(list(given.values())))
 
 
 def read_poses(path: Path) -> FloatArray:
@@ -165,8 +153,7 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 
 def _read_csv(text: str, path: Path, chain: Chain) -> ProgramFile:
     found = columns_of(path, text.encode())
-    names = _header_of(found, chain)
-    program = _program(found, chain, names)
+    names, program = _program(found, chain)
     signs = joint_columns(len(names), 's')
     known = [k for k, sign in enumerate(signs) if sign in found.header]
     if len({*known, *chain.held}) == len(signs):

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 from calib_ros.errors import ConfigError, UnknownNameError
@@ -119,10 +119,9 @@ def parse_source(text: str) -> Source:
         values.setdefault('type', TRANSFORMS)
     if 'board' in values:
         values.setdefault('type', PICTURES[topic.endswith('/compressed')])
-    source = Source(topic, **values)
-    if source.type.endswith('/Range') and not source.device:
-        source = replace(source, device=DISTANCE)
-    return source
+    if values.get('type', '').endswith('/Range'):
+        values['device'] = values.get('device') or DISTANCE
+    return Source(topic, **values)
 
 
 KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')

@@ -159,13 +159,12 @@ class Links:
         if not (self._fixed or self._moving):
             return []
         self._update()
-        found = []
-        for source, route in self._routes.items():
-            if isinstance(route, Route):
-                continue
-            words = route or f'nothing links frame "{source.child}" to "{source.parent}"'
-            found.append(f'{words} on {self.topic}; {self}')
-        return found
+        unlinked = 'nothing links frame "{0.child}" to "{0.parent}"'
+        return [
+            f'{route or unlinked.format(source)} on {self.topic}; {self}'
+            for source, route in self._routes.items()
+            if not isinstance(route, Route)
+        ]
 
     def __str__(self) -> str:
         if not self._moving:
