@@ -81,11 +81,11 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
     with closing(reader):
         available = stored.named((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
-        streams, recorded = _chosen(session, available, partial(stored.read, reader), defined)
+        streams, deserialise = _chosen(session, available, partial(stored.read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
         expected = sum(count for count in counts if isinstance(count, int) and count > 0)
         messages = stored.read(reader, streams)
-        count, problem = _feed(session, messages, recorded.deserialise, progress, expected)
+        count, problem = _feed(session, messages, deserialise, progress, expected)
     if problem is not None and count == 0 and (found := stored.salvage(folder)) is not None:
         return _salvaged(path, folder, found, session)
     _check_links(streams)
@@ -110,8 +110,8 @@ def _opened(path: Path, folder: Path) -> Any:
 def _salvaged(
     path: Path, folder: Path, found: stored.Salvage, session: CalibrationSession
 ) -> Replayed:
-    streams, recorded = _chosen(session, found.topics, found.on, {})
-    count, problem = _feed(session, found.on(streams), recorded.deserialise)
+    streams, deserialise = _chosen(session, found.topics, found.on, {})
+    count, problem = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     problem = problem or found.problem
     total = stored.recorded(folder if folder.is_dir() else folder.parent)
@@ -159,7 +159,7 @@ def _chosen(
     available: Mapping[str, str],
     messages_on: MessagesOn,
     definitions: Mapping[str, MessageDefinition],
-) -> tuple[dict[str, Stream], Recorded]:
+) -> tuple[dict[str, Stream], Deserialise]:
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
     recorded = Recorded(available, _decodable(messages_on), _deserialiser(defined))
     streams = choose(recorded, session.settings)
@@ -169,16 +169,10 @@ def _chosen(
                 f'the bag does not define {stream.type} of {topic}: record it on a computer with '
                 'that package'
             )
-    _check_joints(session, streams, recorded)
-    return streams, recorded
-
-
-def _check_joints(
-    session: CalibrationSession, streams: Mapping[str, Stream], recorded: Recorded
-) -> None:
     joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
     if len(joints) > 1 and not session.settings.joint_topics:
         check_joints(recorded, joints, session.joint_names)
+    return streams, recorded.deserialise
 
 
 def _check_links(streams: Mapping[str, Stream]) -> None:
