@@ -135,13 +135,12 @@ def converted(chain: Chain, convention: Convention) -> Chain:
         return chain
     tails = [{name: getattr(joint, name) for name in TAIL} for joint in chain.joints]
     none, base, tool = dict.fromkeys(TAIL, 0.0), chain.frame('base'), chain.frame('tool')
-    names = chain.joint_names
-    ends = {'modified': (names, names[1:]), 'standard': (names[1:], names)}[convention]
-    moved = dict(zip(*ends, strict=False))
+    moved = dict(zip(chain.joint_names, chain.joint_names[1:], strict=False))
     if convention == 'modified':
         tool = replace(tool, matrix=_tail(**tails[-1]) @ tool.matrix)
         tails = [none, *tails[:-1]]
     else:
+        moved = {after: before for before, after in moved.items()}
         base = replace(base, matrix=base.matrix @ _tail(**tails[0]))
         tails = [*tails[1:], none]
     joints = tuple(replace(j, **tail) for j, tail in zip(chain.joints, tails, strict=True))

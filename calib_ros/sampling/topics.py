@@ -101,17 +101,9 @@ def _learn(recorded: Recorded, streams: Mapping[str, Stream]) -> None:
 
 def outputs(available: Mapping[str, str]) -> set[str]:
     """Return the topics of calibration nodes, recognised by their MARKERS."""
-    nodes = [
-        topic.rpartition('/')[0]
-        for topic in available
-        if topic.rpartition('/')[2] in MARKERS and topic.rpartition('/')[0]
-    ]
-    known = {
-        f'{node}/'
-        for node in nodes
-        if all(available.get(f'{node}/{name}') == kind for name, kind in MARKERS.items())
-    }
-    return {topic for topic in available if topic.startswith(tuple(known))}
+    nodes = [each.removesuffix('status') for each in available if each.endswith('/status')]
+    known = [n for n in nodes if all(available.get(n + k) == kind for k, kind in MARKERS.items())]
+    return {topic for topic in available if topic.startswith(tuple(n for n in known if n != '/'))}
 
 
 def check_joints(
@@ -158,11 +150,6 @@ def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> 
 
 
 def _contents(available: Mapping[str, str]) -> str:
-    own = outputs(available)
-    return (
-        ', '.join(
-            f'{t} (own output)' if t in own else f'{t} ({short_type(kind)})'
-            for t, kind in sorted(available.items())
-        )
-        or 'nothing'
-    )
+    kinds = {topic: short_type(kind) for topic, kind in sorted(available.items())}
+    kinds |= dict.fromkeys(outputs(available), 'own output')
+    return ', '.join(f'{topic} ({kind})' for topic, kind in kinds.items()) or 'nothing'

@@ -56,8 +56,6 @@ def silences(stamps: Stamps, max_gap_ns: int) -> Stamps:
 
 def union(several: Sequence[Stamps]) -> Stamps:
     """Return the union (K, 2) of sorted lists of intervals."""
-    if len(several) == 1:
-        return several[0]
     found = np.concatenate(several)
     found = found[np.argsort(found[:, 0], kind='stable')]
     ends = np.maximum.accumulate(found[:, 1])
