@@ -55,8 +55,8 @@ class Rows:
         self._values[self.count : end, width:] = np.nan
         self.count = end
 
-    def keep(self, index: NDArray[np.generic]) -> None:
-        """Keep only the rows of a mask (N,) or an index (K,), in its order."""
+    def keep(self, index: NDArray[np.generic] | slice) -> None:
+        """Keep only the rows of a mask (N,), a slice or an index (K,), in its order."""
         stamps = self.stamps[index]
         self._values[: len(stamps)] = self.values[index]
         self._stamps[: len(stamps)] = stamps
@@ -64,10 +64,7 @@ class Rows:
 
     def release(self, count: int) -> None:
         """Drop the first rows."""
-        left = self.count - count
-        self._values[:left] = self._values[count : self.count]
-        self._stamps[:left] = self._stamps[count : self.count]
-        self.count = left
+        self.keep(slice(count, None))
 
     def sort(self) -> int:
         """Sort the rows by stamp, one row each; return how many were dropped.

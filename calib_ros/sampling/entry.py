@@ -11,11 +11,11 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.messages import NO_STAMP, Readings
+from calib_ros.sampling.messages import JOINT_STATE, Readings, usable
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
-from calib_ros.values import LARGEST, MOST_NAMES
+from calib_ros.values import MOST_NAMES
 
 Layout: TypeAlias = tuple[Columns, Index]
 OTHERS = 'none of the joints in the message'
@@ -172,15 +172,9 @@ class Entry:
             values = numbers[:, index]
             for place in np.flatnonzero(index == NOWHERE):
                 values[:, place] = self._names.held[columns[place]]
-            size, good = np.abs(values).max(axis=1), np.ones(len(stamps), dtype=bool)
-            for wrong, cause in (
-                (stamps <= 0, NO_STAMP),
-                (~np.isfinite(size), 'NaN or infinite joint value'),
-                (size > LARGEST, 'joint value beyond 1e6'),
-            ):
-                if count := int((good & wrong).sum()):
-                    self.miss(JOINTS, count, cause)
-                    good &= ~wrong
+            good, causes = usable(JOINT_STATE, Readings(stamps, (), values))
+            for cause, count in causes.items():
+                self.miss(JOINTS, count, cause)
             if not good.all():
                 places, stamps, values = places[good], stamps[good], values[good]
             if not len(stamps):

@@ -185,10 +185,11 @@ class Intake:
         yield from self._decode(sorted(single))
 
     def _add(self, source: Source | None, kind: str, places: Index, found: Readings) -> None:
-        good, causes = usable(kind, found)
-        self.faults[JOINTS if source is None else POSES] += causes
-        if not good.all():
-            places, found = places[good], found.rows(good)
+        if source is not None:  # some joint states may be those of another robot
+            good, causes = usable(kind, found)
+            self.faults[POSES] += causes
+            if not good.all():
+                places, found = places[good], found.rows(good)
         if len(places):
             self.parts.append(Part(places, source, found))
 

@@ -103,10 +103,7 @@ def head_of(message: Any) -> tuple[int, str]:
 
 
 def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
-    """Return which readings (N,) can be used, and the causes of the others.
-
-    Joint states are not checked: some may be those of another robot.
-    """
+    """Return which readings (N,) can be used, and the causes of the others."""
     numbers, causes = found.numbers, Counter[str]()
     good = np.ones(len(numbers), dtype=bool)
 
@@ -116,9 +113,12 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
             causes[cause] += count
             good[wrong] = False
 
-    if kind == JOINT_STATE:
-        return good, causes
     refuse(found.stamps_ns <= 0, NO_STAMP)
+    if kind == JOINT_STATE:
+        size = np.abs(numbers).max(axis=1)
+        refuse(~np.isfinite(size), 'NaN or infinite joint value')
+        refuse(size > LARGEST, 'joint value beyond 1e6')
+        return good, causes
     if kind in PICTURES:
         return good, causes
     width = numbers.shape[1]
