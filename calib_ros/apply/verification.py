@@ -116,8 +116,7 @@ class Verification(Shown):
     uncorrected: bool = False
     """Whether all measurements were taken at the joint values of the program as it was given."""
     odd: tuple[int, ...] = ()
-    """Configurations without which the others would be within the limit: few that are far off, or
-    all before or after some moment."""
+    """Configurations without which the others would be within the limit."""
     mistake: mistakes.Explained | None = None
     """What explains measurements that are further off than any arm."""
 
@@ -187,10 +186,9 @@ def verify(
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
     limit = tolerance or arm.limit(sets)
-    odd: tuple[int, ...] = ()
+    odd = () if limit is None else _odd(moments, lost, limit, confidence)
     if limit is not None:
         verdict = _decided(limit, lower, upper, numbers)
-        odd = _odd(moments, lost, limit, confidence)
     if mistake or (reused and verdict[0] != 'FAIL'):
         verdict = ('no verdict', None)
     if tolerance is None:

@@ -19,7 +19,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.levels import CERTAIN, CONFIDENT, MOST_OUTLIERS
+from calib_ros.estimation.levels import ALIKE, CERTAIN, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
 from calib_ros.settings import EXCEPTION
@@ -57,7 +57,10 @@ def refusals(
     gained = tuple(_of_the_gain(problem, result, validation, sized, scaled))
     before, after = validation.figures
     helps = after.rms_mm < before.rms_mm or all(each.rule is not Rule.GAIN for each in gained)
-    return (*failed, *gained, *_of_harm(validation, may_be_rounding, helps))
+    found = (*failed, *gained, *_of_harm(validation, may_be_rounding, helps))
+    # of a fit that explains nothing the parameters tell nothing
+    nothing = after.rms_mm > max(1e3 * problem.largest_error, before.rms_mm / ALIKE)
+    return tuple(sorted(found, key=lambda each: nothing and each.rule is Rule.COMMON_SENSE))
 
 
 def _of_the_fit(

@@ -168,11 +168,10 @@ def _apart(found: Verification) -> str:
         names = f'pose {first} alone is'
     elif last - first < len(found.odd):
         names = f'poses {first} to {last} alone are up to'
-    which = np.isin(found.group, found.odd)
-    away = rounded(1e3 * norms(found.comparison.after.position[which]).max())
+    far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
-        f'{names} {away} mm off; the others are within the limit: measure again, or find what '
-        'moved, was changed or was hit there'
+        f'{names} {rounded(far)} mm off; the others are within the limit: measure again, or find '
+        'what moved, was changed or was hit there'
     )
 
 
