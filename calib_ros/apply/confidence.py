@@ -77,9 +77,12 @@ def rms_interval(
 @lru_cache(maxsize=4)  # fitted and judged, before and after: many ask
 def interval_of(which: Comparison, when: int) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS before (0) or after (1), without outliers."""
-    residuals = (which.before, which.after)[when]
-    mask = which.deciding & ~np.isnan(residuals.position).any(axis=1)
-    return rms_interval(residuals.position[mask], residuals.configurations[mask])
+    known: dict[int, tuple[float, float]] = vars(which).setdefault('_intervals', {})
+    if when not in known:  # a report asks several times
+        residuals = (which.before, which.after)[when]
+        mask = which.deciding & ~np.isnan(residuals.position).any(axis=1)
+        known[when] = rms_interval(residuals.position[mask], residuals.configurations[mask])
+    return known[when]
 
 
 def freedom_of(moments: FloatArray) -> float:

@@ -37,8 +37,7 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
     kinds = [['length', 'position error [mm]']]
     kinds += [[axis, f'position error along {axis} [mm]'] for axis in 'xyz']
     kinds += [['angle', 'orientation error [mrad]']] if poses.oriented else []
-    judged = poses.select(poses.judged)
-    lengths = {when: _values(judged, 'length', when) for when in WHEN}
+    lengths = {when: _values(poses, 'length', when)[poses.judged] for when in WHEN}
     reach = float(np.linalg.norm(poses.position, axis=1).max())
     arrays = {
         'joints': shown.joints,
@@ -142,10 +141,11 @@ def _quantiles(values: FloatArray, place: Index) -> list[Any]:
 
 
 def _cells(poses: Poses) -> dict[str, Any]:
-    good = poses.select(~poses.outlier)
-    low = good.position.min(axis=0)
-    edge = max(float(np.ptp(good.position, axis=0).max()) / CELLS, 1e-9)
-    cell = ((good.position - low) / edge).astype(int)
+    good = ~poses.outlier  # no selection of all columns: with many poses that is large
+    position = poses.position[good]
+    low = position.min(axis=0)
+    edge = max(float(np.ptp(position, axis=0).max()) / CELLS, 1e-9)
+    cell = ((position - low) / edge).astype(int)
     number = cell @ (1, CELLS + 1, (CELLS + 1) ** 2)
     _, index, count = np.unique(number, return_inverse=True, return_counts=True)
 
@@ -154,9 +154,9 @@ def _cells(poses: Poses) -> dict[str, Any]:
         sums = [np.bincount(index, column, len(count)) for column in columns]
         return np.stack(sums, axis=1) / count[:, np.newaxis]
 
-    found: dict[str, Any] = {'count': count.tolist(), 'position': numbers(mean(good.position), 4)}
+    found: dict[str, Any] = {'count': count.tolist(), 'position': numbers(mean(position), 4)}
     for when in WHEN:
-        errors = 1e3 * getattr(good, when)
+        errors = 1e3 * getattr(poses, when)[good]
         squares = mean((errors**2).sum(axis=1))[:, 0]
         found[f'rms_{when}'] = numbers(np.sqrt(squares), 4)
         found[f'mean_{when}'] = numbers(mean(errors), 4)

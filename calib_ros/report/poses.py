@@ -116,7 +116,7 @@ class Poses:
             text = '\n'.join(form % row for row in zip(*columns, strict=True))
             parts.append(text.replace('nan', ''))
             progress(min(1.0, rows.stop / len(self)))
-        return '\n'.join(parts) + '\n'
+        return '\n'.join([*parts, ''])
 
 
 def _poses(
@@ -160,10 +160,10 @@ def _poses(
                 'tools': chain.frame(each.tool).matrix[np.newaxis],
             }
             parts.append(part)
-    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    tools = arrays.pop('tools')
-    order = np.argsort(arrays['stamps_ns'], kind='stable')
-    ordered = {name: array[order] for name, array in arrays.items()}
+    tools = np.concatenate([part.pop('tools') for part in parts])
+    order = np.argsort(np.concatenate([part['stamps_ns'] for part in parts]), kind='stable')
+    names = list(parts[0])  # let go one by one: of many poses they are large
+    ordered = {name: np.concatenate([p.pop(name) for p in parts])[order] for name in names}
     return Poses(**ordered, tools=tools, by_line=by_line, images=images, repeats=repeats)
 
 
