@@ -97,19 +97,14 @@ class Snapshot(NamedTuple):
     loaded: Loaded
     settings: Settings
     samples: tuple[Sample, ...]
-    numbers: dict[Sample, int]
+    numbers: dict[tuple[int, str, str], int]  # the operator's, by stamp, base and tool
     origin: dict[str, Any]
     configuration: str
 
     def numbers_of(self, outliers: Sequence[Outlier]) -> dict[Outlier, int]:
         """Return the operator's numbers of outlier samples."""
-        frames = named(self.samples)
-        known = {(each.stamp_ns, *frames.of(each)): self.numbers[each] for each in self.samples}
-        sets = self.loaded.problem.sets
-        return {
-            each: known[each.stamp_ns, sets[each.set].base, sets[each.set].tool]
-            for each in outliers
-        }
+        of = [(each.base, each.tool) for each in self.loaded.problem.sets]
+        return {each: self.numbers[(each.stamp_ns, *of[each.set])] for each in outliers}
 
 
 class Identifying:
@@ -153,10 +148,11 @@ class Identifying:
             'samples': len(samples),
             'journal': str(self._archive.journal or ''),
         }
-        numbers = {sample: k + 1 for k, sample in enumerate(session.samples)}
+        frames, number = named(samples), {each: k for k, each in enumerate(session.samples, 1)}
+        numbers = {(each.stamp_ns, *frames.of(each)): number[each] for each in samples}
         account, largest_loss = session.account(), self._node.get_parameter('largest_loss').value
         lost = tuple(too_much_lost(account, largest_loss)) if session.made else ()
-        owners, texts = named(samples).owners, (session.warnings, str(account))
+        texts, owners = (session.warnings, str(account)), frames.owners
         loaded = Loaded(problem, asdict(account), *texts, refusals=lost, owners=owners)
         known = numbers, origin, self._configuration()
         found = Snapshot(loaded, session.settings, samples, *known)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
@@ -51,6 +51,11 @@ class Hearing:
     full: int = 0  # how often the queue was full
     lost_before: int = 0
     losing: bool = False  # true if either grew between the last two looks
+
+    def note_deaf(self, policy: QoSPolicyKind) -> None:
+        """Note that the publisher's QoS does not match."""
+        latched = policy == QoSPolicyKind.DURABILITY
+        self.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
 
     def note_lost(self, total: int) -> None:
         """Count up to a total of lost messages; its change omits some.
@@ -95,13 +100,8 @@ class _Due:
 class Inputs:
     """Subscriptions to streams of messages, emptied by hand."""
 
-    def __init__(
-        self,
-        node: Node,
-        streams: Sequence[Stream],
-        guarded: Callable[[Callable[..., None]], Callable[..., None]],
-    ) -> None:
-        self._node, self._guarded = node, guarded
+    def __init__(self, node: Node, streams: Sequence[Stream]) -> None:
+        self._node = node
         self._topics: dict[str, Hearing] = {}
         self._looked_at = time.monotonic()
         self.failures: list[str] = []
@@ -155,10 +155,8 @@ class Inputs:
 
     def troubles(self) -> list[str]:
         """Return problems of topics as text."""
-        losing = [topic for topic, hearing in self._topics.items() if hearing.losing]
-        if not losing:
-            return self.failures
-        return [*self.failures, f'messages are lost on {", ".join(losing)}']
+        losing = ', '.join(topic for topic, hearing in self._topics.items() if hearing.losing)
+        return [*self.failures, *([f'messages are lost on {losing}'] if losing else [])]
 
     def figures(self) -> dict[str, Any]:
         """Return the diagnostics of each topic."""
@@ -183,6 +181,11 @@ class Inputs:
             raise ConfigError(f'"{stream.topic}" is no topic name: {why}') from err
         hearing = self._topics.setdefault(name, Hearing())
         hearing.latched = stream.still
+        events = SubscriptionEventCallbacks(
+            incompatible_qos=lambda event: hearing.note_deaf(event.last_policy_kind),
+            message_lost=lambda event: hearing.note_lost(event.total_count),
+            use_default_callbacks=False,  # reported by `_of_other_types`
+        )
         try:
             subscription = self._node.create_subscription(
                 _message_type(stream.type),
@@ -190,7 +193,7 @@ class Inputs:
                 lambda data: None,  # no executor serves it
                 _qos(stream),
                 qos_overriding_options=overriding,
-                event_callbacks=self._noting(hearing),
+                event_callbacks=events,
                 raw=True,
             )
         except RuntimeError as err:  # unknown policy
@@ -198,20 +201,6 @@ class Inputs:
         if subscription.qos_profile.depth < 1:
             raise ConfigError(f'the depth of qos_overrides for "{stream.topic}" must be >= 1')
         return subscription, (stream, hearing)
-
-    def _noting(self, hearing: Hearing) -> SubscriptionEventCallbacks:
-        def note_deaf(event: Any) -> None:
-            latched = event.last_policy_kind == QoSPolicyKind.DURABILITY
-            hearing.deaf = 'not latched, but that' if latched else 'best effort, but reliable'
-
-        def note_lost(event: Any) -> None:
-            hearing.note_lost(event.total_count)
-
-        return SubscriptionEventCallbacks(
-            incompatible_qos=self._guarded(note_deaf),
-            message_lost=self._guarded(note_lost),
-            use_default_callbacks=False,  # reported by `_of_other_types`
-        )
 
     def _of_other_types(self) -> list[str]:
         found = {}

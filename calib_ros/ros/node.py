@@ -96,7 +96,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         """Samples not kept in data_dir at the end, and why; empty if all were."""
         if given.resume:
             self._resume()
-        self._inputs = Inputs(self, self._streams(), self._boundary.guarded)
+        self._inputs = Inputs(self, self._streams())
         refuse_unknown(self, names)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
