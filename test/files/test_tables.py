@@ -250,6 +250,22 @@ def test_one_column_has_a_line_for_each_row(tmp_path):
     assert found.select(slice(1, None)).lines.tolist() == [3]
 
 
+def test_a_column_of_any_length_is_read_to_the_last_bit(tmp_path):
+    """Longer than the parts in which numpy reads it; each cell is read as Python reads it."""
+    path = tmp_path / 'long.csv'
+    cells = [
+        f'{x!r}{"0" * 90}' for x in np.random.default_rng(0).uniform(0.1, 2.0, 12_000).tolist()
+    ]
+    cells[5000], cells[-3:] = '', ['1_0', ' 2 ', '']
+    path.write_text('\n'.join(['q1,x', *(f'{cell},1' for cell in cells), '']))
+    found = read_columns(path, ['q1']).numbers(['q1', 'x'])
+    np.testing.assert_array_equal(found[:, 0], [float(cell or 'nan') for cell in cells])
+    cells[9000] = '1e400'
+    path.write_text('\n'.join(['q1', *cells, '']))
+    with pytest.raises(InputError, match=r'line 9002: q1 must be a finite number'):
+        read_columns(path, ['q1']).numbers(['q1'])
+
+
 @pytest.mark.parametrize('far', [3, 2**40])
 def test_rows_alike_have_one_number(far):
     """Also where their codes do not fit into one integer."""
