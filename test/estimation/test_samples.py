@@ -37,6 +37,38 @@ def test_weighted_rows_give_back_the_errors_in_metres(given):
     np.testing.assert_allclose(found[:, : expected.shape[1]], expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize('weighted', [False, True])
+@pytest.mark.parametrize(
+    'given',
+    [
+        lambda seen: seen,
+        lengths,
+        lambda seen: replace(seen, covariance=1e-8 * np.tile(SPREAD, (len(seen), 1, 1))),
+    ],
+    ids=['pose', 'distance', 'covariance'],
+)
+def test_products_of_effects_are_those_of_their_rows(given, weighted, monkeypatch):
+    """Effects of several joints, in any order of the names, over the ends of blocks."""
+    monkeypatch.setattr(samples_module, 'BLOCK', 16)
+    rng = np.random.default_rng(0)
+    joint, other = UR10E.joint_names[1], UR10E.joint_names[4]
+    effects = [f'{other}.sin_1', f'{joint}.cos_3', f'{other}.ratio', f'{joint}.sin_2']
+    chain = UR10E.with_effects(effects)
+    seen = given(measure(arm(0), UR10E.random_joints(40, rng), rng, 5e-5, 2e-4))
+    samples = Samples(seen, 3e-4, 7e-4)
+    if weighted:
+        samples = samples.weighted(rng.random(len(seen)))
+    names = [effects[0], *UR10E.parameter_names[:9], *effects[1:], 'tool.x']
+    folds = rng.integers(0, 3, size=len(seen))
+    found = samples.products(chain, names, 3, folds)
+    rows = samples.rows_of(chain, names)
+    for fold, products in enumerate(found.sum(axis=1)):
+        own = rows[..., folds == fold].reshape(len(rows), -1)
+        sizes = np.linalg.norm(own, axis=1) + 1e-12
+        both = np.outer(sizes, sizes)
+        np.testing.assert_allclose(products / both, own @ own.T / both, atol=1e-12)
+
+
 def test_residuals_are_those_of_the_joint_values_at_the_delay():
     """An arm at 0.3 rad/s, 50 ms before the stamps, before a tracker and before a camera."""
     rng = np.random.default_rng(0)
