@@ -157,6 +157,8 @@ def hints(found: Verification) -> list[str]:
             f'{100.0 * found.common:.2g} % of it: was the measuring device moved? If on purpose, '
             'give --new-base, and --new-tool for a new target'
         )
+    elif rms > 1e-3 * found.comparison.figures[0].rms_mm and not found.uncorrected:
+        lines.append('the nominal arm would be nearer: is the calibration that of this robot?')
     return lines
 
 

@@ -207,6 +207,16 @@ def test_the_repeatability_of_the_standard_needs_the_program(cell, arm, program)
         assert ('its place in the program' in str(page.accuracy)) is each.by_program
 
 
+@pytest.mark.parametrize(('seed', 'told'), [(0, False), (5, True)])
+def test_a_robot_that_is_not_that_of_the_calibration_is_told(arm, seed, told):
+    """With frames refitted, as in a plant; the nominal arm is nearer to any of them."""
+    other = simulation.faulty(UR, simulation.Cell(), np.random.default_rng(seed))
+    seen = measured(other, UR.random_joints(20, np.random.default_rng(3)))
+    found = verify(arm, [seen], 3e-4, new_base=True, new_tool=True)
+    assert (found.verdict == 'FAIL') is told
+    assert ('is the calibration that of this robot?' in in_words(found)) is told
+
+
 @pytest.mark.parametrize(('scale', 'told'), [(1.0, False), (1e3, True)])
 def test_what_no_arm_can_be_off_is_of_other_units(cell, arm, program, scale, told):
     seen = measured(cell[0], program)
