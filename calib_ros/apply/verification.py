@@ -166,8 +166,6 @@ def verify(
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
     require(Calibration, arm=arm)
-    if isinstance(sets, Observations) or not sets:
-        raise ConfigError('sets must be a list of Observations, at least one')
     _check(arm.chain, sets, tolerance, confidence, fitted)
     comparison, left, uncorrected = _compared(arm, sets, commanded, fitted)
     progress(2 / 3)
@@ -282,6 +280,8 @@ def _check(
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
+    if isinstance(sets, Observations) or not sets:
+        raise ConfigError('sets must be a list of Observations, at least one')
     if tolerance is not None and not 0.0 < tolerance < np.inf:
         raise ConfigError(f'tolerance must be positive and finite, not {tolerance} m')
     if not 0.5 < confidence < 1.0:
