@@ -81,11 +81,9 @@ def mobility(chain: Chain) -> tuple[int, int, int]:
     jacobian = _columns(chain, q).transpose(2, 1, 0)
     for part in (jacobian[:, :3], jacobian[:, 3:]):
         part /= max(float(np.linalg.norm(part, 2, (1, 2)).max()), SAME)
-    ranks = [
-        int(np.linalg.matrix_rank(part, BY_DESIGN).max())
-        for part in (jacobian, jacobian[:, :3], jacobian[:, 3:])
-    ]
-    return ranks[0], ranks[1], ranks[2]
+    parts = (jacobian, jacobian[:, :3], jacobian[:, 3:])
+    pose, place, turn = (int(np.linalg.matrix_rank(each, BY_DESIGN).max()) for each in parts)
+    return pose, place, turn
 
 
 def _columns(chain: Chain, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:

@@ -258,7 +258,7 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
             for key, default in (('multiplier', '1'), ('offset', '0'))
         )
         follows = mimic.get('joint', ''), ratio, offset
-    origin = _origin(element, where)
+    origin, _ = _placed(_child(element, 'origin'), f'origin of {where}')
     return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, follows)
 
 
@@ -267,12 +267,8 @@ def _inertial(link: ET.Element) -> tuple[float, FloatArray]:
     where = f'inertial of link "{link.get("name", "")}"'
     inertial = _child(link, 'inertial')
     mass = _numbers(_child(inertial, 'mass'), 'value', where, '0', 1)
-    return float(mass[0]), _origin(inertial, where)[:3, 3]
-
-
-def _origin(element: ET.Element, where: str) -> FloatArray:
-    origin = _child(element, 'origin')
-    return _placed(origin, f'origin of {where}')[0]
+    origin, _ = _placed(_child(inertial, 'origin'), f'origin of {where}')
+    return float(mass[0]), origin[:3, 3]
 
 
 def _placed(origin: ET.Element, where: str) -> tuple[FloatArray, FloatArray]:

@@ -81,16 +81,16 @@ class Pictures:
         for number in self._kept.keys() - numbers:
             del self._kept[number]
 
-    def through(self, made: Sequence[Sample]) -> None:
-        """Start to process the images of samples; `ready` returns them."""
+    def through(self, made: Sequence[Sample], wait: bool) -> list[Sample]:
+        """Start to process the images of samples; return finished ones in order.
+
+        With `wait` all of them are finished.
+        """
         for sample in made:
             if not sample.images:
                 self._queue.append((sample, None))
-            elif (found := self._begin(sample)) is not None:
-                self._queue.append((sample, found))
-
-    def ready(self, wait: bool = False) -> list[Sample]:
-        """Return finished samples in order; with `wait` all of them."""
+            elif (begun := self._begin(sample)) is not None:
+                self._queue.append((sample, begun))
         found: list[Sample] = []
         while self._queue:
             sample, looked = self._queue[0]

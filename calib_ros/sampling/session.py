@@ -371,8 +371,7 @@ class CalibrationSession:
         self.pictures.keep_only(self._collector.waiting.images)
 
     def _take(self, made: Sequence[Sample], wait: bool = False) -> int:
-        self.pictures.through(made)
-        fresh = self.pictures.ready(wait)
+        fresh = self.pictures.through(made, wait)
         self.samples += fresh
         self.made += len(fresh)
         for sample in fresh:
