@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 
 import numpy as np
 from scipy import special
@@ -74,7 +74,6 @@ def rms_interval(
     return float(lower[0]), float(upper[0])
 
 
-@lru_cache(maxsize=4)  # fitted and judged, before and after: many ask
 def interval_of(which: Comparison, when: int) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS before (0) or after (1), without outliers."""
     known: dict[int, tuple[float, float]] = vars(which).setdefault('_intervals', {})
