@@ -229,11 +229,16 @@ def gram(rows: FloatArray) -> FloatArray:
 def _add_products(found: FloatArray, rows: FloatArray, phi: FloatArray, motions: Index) -> None:
     """Add the products of effects, then motions (M + 1, c, N), to those `found`.
 
-    The rows of effects with phi (E, N), in the order of their `motions` (E,), are never formed:
-    their products are those of phi, weighted by the products of two motions at each sample.
+    Unless samples are few, the rows of effects with phi (E, N), in the order of their `motions`
+    (E,), are not formed: their products are those of phi, weighted by the products of two motions
+    at each sample.
     """
+    if len(motions) and rows.shape[2] < BLOCK // 4:
+        rows, motions = np.concatenate([rows[motions] * phi[:, np.newaxis], rows]), motions[:0]
     count = len(motions)
     found[count:, count:] += gram(rows)
+    if not count:
+        return
     ends = [*np.flatnonzero(np.diff(motions, prepend=-1)).tolist(), count]
     weighted = np.empty((len(found), rows.shape[2]))
     for number, (first, last) in enumerate(pairwise(ends)):
