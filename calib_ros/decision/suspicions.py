@@ -35,7 +35,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import EXPLAINED
-from calib_ros.errors import InputError
+from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SURE, TELLING, chance_of
@@ -123,8 +123,8 @@ def _sessions(problem: Problem, result: Identification) -> str:
     for first, *more in ([o.spread(SOME_POSES) for o in s] for s in sessions):
         try:
             alone = fit(replace(problem, observations=first, more=more, held_out=()))[2]
-        except (InputError, np.linalg.LinAlgError):
-            return ''  # too few to tell
+        except (CalibrationError, np.linalg.LinAlgError):
+            return ''  # too few to tell, or without what an effect needs
         worst = max(worst, alone.noise.position)
     if worst > NEARER * result.noise.position:
         return ''

@@ -82,6 +82,17 @@ def test_two_robots_in_two_sessions_are_not_averaged(seed, alike):
     assert said == ([] if alike else [Rule.MISTAKE])
 
 
+def test_a_session_that_cannot_be_fitted_alone_is_of_the_same_arm():
+    """Only the first has the signs of the last moves, which backlash needs."""
+    first, second = (seen_of(arm(), seed, 40) for seed in (1, 2))
+    signs = np.sign(np.random.default_rng(0).normal(size=first.joints.shape))
+    more = [replace(second, base='base_B', tool='tool_B')]
+    problem = Problem(UR, replace(first, approach=signs), more=more, effects=['backlash'])
+    result = identify(replace(problem, sigma_position=1e-5, sigma_orientation=4e-5))
+    assert not result.noise.consistent
+    assert result.refusals == ()
+
+
 @pytest.mark.parametrize('sigma', [0.05, 5e-3])
 @pytest.mark.parametrize('oriented', [True, False])
 def test_sigmas_in_millimetres_are_named(sigma, oriented):
