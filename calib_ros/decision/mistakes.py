@@ -28,14 +28,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
 from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
-from calib_ros.estimation.levels import (
-    ALIKE,
-    CONFIDENT,
-    MOST_OUTLIERS,
-    NEARER,
-    SEVERAL,
-    TRIED,
-)
+from calib_ros.estimation.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER, SEVERAL, TRIED
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses

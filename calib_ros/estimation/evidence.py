@@ -25,13 +25,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.estimation.considered import (
-    Doubted,
-    Doubts,
-    doubted_products,
-    lengths_of,
-    lenses,
-)
+from calib_ros.estimation.considered import Doubted, Doubts, doubted_products, lengths_of, lenses
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
