@@ -255,9 +255,9 @@ def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tup
     sizes = np.log(sums[:-1] / before), np.log((sums[-1] - sums[:-1]) / after)
     moment = 1 + int(np.argmin(before * sizes[0] + after * sizes[1]))
     outliers = np.flatnonzero(squares > OUTLIER**2 * np.median(squares))
-    for bad in (outliers, every[:moment], every[moment:]):
-        beyond = bad is outliers or limits(bad)[0] > limit
-        if beyond and limits(np.setdiff1d(every, bad))[1] <= limit < limits(every)[1]:
+    sides = [each for each in (every[:moment], every[moment:]) if limits(each)[0] > limit]
+    for bad in (outliers, *sides):
+        if limits(np.setdiff1d(every, bad))[1] <= limit < limits(every)[1]:
             return tuple(bad.tolist())
     return ()
 

@@ -6,6 +6,9 @@ Lens. If other intrinsics of a camera explain most of the residuals, the given o
 another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
 the lens it would be another arm, not just a more accurate one.
 
+Sessions. If sessions that share neither base nor tool fit far better alone, they are of two arms,
+or of one before and after something happened to it; their mean is neither.
+
 Motion. Stamps that jitter, clocks that drift, and smoothing of the device or of the joint states
 leave errors that are larger where the arm is faster or accelerates more; nothing of space does.
 
