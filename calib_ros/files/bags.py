@@ -77,7 +77,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
         found = stored.salvage(folder)
         if found is None:
             raise
-        return _salvaged(path, folder, found, session)
+        return _salvaged(path, folder, found, session, {})
     with closing(reader):
         available = stored.named((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
@@ -87,7 +87,8 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
         messages = stored.read(reader, streams)
         count, problem = _feed(session, messages, deserialise, progress, expected)
     if problem is not None and count == 0 and (found := stored.salvage(folder)) is not None:
-        return _salvaged(path, folder, found, session)
+        found.problem = found.problem or problem
+        return _salvaged(path, folder, found, session, defined)
     _check_links(streams)
     warnings = session.warnings
     if problem is not None:
@@ -108,9 +109,13 @@ def _opened(path: Path, folder: Path) -> Any:
 
 
 def _salvaged(
-    path: Path, folder: Path, found: stored.Salvage, session: CalibrationSession
+    path: Path,
+    folder: Path,
+    found: stored.Salvage,
+    session: CalibrationSession,
+    defined: Mapping[str, MessageDefinition],
 ) -> Replayed:
-    streams, deserialise = _chosen(session, found.topics, found.on, {})
+    streams, deserialise = _chosen(session, found.topics, found.on, defined)
     count, problem = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     problem = problem or found.problem

@@ -4,11 +4,12 @@
 
 import re
 import shlex
+import struct
 
 import numpy as np
 import pytest
 from recorded import MS, TYPES, header, pose, record, session_of, standing, storages
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from test_transforms import TIMES, frame, link, tf
 
@@ -147,6 +148,22 @@ def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
     path = write(tmp_path / 'bag', standing(come, '/bodies'), defined='')
     with pytest.raises(InputError, match=f'does not define {MOCAP}'):
         session_of(path, sources=(line(MOCAP),))
+
+
+def test_bodies_are_read_beside_a_wrong_index_too(tmp_path, rng):
+    _, come = measured(rng, MOCAP)
+    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    with Reader(path) as reader:
+        (chunk,) = reader.storage.storages[0].chunks
+    (file,) = path.glob('*.mcap')
+    right, wrong = (
+        struct.pack('<QQ', chunk.chunk_start_offset + off, chunk.chunk_length) for off in (0, 7)
+    )
+    file.write_bytes(file.read_bytes().replace(right, wrong))
+    session, (warning,) = session_of(path, sources=(line(MOCAP),))
+    assert session.account().samples == len(TIMES)
+    assert 'is damaged (' in warning
+    assert ', 0 of ' in warning
 
 
 @pytest.mark.parametrize(
