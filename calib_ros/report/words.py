@@ -170,8 +170,9 @@ def checked(
             f'{text}, more than the calibration in use and noise explain; no change of a few '
             'parameters explains it: call ~/clear, measure new poses and call ~/identify'
         )
-    if _least_and_most(found.comparison, 0)[0] > (previous.limit(sets) or np.inf):
-        return False, _lost(previous, text)
+    limit = previous.limit(sets)
+    if limit is not None and _least_and_most(found.comparison, 0)[0] > limit:
+        return False, LOST.format(text, 1e3 * limit)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
 
@@ -194,8 +195,8 @@ def verdict(
         return 'no verdict', f'{text}; judge with calib_ros verify --tolerance'
     least, most = _least_and_most(found, 1)
     if least > limit:
-        return 'does not hold', _lost(calibration, text)
-    text += f'; it had {1e3 * (calibration.residual or 0.0):.3f} mm'
+        return 'does not hold', LOST.format(text, 1e3 * limit)
+    text += f'; the limit is {1e3 * limit:.3f} mm'
     if warning := reused_in_words(reused):
         text = f'RMS {now.rms_mm:.3f} mm on {now.count} poses measured since'
         return 'no verdict', f'no verdict: {warning}; {text}'
@@ -212,13 +213,10 @@ def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
     return limits if np.isfinite(limits[1]) else (rms, rms)
 
 
-def _lost(calibration: Calibration, text: str) -> str:
-    return (
-        f'the calibration no longer holds: {text}; it had '
-        f'{1e3 * (calibration.residual or 0.0):.3f} mm. Was the tracker, target or robot moved?'
-    )
-
-
+LOST = (
+    'the calibration no longer holds: {}; the limit is {:.3f} mm. Was the tracker, target or '
+    'robot moved?'
+)
 BEFORE = 'the nominal chain with its base and tool frames fitted to the same measurements'
 
 

@@ -42,6 +42,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
     ]
     told = verdict(previous, both)
     assert told[0] == says
+    assert '; the limit is 0.150 mm' in told[1]
     assert told[1].startswith('too few poses to tell') == (says == 'UNDECIDED')
     same = checked(previous, updates[0])
     assert same[0] == (says != 'does not hold')
