@@ -78,7 +78,7 @@ class Screen:
     def bullet(self, text: str, steps: Sequence[str] = ()) -> None:
         """Print a reason or note, and what to do, in steps if several."""
         if self.quiet:
-            self.reasons += [f'{text} -> {step}' for step in steps[:1]]
+            self.reasons += [f'{text.removesuffix(":")} -> {step}' for step in steps[:1]]
             return
         _print(text, '- ')
         for k, step in enumerate(steps):

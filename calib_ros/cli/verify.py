@@ -103,6 +103,7 @@ def show(found: Verification, screen: Screen) -> None:
     )
     if found.each:
         screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
+    screen.reasons += remarks(found)
     for remark in remarks(found):
         screen.bullet(remark)
     if state.state in ('bad', 'open'):
