@@ -112,8 +112,8 @@ def limits(found: Verification) -> list[str]:
             '(--commanded) to test whether the correction reaches the arm'
         )
     turned = found.comparison.figures[1].rms_mrad
-    moved = found.common < NEARER
-    if turned is not None and turned > 1e3 * Settings.largest_angle and not moved:
+    explained = found.mistake or found.common < NEARER
+    if turned is not None and turned > 1e3 * Settings.largest_angle and not explained:
         lines.append(
             f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
             'their format (order of the quaternion or angles, degrees) and the target'

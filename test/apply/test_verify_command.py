@@ -148,6 +148,7 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
             found = verify(arm, [wrong], tolerance)
             assert found.verdict == 'no verdict'
             assert words in in_words(found)
+            assert 'the orientations are' not in in_words(found)
             assert standing(found)[0].state == 'open'
 
 
