@@ -33,10 +33,10 @@ IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration
 WORDS = {
     'bag': ('a bag', 'use identify or verify, or bag2csv to make a table'),
     'table': ('a table', 'use identify or verify, or csv2bag to make a bag'),
-    'program': ('a program', 'use compensate'),
+    'program': ('a JointTrajectory', 'use compensate'),
     'native': (
         "a program in a robot's own language",
-        'write its joint values [rad, m] as a CSV with q1 ... qn, and corrected ones back',
+        'to compensate it, write its joint values [rad, m] as a CSV with q1 ... qn',
     ),
     'chain': ('a YAML file', 'give an arm as --chain, a calibration as --calibration'),
     'urdf': ('a URDF', 'give it as --chain'),

@@ -73,7 +73,12 @@ def bad_inputs():
     yield (
         'a program of KUKA',
         (*bag_of, 'move.dat'),
-        "move.dat is a program in a robot's own language, but identify takes a table or a bag: wr",
+        "move.dat is a program in a robot's own language, but identify takes a table or a bag: to",
+    )
+    yield (
+        'a program of KUKA to compensate',
+        ('compensate', 'move.dat', '--chain', 'ur5e', '--calibration', 'none', '--out', 'o.csv'),
+        'but compensate takes a JointTrajectory or a YAML file or a table: to compensate it, wr',
     )
     yield 'no program', ('compare', 'start.dtx', 'none'), "start.dtx is a program in a robot's own"
     yield 'images as a table', (*bag_of, 'shots'), 'shots is a folder of images, but identify tak'
