@@ -104,16 +104,18 @@ def each_in_words(found: Verification) -> list[str]:
 
 
 def limits(found: Verification) -> list[str]:
-    """Return what the verdict leaves open."""
+    """Return what the verdict leaves open, or why there is none."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
+    if found.mistake:
+        return [*lines, str(found.mistake)]
     if not found.by_program:
         lines.append(
             'this judges the calibration, not the corrected robot: give the uncorrected program '
             '(--commanded) to test whether the correction reaches the arm'
         )
     turned = found.comparison.figures[1].rms_mrad
-    explained = found.mistake or found.common < NEARER
-    if turned is not None and turned > 1e3 * Settings.largest_angle and not explained:
+    moved = found.common < NEARER
+    if turned is not None and turned > 1e3 * Settings.largest_angle and not moved:
         lines.append(
             f'the orientations are {turned:.0f} mrad off, but only positions are judged: check '
             'their format (order of the quaternion or angles, degrees) and the target'
@@ -142,8 +144,8 @@ def hints(found: Verification) -> list[str]:
         )
     rms = 1e-3 * found.comparison.figures[1].rms_mm
     if found.mistake:
-        lines.append(str(found.mistake))
-    elif found.odd:
+        return lines
+    if found.odd:
         lines.append(_apart(found))
     elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
         lines.append(
@@ -186,7 +188,7 @@ def verification_report(
     ]
     if found.fitted:
         text.append('The interval allows for the refitted frames.')
-    if found.limit is not None:
+    if found.limit is not None and not found.mistake:
         names = ('Tolerance', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
         if found.tolerance is None:
             size = rounded(1e3 * found.limit)
