@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from scipy import special
@@ -74,14 +74,12 @@ def rms_interval(
     return float(lower[0]), float(upper[0])
 
 
+@lru_cache(maxsize=4)  # fitted and judged, before and after: a report asks several times
 def interval_of(which: Comparison, when: int) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS before (0) or after (1), without outliers."""
-    known: dict[int, tuple[float, float]] = vars(which).setdefault('_intervals', {})
-    if when not in known:  # a report asks several times
-        residuals = (which.before, which.after)[when]
-        mask = which.deciding & ~np.isnan(residuals.position).any(axis=1)
-        known[when] = rms_interval(residuals.position[mask], residuals.configurations[mask])
-    return known[when]
+    residuals = (which.before, which.after)[when]
+    mask = which.deciding & ~np.isnan(residuals.position).any(axis=1)
+    return rms_interval(residuals.position[mask], residuals.configurations[mask])
 
 
 def freedom_of(moments: FloatArray) -> float:
