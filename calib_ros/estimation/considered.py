@@ -171,7 +171,7 @@ def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doub
             for number, rows in enumerate(parts):
                 more = [unmodelled.columns(chain, columns, joints, rows)[-waves:]] if waves else []
                 bent = [bend[:, :, block]] if number == 0 else []  # distortion does not turn
-                flat = [each.reshape(len(each), -1) for each in (rows, *more, *bent)]
+                flat = [each.reshape(len(each), rows[0].size) for each in (rows, *more, *bent)]
                 products = np.block([[one @ other.T for other in flat] for one in flat])
                 found[: len(products), : len(products)] += products
     return found

@@ -51,6 +51,19 @@ def test_a_joint_whose_zero_has_slipped_is_named_and_mended_by_8_poses(earlier, 
     assert 0.5 < after / np.sqrt(np.mean(sigma**2)) < 2.0
 
 
+def test_distances_show_a_slipped_zero_of_a_wobbling_arm(earlier):
+    """They, pixels and sockets have no smooth errors of a device beside the waves."""
+    true, previous = earlier
+    previous = replace(previous, unmodelled=previous.unmodelled._replace(waves=1e-5))
+    now = true.with_offsets({'elbow_joint.theta': 2e-3})
+    seen = problem(now, 20, 1)
+    sizes = np.linalg.norm(seen.observations.positions, axis=1)
+    distances = replace(seen.observations, distances=sizes, oriented=np.zeros(20, dtype=bool))
+    found = recalibrate(previous, replace(seen, observations=distances), 0.1)
+    assert found.accepted
+    assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
+
+
 def test_a_bent_link_is_named(earlier):
     true, previous = earlier
     bent = {'a': 4e-4, 'alpha': -6e-4, 'beta': 5e-4, 'd': 3e-4}
