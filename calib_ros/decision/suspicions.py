@@ -113,7 +113,7 @@ def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:
 
 
 def _sessions(problem: Problem, result: Identification) -> str:
-    """Return that sessions with frames of their own fit far better alone: another arm in each."""
+    """Return that sessions with frames of their own fit far better alone: not of one arm."""
     sessions: list[list[Observations]] = []
     for each in problem.sets:
         mine = [s for s in sessions if any(each.base == o.base or each.tool == o.tool for o in s)]
@@ -123,7 +123,7 @@ def _sessions(problem: Problem, result: Identification) -> str:
     if len(sessions) < 2 or result.noise.consistent or moved:
         return ''
     worst = 0.0
-    for first, *more in ([o.spread(SOME_POSES) for o in s] for s in sessions):
+    for first, *more in (map(_some, s) for s in sessions):
         try:
             alone = fit(replace(problem, observations=first, more=more, held_out=()))[2]
         except (CalibrationError, np.linalg.LinAlgError):
@@ -132,10 +132,16 @@ def _sessions(problem: Problem, result: Identification) -> str:
     if worst > NEARER * result.noise.position:
         return ''
     return (
-        f'the sessions are not of one arm: alone each fits {result.noise.position / worst:.1f} '
-        'times as well or better. Is it the same robot, and did nothing happen to it in between? '
-        'Identify each alone (--session) and compare them'
+        f'one arm does not fit all sessions: alone each fits {result.noise.position / worst:.1f} '
+        'times as well or better. Is it the same robot, did nothing happen to it in between, and '
+        'are the devices true to scale? Identify each alone (--session) and compare them'
     )
+
+
+def _some(each: Observations) -> Observations:
+    """Return evenly spread poses or whole images."""
+    step = 1 + int(each.images[-1]) // SOME_POSES
+    return each if step == 1 else each.select(each.images % step == 0)
 
 
 def _motion(problem: Problem, result: Identification) -> str:

@@ -15,6 +15,7 @@ from calib_ros.decision.suspicions import _motion
 from calib_ros.kinematics.chain import Frame, Joint
 
 UR = load_chain('ur10e')
+NOT_OF_ONE_ARM = 'one arm does not fit all sessions'
 
 
 def seen_of(true, seed=0, count=60, oriented=True, noise=5e-5):
@@ -78,7 +79,7 @@ def test_two_robots_in_two_sessions_are_not_averaged(seed, alike):
     lever = replace(seen_of(arm(0), 3, 40), tool='tool_lever')
     result = identify(Problem(UR, seen_of(arm(0), 1, 40), more=(lever, second)))
     assert result.accepted == alike
-    said = [each.rule for each in result.refusals if 'the sessions are not of one arm' in each]
+    said = [each.rule for each in result.refusals if NOT_OF_ONE_ARM in each]
     assert said == ([] if alike else [Rule.MISTAKE])
 
 
@@ -91,6 +92,21 @@ def test_a_session_that_cannot_be_fitted_alone_is_of_the_same_arm():
     result = identify(replace(problem, sigma_position=1e-5, sigma_orientation=4e-5))
     assert not result.noise.consistent
     assert result.refusals == ()
+
+
+@pytest.mark.parametrize('seed', [0, 1])
+def test_images_of_two_robots_are_not_averaged(seed):
+    """Of 80 images a few points each, alone, would not fit."""
+    rng, camera = np.random.default_rng(3), Camera()
+    first, second = (
+        photograph(before_camera(arm(k), camera, POINTS, False, rng), camera, POINTS, False, *many)
+        for k, many in ((0, (80, rng, 0.1)), (seed, (80, rng, 0.1)))
+    )
+    second = replace(second, base='base_B', tool='tool_B')
+    chain = UR.with_frame('base', Frame(lens=camera.lens))
+    chain = chain.with_frame('base_B', Frame(lens=camera.lens))
+    result = identify(Problem(chain, first, more=[second], sigma_pixel=0.1))
+    assert any(NOT_OF_ONE_ARM in each for each in result.refusals) == (seed != 0)
 
 
 @pytest.mark.parametrize('sigma', [0.05, 5e-3])
