@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError, UnknownNameError, shortened
@@ -24,6 +24,8 @@ from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
+
+    Definitions: TypeAlias = Mapping[str, MessageDefinition]
 
 
 @dataclass(frozen=True)
@@ -74,10 +76,9 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
     try:
         reader = _opened(path, folder)
     except InputError:
-        found = stored.salvage(folder)
-        if found is None:
+        if (found := stored.salvage(folder)) is None:
             raise
-        return _salvaged(path, folder, found, session, {})
+        return _salvaged(path, found, session, {})
     with closing(reader):
         available = stored.named((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
@@ -88,7 +89,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
         count, problem = _feed(session, messages, deserialise, progress, expected)
     if problem is not None and count == 0 and (found := stored.salvage(folder)) is not None:
         found.problem = found.problem or problem
-        return _salvaged(path, folder, found, session, defined)
+        return _salvaged(path, found, session, defined)
     _check_links(streams)
     warnings = session.warnings
     if problem is not None:
@@ -109,17 +110,13 @@ def _opened(path: Path, folder: Path) -> Any:
 
 
 def _salvaged(
-    path: Path,
-    folder: Path,
-    found: stored.Salvage,
-    session: CalibrationSession,
-    defined: Mapping[str, MessageDefinition],
+    path: Path, found: stored.Salvage, session: CalibrationSession, known: Definitions
 ) -> Replayed:
-    streams, deserialise = _chosen(session, found.topics, found.on, defined)
+    streams, deserialise = _chosen(session, found.topics, found.on, known)
     count, problem = _feed(session, found.on(streams), deserialise)
     _check_links(streams)
     problem = problem or found.problem
-    total = stored.recorded(folder if folder.is_dir() else folder.parent)
+    total = stored.recorded(found.files[0].parent)
     if total is None and found.whole:
         total = found.count
     warnings = session.warnings
@@ -163,7 +160,7 @@ def _chosen(
     session: CalibrationSession,
     available: Mapping[str, str],
     messages_on: MessagesOn,
-    definitions: Mapping[str, MessageDefinition],
+    definitions: Definitions,
 ) -> tuple[dict[str, Stream], Deserialise]:
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
     recorded = Recorded(available, _decodable(messages_on), _deserialiser(defined))
@@ -207,7 +204,7 @@ def typestore() -> Any:
     return get_typestore(Stores.ROS2_JAZZY)
 
 
-def _deserialiser(defined: Mapping[str, MessageDefinition]) -> Deserialise:
+def _deserialiser(defined: Definitions) -> Deserialise:
     if not defined:
         return lambda data, kind: _decoded(typestore(), data, kind)
     from rosbags.interfaces import MessageDefinitionFormat
