@@ -31,7 +31,7 @@ test: prepared
 FUZZ_SECONDS ?= 600
 fuzz: $(VENV)/installed
 	$(call packages,--only-binary :all: atheris) \
-	    || echo 'no atheris for this Python: by chance'
+	    || echo 'no atheris for this Python: random variants only'
 	OMP_NUM_THREADS=1 $(BIN)/python test/fuzz/fuzz_run.py --seconds $(FUZZ_SECONDS)
 
 # Changes one thing at a time in the numeric folders and tells which changes no test notices; hours,

@@ -5,7 +5,7 @@
     python test/fuzz/fuzz_run.py [--seconds 180] [--jobs 2] [--targets table,urdf] [--seed 0]
 
 Each target runs in a process of its own: by atheris, which is led by the branches that an input
-reaches, or, where there is no atheris for this Python, by chance, which only varies the seeds.
+reaches, or, where there is no atheris for this Python, by random variants of the seeds.
 What breaks the contract is kept in `test/fuzz/failures`; put it into `test/fuzz/corpus`
 with its mend, and every test run replays it.
 """
