@@ -207,13 +207,19 @@ class Calibration(Shown):
         return left
 
     def limit(self, sets: Sequence[Observations] = ()) -> float | None:
-        """Return the RMS error [m] of new poses up to which it holds there, if known."""
+        """Return the RMS error [m] of new poses up to which it holds there, if known.
+
+        ALIKE times its former error, or the one expected there, but no more than it removes there.
+        """
         if self.residual is None:
             return None
-        expected = [self.remaining(each.spread().joints) for each in sets]
-        known = np.concatenate(expected or [np.array([self.residual])])
-        sizes = np.nan_to_num(known, nan=self.residual)
-        return ALIKE * float(np.sqrt(np.mean(sizes**2)))
+        former = ALIKE * self.residual
+        if not sets:
+            return former
+        joints = np.concatenate([each.spread().joints for each in sets])
+        sizes = np.nan_to_num(self.sigma(joints)), self.removed(joints)[0]
+        expected, removed = (float(np.sqrt(np.mean(each**2))) for each in sizes)
+        return max(former, min(ALIKE * expected, removed))
 
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that this calibration was fitted to, if known."""

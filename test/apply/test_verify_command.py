@@ -171,4 +171,11 @@ def test_a_calibration_holds_where_it_was_not_measured_if_no_worse_than_expected
     assert found.verdict == 'holds'
     near = verify(arm, [measure(true, q[:30] + 0.01, rng, *NOISE)], None)
     assert near.verdict == 'holds'
-    assert near.limit < 1.2 * 1.5 * arm.residual
+    assert near.limit == 1.5 * arm.residual
+
+
+def test_a_calibration_does_not_hold_only_because_nothing_was_known_there(arm):
+    """It removes 1.6 mm, and leaves 2.1: less than 1.5 times as much, but more."""
+    errors = np.random.default_rng(0).normal(scale=1.3e-3, size=(40, 3))
+    vague = replace(arm, region=replace(arm.region, square=1e6 * arm.region.square))
+    assert verify(vague, [with_errors(arm, errors)], None).verdict == 'does not hold'
