@@ -175,7 +175,7 @@ def _apart(found: Verification) -> str:
     far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
         f'{names} {rounded(far)} mm off; the others are within the limit: measure again, or find '
-        'what moved, was changed or was hit there'
+        'what moved, was changed or was hit; an arm may also be worse in a part of its range'
     )
 
 
