@@ -128,17 +128,13 @@ class Information(Shown):
 
     def marginalised(self, square: FloatArray) -> Information:
         """Return the information after marginalising expected changes of covariance (P, P)."""
-        mean, covariance = self.mean(square)
+        mean, covariance = self.mean(root_of(square))
         left = self.matrix - self.matrix @ covariance @ self.matrix
         return Information(self.names, left, self.vector - self.matrix @ mean)
 
-    def mean(self, square: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return posterior mean (P,) and covariance (P, P) of changes with prior N(0, square)."""
-        scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
-        sizes, directions = linalg.eigh(square / np.outer(scale, scale))
-        root = scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0))
-        inner = np.eye(len(scale)) + root.T @ self.matrix @ root
-        values, axes = linalg.eigh(inner)
+    def mean(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return posterior mean (P,) and covariance (P, P) with the prior N(0, root root^T)."""
+        values, axes = linalg.eigh(np.eye(root.shape[1]) + root.T @ self.matrix @ root)
         # less than one only by rounding, of poses far away
         left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T
         return left.T @ (left @ self.vector), left.T @ left
@@ -163,6 +159,13 @@ class Information(Shown):
         seen = scaled.T @ self.vector
         gain = float(seen @ np.linalg.solve(inner, seen))
         return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
+
+
+def root_of(square: FloatArray) -> FloatArray:
+    """Return a root (P, P) of a covariance (P, P), also of one that is singular by rounding."""
+    scale = np.sqrt(np.maximum(np.diag(square), 1e-300))
+    sizes, directions = linalg.eigh(square / np.outer(scale, scale))
+    return np.asarray(scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0)))
 
 
 def explanations(

@@ -17,12 +17,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from calib_ros.decision import changes, mistakes
-from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information
+from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information, root_of
 from calib_ros.decision.comparison import Comparison, residuals
 from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
@@ -138,7 +139,8 @@ def _recalibrated(
         arm = replace(arm, square=arm.square + columns.spread(reasons))
         found = arm.solved(system)
     rows, fitted = system.rows, len(names)
-    left = found.squares - float(found.information.vector @ found.information.mean(arm.doubted)[0])
+    expected, _ = found.information.mean(root_of(arm.doubted))
+    left = found.squares - float(found.information.vector @ expected)
     result = Recalibration(
         _updated(arm, found, problem, changed),
         tuple(changed),
@@ -235,6 +237,11 @@ class _Arm:
         wandered = np.diag(np.square(sizes)) * max(years, 0.0)
         return cls(previous, chain, named, square + wandered, device)
 
+    @cached_property
+    def root(self) -> FloatArray:
+        """Return a root (P, P) of the covariance."""
+        return root_of(self.square)
+
     @property
     def doubted(self) -> FloatArray:
         """Return the covariance (P, P) of arm and device."""
@@ -284,7 +291,7 @@ class _Arm:
             matrix, gradient = products[:-1, :-1], products[:-1, -1]
             information = Information(self.names, matrix, gradient + matrix @ change)
             squares = float(products[-1, -1] + change @ (gradient + information.vector))
-            change, covariance = information.mean(self.square)
+            change, covariance = information.mean(self.root)
         return _Found(change, covariance, information, squares)
 
 
@@ -327,7 +334,7 @@ def _judged(
     for products in parts.sum(axis=0) - parts:
         matrix = products[:-1, :-1]
         rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
-        chains.append((earlier, arm.changed(*rest.mean(arm.square))))
+        chains.append((earlier, arm.changed(*rest.mean(arm.root))))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
     return Comparison(before, after, every)
