@@ -86,11 +86,6 @@ class Doubted(NamedTuple):
     cross: FloatArray
     doubtful: FloatArray
 
-    @classmethod
-    def nothing(cls, plain: FloatArray) -> Doubted:
-        """Return the products (Q, Q) of columns beside which nothing is doubted."""
-        return cls(plain, plain[:, :0], plain[:0, :0])
-
     @property
     def reduced(self) -> FloatArray:
         """Return the products (Q, Q) without what the doubtful columns explain."""

@@ -150,7 +150,8 @@ def posterior_of(
         doubts = Doubts(beside, lengths, by_device=bool(more))
         products = doubted_products(whole, every, system, doubts, noise)
     else:
-        products = Doubted.nothing(fitted.products / noise**2)
+        alone = fitted.products / noise**2
+        products = Doubted(alone, alone[:, :0], alone[:0, :0])
     plain, cross, doubtful = products
     offsets = np.append(fitted.offsets, np.zeros(len(plain) - 1 - len(names)))
     reduced = products.reduced
