@@ -147,14 +147,13 @@ def posterior_of(
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
     unsure = judging and bool(lengths) and scale < PRINTED and 'scale' not in known
     if more or beside:
-        doubts = Doubts(beside, lengths, by_device=bool(more))
-        products = doubted_products(whole, every, system, doubts, noise)
+        sums = doubted_products(whole, every, system, Doubts(beside, lengths, bool(more)), noise)
     else:
         alone = fitted.products / noise**2
-        products = Doubted(alone, alone[:, :0], alone[:0, :0])
-    plain, cross, doubtful = products
+        sums = Doubted(alone, alone[:, :0], alone[:0, :0])
+    plain, cross, doubtful = sums
     offsets = np.append(fitted.offsets, np.zeros(len(plain) - 1 - len(names)))
-    reduced = products.reduced
+    reduced = sums.reduced
     alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
     vector = matrix @ offsets + reduced[:-1, -1]
     also = ['scale'] if lengths else []
