@@ -157,6 +157,17 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
             assert words in told
 
 
+def test_with_quiet_a_bad_verdict_tells_its_reasons(cell, folder, run):
+    seen = measured(cell[0], UR.random_joints(10, np.random.default_rng(3)), 1)
+    write_csv(folder / 'measured.csv', rows_of(seen, 0))
+    status, out, err = run(*VERIFY, 'result', '--length', 'mm', '--quiet')
+    assert (status, out) == (3, '')
+    verdict, why, steps = [each for each in err.splitlines() if each.startswith('calib_ros: ')]
+    assert verdict == 'calib_ros: No verdict: the measurements do not fit the arm'
+    assert 'the positions are in metres, not mm: --length m (' in why
+    assert steps.startswith('calib_ros: what to do -> Check what is named ')
+
+
 @pytest.mark.parametrize('seed', [1, 2])
 def test_a_calibration_holds_where_it_was_not_measured_if_no_worse_than_expected(seed):
     """Two joints stood nearly still; then they move, and nothing else has changed."""
