@@ -61,6 +61,16 @@ class Status(IntEnum):
     """Of a fleet: measurements of some robots could not be used, and no robot needs a look."""
 
 
+def refuse_ignored(options: argparse.Namespace, source: str) -> None:
+    """Refuse options that a bag, or a table, would ignore."""
+    of_bags = (*SETTINGS['bags: what is read'], 'frame_id')
+    for name in of_bags if source == 'table' else OF_TABLES:
+        if vars(options).get(name):
+            instead = ': add eye_in_hand=true to its --sources' if name == 'eye_in_hand' else ''
+            option = f'--{name.replace("_", "-")}'
+            raise InputError(f'{option} does not apply to a {source}{instead}')
+
+
 def complete_robots(prefix: str, **_: Any) -> list[str]:
     """Return completions of a robot or file name."""
     from glob import glob

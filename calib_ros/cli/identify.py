@@ -192,12 +192,7 @@ def _source(options: argparse.Namespace) -> str:
         raise InputError(
             'give a bag, or a table, or --detections FILE; a table and --detections go together'
         )
-    of_bags = (*common.SETTINGS['bags: what is read'], 'frame_id')
-    for name in of_bags if source == 'table' else common.OF_TABLES:
-        if getattr(options, name):
-            instead = ': add eye_in_hand=true to its --sources' if name == 'eye_in_hand' else ''
-            option = f'--{name.replace("_", "-")}'
-            raise InputError(f'{option} does not apply to a {source}{instead}')
+    common.refuse_ignored(options, source)
     return source
 
 

@@ -115,7 +115,9 @@ def _sets(
 ) -> tuple[Sequence[Observations], tuple[str, ...], bool]:
     """Return the sets between the calibration's frames of their devices and targets."""
     settings = common.settings_of(options)
-    if refuse_others(options.measured, 'verify', 'table', 'bag') == 'table':
+    kind = refuse_others(options.measured, 'verify', 'table', 'bag')
+    common.refuse_ignored(options, kind)
+    if kind == 'table':
         found = given.table(options, options.measured, nominal, settings, screen)
     else:
         session, read = given.replayed(options.measured, nominal, settings, screen)

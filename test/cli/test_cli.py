@@ -284,6 +284,8 @@ def test_json_of_a_verdict_alone_is_printed_and_has_no_infinity(of_two, run, tmp
     status, out, _ = run('verify', *judged, '0.3', '--confidence', str(np.nextafter(1.0, 0.0)))
     found = json.loads(out, parse_constant=pytest.fail)
     assert (status, found['verdict'], found['upper_mm']) == (3, 'UNDECIDED', None)
+    status, _, err = run('verify', *judged, '0.3', '--sources', '/pose')
+    assert (status, '--sources does not apply to a table' in err) == (1, True)
 
 
 @pytest.mark.parametrize(
