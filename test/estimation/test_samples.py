@@ -18,7 +18,7 @@ def lengths(seen):
     return replace(seen, distances=distances, oriented=np.zeros(len(seen), dtype=bool))
 
 
-@pytest.mark.parametrize(
+KINDS = pytest.mark.parametrize(
     'given',
     [
         lambda seen: seen,
@@ -27,6 +27,9 @@ def lengths(seen):
     ],
     ids=['pose', 'distance', 'covariance'],
 )
+
+
+@KINDS
 def test_weighted_rows_give_back_the_errors_in_metres(given):
     rng = np.random.default_rng(0)
     seen = given(measure(arm(0), UR10E.random_joints(20, rng), rng, 5e-5, 2e-4))
@@ -38,15 +41,7 @@ def test_weighted_rows_give_back_the_errors_in_metres(given):
 
 
 @pytest.mark.parametrize('weighted', [False, True])
-@pytest.mark.parametrize(
-    'given',
-    [
-        lambda seen: seen,
-        lengths,
-        lambda seen: replace(seen, covariance=1e-8 * np.tile(SPREAD, (len(seen), 1, 1))),
-    ],
-    ids=['pose', 'distance', 'covariance'],
-)
+@KINDS
 def test_products_of_effects_are_those_of_their_rows(given, weighted, monkeypatch):
     """Effects of several joints, in any order of the names, over the ends of blocks."""
     monkeypatch.setattr(samples_module, 'BLOCK', 16)
