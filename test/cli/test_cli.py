@@ -96,6 +96,17 @@ def test_out_writes_every_file(written):
     assert 'wrist_1_joint.theta' in files['report.md'].decode()
 
 
+def test_the_corrected_chain_is_a_chain_that_predicts(run, written):
+    corrected, table = written[0] / 'calibration.yaml', written[0].parents[1] / 'cell.csv'
+    q = UR.random_joints(1000, np.random.default_rng(99))
+    error = load_chain(corrected).forward(q) - TRUE.forward(q)
+    assert np.sqrt((error[:, :3, 3] ** 2).sum(axis=1).mean()) < 1e-4
+    assert np.abs(error[:, :3, :3]).max() < 1e-3
+    _, out, _ = run('identify', table, '--chain', corrected, '--json')
+    before, after = (json.loads(out)['validation'][when]['rms_mm'] for when in ('before', 'after'))
+    assert before == pytest.approx(after, abs=1e-4)
+
+
 @pytest.mark.parametrize(
     ('storage', 'held_out', 'oriented'), [('mcap', TEST, True), ('sqlite3', 0, False)]
 )
