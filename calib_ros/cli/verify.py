@@ -88,7 +88,7 @@ def show(found: Verification, screen: Screen) -> None:
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
     elif found.limit is not None:
-        tolerance += f': {rounded(1e3 * found.limit)} mm, {ALIKE:g} x expected error'
+        tolerance += f': {rounded(1e3 * found.limit)} mm, at most {ALIKE:g} x expected error'
     state, steps = standing(found)
     screen.title(state.heading, STATES.get(state.state))
     screen.table(

@@ -192,7 +192,8 @@ def verification_report(
         names = ('Tolerance', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
         if found.tolerance is None:
             size = rounded(1e3 * found.limit)
-            names = (f'{ALIKE:g} times the expected error', size, 'it holds', 'it no longer holds')
+            what = f'Limit, at most {ALIKE:g} times the expected error'
+            names = (what, size, 'it holds', 'it no longer holds')
         what, size, good, bad = names
         text.append(
             f'{what}: {size} mm. If the whole interval is within it: '
