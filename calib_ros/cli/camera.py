@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from calib_ros.atomic import write_file, write_together
 from calib_ros.cli import common
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.atomic import write_file
 from calib_ros.cli import common, given
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from calib_ros.cli.common import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from calib_ros.cli import common, given
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import STATES, Screen
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.comparison import Comparison

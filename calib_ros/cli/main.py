@@ -96,7 +96,7 @@ def _options(given: Sequence[str]) -> argparse.Namespace:
     if name not in COMMANDS:
         from pathlib import Path  # slow to load, not needed by the overview
 
-        from calib_ros.cli.kinds import proposal
+        from calib_ros.cli.file_types import proposal
 
         words = proposal(Path(name))
         if words is None:

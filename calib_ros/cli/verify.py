@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, given
-from calib_ros.cli.kinds import refuse_others
+from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import STATES, Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
