@@ -11,7 +11,7 @@ from pathlib import Path
 from calib_ros.atomic import write_file
 from calib_ros.cli import common
 from calib_ros.cli.file_types import refuse_others
-from calib_ros.cli.given import calibration_of
+from calib_ros.cli.inputs import calibration_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text

@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 from calib_ros.atomic import write_file
-from calib_ros.cli import common, given
+from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -25,7 +25,7 @@ def _convert(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.table, 'import', 'table')
     common.refuse_existing(options, options.out)
     chain = None if options.chain is None else load_chain(options.chain)
-    foreign = given.foreign_of(options, chain) or Foreign(Layout(), chain)
+    foreign = inputs.foreign_of(options, chain) or Foreign(Layout(), chain)
     with screen.work(f'converting {options.table.name}'):
         columns, notes = foreign.convert(options.table)
         check_table(columns)
@@ -62,7 +62,7 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.bag, 'bag2csv', 'bag')
     common.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
-    session, read = given.replayed(options.bag, chain, common.settings_of(options), screen)
+    session, read = inputs.replayed(options.bag, chain, common.settings_of(options), screen)
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:

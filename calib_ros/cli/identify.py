@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from calib_ros.cli import common, given
+from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import STATES, Screen
 from calib_ros.decision.changes import reason_in_words
@@ -67,7 +67,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             raise InputError(f'--{name.replace("_", "-")} {does} --previous')
     if update:
         return _recalibrated(options, screen)
-    filed = given.history_of(options)
+    filed = inputs.history_of(options)
     with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
@@ -75,7 +75,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if filed is not None:
         (history, unread), problem = filed, found.loaded.problem
         judged_by = options.largest_loss
-        about = given.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
+        about = inputs.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
         history.file(row_of(found.result, about, found.loaded.warnings))
     shown = () if found.result.accepted and not options.json else words.remarks(found.result)
     for warning in (*found.loaded.warnings, *shown):
@@ -97,7 +97,7 @@ def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
     with common.results(options, ('calibration.yaml', 'result.json')) as contents:
         loaded, _ = _loaded(options, screen)
         common.at_least(options, growth=0)
-        previous = given.calibration_of(
+        previous = inputs.calibration_of(
             options.previous, 'identify --previous', loaded.problem.chain
         )
         for warning in loaded.warnings:
@@ -159,7 +159,7 @@ def _identified(options: argparse.Namespace, screen: Screen) -> Identified:
     loaded, settings = _loaded(options, screen)
     configuration = documents.configuration_yaml(options.chain, settings)
     read = (options.csv, options.detections, options.measured)
-    origin = given.origin_of(options, read, configuration)
+    origin = inputs.origin_of(options, read, configuration)
     with screen.work('identifying') as work:
         result = loaded.identified(settings.model, work)
     return Identified(loaded, result, origin, options.tolerance)
@@ -175,9 +175,9 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     if options.detections is not None:
         return _detected(options, chain, settings, touched, screen), settings
     if source == 'table':
-        found = given.table(options, options.csv, chain, settings, screen, options.eye_in_hand)
+        found = inputs.table(options, options.csv, chain, settings, screen, options.eye_in_hand)
         return of_table(found, chain, settings, **touched), settings
-    bag = given.replayed(options.measured, chain, settings, screen)
+    bag = inputs.replayed(options.measured, chain, settings, screen)
     return of_bag(*bag, options.largest_loss), settings
 
 
@@ -220,7 +220,7 @@ def _detected(
     held_out: Sequence[Observations] = ()
     by_line = True
     if options.csv is not None:
-        rows = given.table(options, options.csv, chain, settings, screen)
+        rows = inputs.table(options, options.csv, chain, settings, screen)
         more, held_out, by_line = rows.fitted, rows.held_out, rows.by_line
         warnings = (*warnings, *rows.warnings)
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
@@ -347,7 +347,7 @@ def result_files(
             loaded.problem, result, poses, found.origin, loaded.warnings, found.wanted
         )
         contents['report.md'] = markdown(report, loaded.samples)
-        contents |= given.page_of(report, screen, pdf=pdf)
+        contents |= inputs.page_of(report, screen, pdf=pdf)
     if result.accepted:
         # the only device and target of a table may be any of a bag or node
         owners = loaded.owners if loaded.read or len(loaded.owners) > 2 else {}

@@ -15,7 +15,7 @@ from calib_ros.apply.design import ASSUMED_TOOL, Design
 from calib_ros.apply.planning import Plan
 from calib_ros.apply.simulation import measure
 from calib_ros.atomic import write_together
-from calib_ros.cli import common, given
+from calib_ros.cli import common, inputs
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
@@ -56,9 +56,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.say('\n'.join([*table, *remarks, *([VISIT] if plan is None else [])]))
     if options.out is not None:
         page = _page_beside(options.out)
-        origin = given.origin_of(options, (options.candidates, options.task, options.taken))
+        origin = inputs.origin_of(options, (options.candidates, options.task, options.taken))
         report = plan_report(design.chain, joints, remarks, origin, plan, options.accuracy)
-        pages = given.page_of(report, screen, page.name)
+        pages = inputs.page_of(report, screen, page.name)
         beside = {options.out.with_name(name): text for name, text in pages.items()}
         write_together({options.out: joints_csv(joints), **beside}, overwrite=options.force)
         screen.say(f'wrote {options.out}' + (f' and {page}' if pages else ''))

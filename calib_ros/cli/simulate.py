@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.apply.program import approaches
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.atomic import whole_folder, write_files
-from calib_ros.cli import common, given
+from calib_ros.cli import common, inputs
 from calib_ros.cli.identify import RESULT_FILES, Identified, result_files, show
 from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import of_bag
@@ -38,10 +38,10 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading the recording as if from a real cell')
-        loaded = of_bag(*given.replayed(bag, chain, settings, screen))
+        loaded = of_bag(*inputs.replayed(bag, chain, settings, screen))
         screen.say('3. identifying the errors')
         configuration = documents.configuration_yaml(options.chain, settings)
-        origin = given.origin_of(options, [bag], configuration)
+        origin = inputs.origin_of(options, [bag], configuration)
         with screen.work('identifying') as work:
             found = Identified(loaded, loaded.identified(settings.model, work), origin)
         screen.say('4. writing the report')

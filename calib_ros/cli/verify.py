@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from calib_ros.apply.verification import Verification, verify
-from calib_ros.cli import common, given
+from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import STATES, Screen
 from calib_ros.errors import InputError
@@ -44,9 +44,9 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _verified(options: argparse.Namespace, screen: Screen, contents: common.Contents) -> int:
-    filed = given.history_of(options)
+    filed = inputs.history_of(options)
     nominal = load_chain(options.chain)
-    arm = given.calibration_of(options.calibration, 'verify --calibration', nominal)
+    arm = inputs.calibration_of(options.calibration, 'verify --calibration', nominal)
     serial = arm.serial_of(str(options.calibration), options.serial or '')
     sets, warnings, by_line = _sets(options, nominal, arm, screen)
     commanded = read_joints(options.commanded, nominal) if options.commanded else None
@@ -58,7 +58,7 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
         history, unread = filed
         wanted = None if commanded is None else commanded.tolist()
         judged_by = (table_hash(arm.chain), options.tolerance, confidence, *moved, wanted)
-        about = given.filing_of(options, nominal, sets, unread, *judged_by)
+        about = inputs.filing_of(options, nominal, sets, unread, *judged_by)
         history.file(verified(arm.chain, found, about))
     for warning in warnings:
         screen.warn(warning)
@@ -73,11 +73,11 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
     read = (options.measured, options.commanded, calibration_file(options.calibration))
     with screen.work('writing the report') as work:
         poses = poses_to_verify(arm.chain, sets, found.comparison, by_line)
-        origin = replace(given.origin_of(options, read), serial=serial)
+        origin = replace(inputs.origin_of(options, read), serial=serial)
         report = verification_report(arm.chain, found, poses, origin, warnings)
         contents['residuals.csv'] = poses.table(share_of(work, 0.0, 2 / 3))
         contents['report.md'] = markdown(report, {})
-        contents |= given.page_of(report, screen, pdf=options.pdf)
+        contents |= inputs.page_of(report, screen, pdf=options.pdf)
     return status
 
 
@@ -118,9 +118,9 @@ def _sets(
     kind = refuse_others(options.measured, 'verify', 'table', 'bag')
     common.refuse_ignored(options, kind)
     if kind == 'table':
-        found = given.table(options, options.measured, nominal, settings, screen)
+        found = inputs.table(options, options.measured, nominal, settings, screen)
     else:
-        session, read = given.replayed(options.measured, nominal, settings, screen)
+        session, read = inputs.replayed(options.measured, nominal, settings, screen)
         screen.say(f'{read}; {session.account()}')
         if not session.usable:
             raise InputError(f'{options.measured} gives no poses: {session.account()}')

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib_ros.apply import workspace
 from calib_ros.apply.workspace import Survey, in_base, regions, task_of
-from calib_ros.cli import common, given
+from calib_ros.cli import common, inputs
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.files.programs import check_limits, csv_of, joints_csv, read_poses
@@ -36,7 +36,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
     from calib_ros.report import plots
 
-    arm = given.calibration_of(options.result, 'workspace', load_chain(options.chain))
+    arm = inputs.calibration_of(options.result, 'workspace', load_chain(options.chain))
     rng = np.random.default_rng(options.seed)
     task = _task(options, arm, rng)
     with screen.work('mapping errors over the workspace'):
@@ -60,11 +60,11 @@ def _files(options: argparse.Namespace, screen: Screen) -> common.Contents:
         contents['placements.csv'] = csv_of(('x', 'y', 'z', 'turn', 'error'), table)
         contents['placements.png'] = plots.placements_png(found)
         contents['placed_task.csv'] = joints_csv(found.joints[found.best])
-    origin = given.origin_of(options, (calibration_file(options.result),))
+    origin = inputs.origin_of(options, (calibration_file(options.result),))
     with screen.work('writing the report'):
         report = workspace_report(arm, survey, origin, found)
         contents['workspace.md'] = markdown(report, {})
-        return contents | given.page_of(report, screen)
+        return contents | inputs.page_of(report, screen)
 
 
 def _show(survey: Survey, screen: Screen) -> None:
