@@ -167,7 +167,7 @@ an earlier calibration (docs/history.md)
   --growth MM={1e3 * GROWTH}  expected drift of lengths in a year; angles: twice as many mrad
 {MOVED}
 ## Use the calibration
-# export calibrated._export  write a calibration for controllers, drivers and URDF users
+# export calibration._export  write a calibration for controllers, drivers and URDF users
 $ export result/calibration.yaml --chain ur10e --out export/
 $ export result/calibration.yaml --chain ur10e --urdf robot.urdf --out export/
 what to export
@@ -183,7 +183,7 @@ for URDF and drivers
   --tip-link LINK  last link of the arm in the URDF
   --ur-hash calib_...=  checksum that the Universal Robots driver prints at its start, for \
 ur_kinematics.yaml
-# compensate calibrated._compensate  correct the joint values of a program
+# compensate calibration._compensate  correct the joint values of a program
 $ compensate program.csv --chain ur10e --calibration result/ --out corrected.csv
 $ compensate path.yaml --chain ur10e --calibration result/ --out corrected.yaml
 what to correct
@@ -238,7 +238,7 @@ a task to place
   --turns N=1  turns about the vertical to try
 {REPORT}
 ## Over time
-# compare calibrated._compare  test what changed between two calibrations of one robot
+# compare calibration._compare  test what changed between two calibrations of one robot
 $ compare monday/ tuesday/
 $ compare before.yaml after.yaml --json
 what to compare
