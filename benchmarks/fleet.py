@@ -43,7 +43,7 @@ from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, run
 from calib_ros.fleet.standing import standings, write_report
-from calib_ros.fleet.work import Outcome, Task, sources, work
+from calib_ros.fleet.tasks import Outcome, Task, sources, work
 from calib_ros.kinematics.chain_file import load_chain
 
 POSES, BEFORE = 60, 3

@@ -23,7 +23,7 @@ from calib_ros.errors import CalibrationError, ConfigError, shortened, trouble
 from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
-from calib_ros.fleet.work import Outcome, Task, sources, work
+from calib_ros.fleet.tasks import Outcome, Task, sources, work
 from calib_ros.progress import Notify, quiet
 
 MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'

@@ -21,8 +21,8 @@ from calib_ros.files.history import History
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, page_path, results, too_late, verifications
+from calib_ros.fleet.tasks import PLOTLY
 from calib_ros.fleet.watch import Change, Watched, watch
-from calib_ros.fleet.work import PLOTLY
 from calib_ros.report.page import MISSING, State, filled, plotly_script
 from calib_ros.shown import some
 

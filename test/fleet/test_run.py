@@ -16,7 +16,7 @@ from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
 from calib_ros.fleet.standing import standings
-from calib_ros.fleet.work import Outcome, Source, Task, sources
+from calib_ros.fleet.tasks import Outcome, Source, Task, sources
 from calib_ros.kinematics.chain_file import chain_document, load_chain
 
 CHAIN = json.dumps(chain_document(load_chain('ur10e')))
