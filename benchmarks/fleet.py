@@ -42,7 +42,7 @@ from calib_ros.files.history import History
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, run
-from calib_ros.fleet.standing import standings, write_report
+from calib_ros.fleet.status import statuses, write_report
 from calib_ros.fleet.tasks import Outcome, Task, sources, work
 from calib_ros.kinematics.chain_file import load_chain
 
@@ -94,7 +94,7 @@ def nights_part(folder, robots, nights, number, cluster):
         begin = time.monotonic()
         done = run(plant, history, cluster, out)
         middle = time.monotonic()
-        stood = standings(plant, history, done, 100.0)
+        stood = statuses(plant, history, done, 100.0)
         later = time.monotonic()
         write_report(out, stood, done)
         end = time.monotonic()

@@ -20,7 +20,7 @@ from calib_ros.files.history import History
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     from calib_ros.fleet.plant import read_plant
     from calib_ros.fleet.run import Cluster, run
-    from calib_ros.fleet.standing import counts, metrics, standings, write_report
+    from calib_ros.fleet.status import counts, metrics, statuses, write_report
 
     if not 0.0 < options.years < 1e9:
         raise InputError(f'--years must be positive, not {options.years:g}')
@@ -31,7 +31,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     with screen.work(f'{len(robots)} robot{"s" * (len(robots) > 1)}') as work, _tidied_up(screen):
         done = run(robots, history, cluster, options.out, work)
         work('comparing nights')
-        found = standings(robots, history, done, options.years)
+        found = statuses(robots, history, done, options.years)
     number = counts(found)
     title = ', '.join(f'{count} {state}' for state, count in number.items() if count)
     screen.title(title, number['fine'] == len(found))

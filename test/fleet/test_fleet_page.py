@@ -13,7 +13,7 @@ from calib_ros.decision.changes import Explanation
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Pattern, Robot
 from calib_ros.fleet.run import Run
-from calib_ros.fleet.standing import STATES, Standing, counts, page_of
+from calib_ros.fleet.status import STATES, RobotStatus, counts, page_of
 from calib_ros.fleet.watch import Change, Night, Watched
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
@@ -24,28 +24,28 @@ REASON = Explanation(
 CHANGE = Change(plants.when(1), plants.when(1), (REASON,))
 
 
-def standing(serial, errors=None, changes=(), errors_mm=(0.1, 0.1, 0.1), **more):
+def status(serial, errors=None, changes=(), errors_mm=(0.1, 0.1, 0.1), **more):
     rows = [Row(serial, 'identify', plants.when(k), 'accepted', '', '') for k in range(3)]
     rows = [replace(row, rms_mm=0.1 + 0.01 * k, **more) for k, row in enumerate(rows)]
     nights = [Night(row, {'a': 0.5, '<b>': 6.0}) for row in rows]
     robot = Robot(serial, load_chain('ur10e'), (Pattern('*'),), tolerance=0.11)
     watched = Watched(tuple(nights), changes)
     verified = tuple(replace(row, rms_mm=rms) for row, rms in zip(rows, errors_mm, strict=True))
-    return Standing(
+    return RobotStatus(
         robot, rows[-1], watched, errors or {}, verified, drift(errors_mm, [30.0] * 3, 100.0)
     )
 
 
 def test_states_from_the_worst_to_the_best():
     fleet = [
-        standing('1', changes=(CHANGE,), verdict='refused'),
-        standing('7', errors_mm=(0.1, 0.1, 0.5)),
-        standing('2', {'x.csv': 'damaged'}, verdict='refused'),
-        standing('4', verdict='refused'),
-        standing('8', {'x.csv': 'damaged'}),
-        standing('5'),
-        replace(standing('3'), last=None),
-        standing('6', lower_mm=0.1, upper_mm=0.2),
+        status('1', changes=(CHANGE,), verdict='refused'),
+        status('7', errors_mm=(0.1, 0.1, 0.5)),
+        status('2', {'x.csv': 'damaged'}, verdict='refused'),
+        status('4', verdict='refused'),
+        status('8', {'x.csv': 'damaged'}),
+        status('5'),
+        replace(status('3'), last=None),
+        status('6', lower_mm=0.1, upper_mm=0.2),
     ]
     wide = replace(fleet[-1].robot, tolerance=None)
     fleet = [replace(each, robot=wide) if each.robot.serial in '126' else each for each in fleet]
@@ -68,13 +68,13 @@ def test_states_from_the_worst_to_the_best():
 
 
 def test_the_page_tells_all_that_is_to_be_said_of_a_robot():
-    fleet = [standing('2', {'x.csv': 'damaged'}, verdict='refused')]
+    fleet = [status('2', {'x.csv': 'damaged'}, verdict='refused')]
     page = page_of(Path('report'), fleet, Run())
     assert 'refused, beyond tolerance, unreadable</span>' in page
 
 
 def test_a_night_that_does_not_determine_a_joint_leaves_a_gap_in_its_chart():
-    each = standing('1')
+    each = status('1')
     few = Watched((*each.watched.nights[:2], Night(each.watched.nights[2].row, {'a': 0.5})))
     told = replace(each, watched=few, remarks=('a <remark>',))
     page = page_of(Path('report'), [told], Run())

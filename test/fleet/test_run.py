@@ -15,7 +15,7 @@ from calib_ros.files.rows import Row
 from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
-from calib_ros.fleet.standing import standings
+from calib_ros.fleet.status import statuses
 from calib_ros.fleet.tasks import Outcome, Source, Task, sources
 from calib_ros.kinematics.chain_file import chain_document, load_chain
 
@@ -86,10 +86,10 @@ def test_a_night_counts_once_whatever_its_file_is_called(plant, cluster, tmp_pat
     monkeypatch.setitem(running.work.__globals__, 'table', lambda *_: done.append(0))
     again = run(plant, history, cluster, out)
     assert (again.copies, again.filed, again.errors, done) == (found.copies, 0, {}, [])
-    (standing,) = (s for s in standings(plant, history, again, 100.0) if s.robot.serial == 'A')
-    assert standing.remarks == (f'{one} has the content of {other}: one night',)
-    assert standing.state == 'fine'
-    assert len(standing.watched.nights) == 2
+    (status,) = (s for s in statuses(plant, history, again, 100.0) if s.robot.serial == 'A')
+    assert status.remarks == (f'{one} has the content of {other}: one night',)
+    assert status.state == 'fine'
+    assert len(status.watched.nights) == 2
 
     (tmp_path / 'nights/A/001.csv').rename(tmp_path / 'nights/A/moved.csv')
     assert run(plant, history, cluster, out).copies == found.copies
@@ -100,7 +100,7 @@ def test_the_measurements_of_another_robot_are_told_of(plant, cluster, tmp_path)
     nights = tmp_path / 'nights'
     (nights / 'B' / '001.csv').write_bytes((nights / 'A' / '001.csv').read_bytes())
     history = History(tmp_path / 'history')
-    found = standings(plant, history, run(plant, history, cluster, None), 100.0)
+    found = statuses(plant, history, run(plant, history, cluster, None), 100.0)
     for each, other in zip(sorted(found, key=lambda one: one.robot.serial), 'BA', strict=True):
         assert 'unreadable' in each.states
         (said,) = each.errors.values()
@@ -109,7 +109,7 @@ def test_the_measurements_of_another_robot_are_told_of(plant, cluster, tmp_path)
     assert f'remove {last.key}.parquet' in said
     (nights / 'B' / '001.csv').unlink()
     (tmp_path / f'history/robot=B/{last.key}.parquet').unlink()
-    found = standings(plant, history, run(plant, history, cluster, None), 100.0)
+    found = statuses(plant, history, run(plant, history, cluster, None), 100.0)
     assert not any(each.errors for each in found)
 
 
@@ -136,7 +136,7 @@ def test_a_night_whose_file_was_put_right_counts_once(unsearched, plant, cluster
     in_mm = [[*row[:7], *(str(1e3 * float(x)) for x in row[7:10]), *row[10:]] for row in lines]
     place.write_text('\n'.join(','.join(row) for row in (head, *in_mm)))
     found = run(plant, history, cluster)
-    assert standings(plant, history, found, 100.0)[0].state == 'refused'
+    assert statuses(plant, history, found, 100.0)[0].state == 'refused'
     place.write_text(right)
     found = run(plant, history, cluster)
     rows = history.rows('A')
@@ -157,8 +157,8 @@ def test_sessions_without_stamps_are_nights_and_a_night_put_right_is_no_other_se
     for each in (row, corrected, other):
         history.file(each)
     assert {each.inputs for each in results(robot, history.rows('A'))} == {'1', '2'}
-    (standing,) = standings(plant[:1], history, Run(), 100.0)
-    assert standing.remarks == ()
+    (status,) = statuses(plant[:1], history, Run(), 100.0)
+    assert status.remarks == ()
 
 
 def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
@@ -173,16 +173,16 @@ def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
     ahead = replace(rows[2], time=plants.when(2000), source='b.csv')
     for each in (*rows[:2], ahead, replace(rows[3], verdict='refused')):
         history.file(each)
-    (standing,) = standings(plant[:1], history, Run(), 100.0)
-    assert standing.state == 'refused'
-    assert standing.remarks == (
+    (status,) = statuses(plant[:1], history, Run(), 100.0)
+    assert status.state == 'refused'
+    assert status.remarks == (
         '1 result with stamps later than the filing, on 2025-10-11 of 2031-04-01 (b.csv): set the '
         'clock of the recorder',
     )
     back = {'time': plants.when(-900), 'filed': plants.when(4), 'source': 'c.csv'}
     history.file(replace(row, verdict='refused', inputs='4', **back))
-    (standing,) = standings(plant[:1], history, Run(), 100.0)
-    assert standing.remarks[1] == (
+    (status,) = statuses(plant[:1], history, Run(), 100.0)
+    assert status.remarks[1] == (
         'c.csv was filed last, and its stamps are of 2023-04-23, before other nights: '
         'unless it is an old one, a clock was set back'
     )
@@ -207,12 +207,12 @@ def test_nights_by_other_settings_are_told_of(plant, cluster, tmp_path):
     (tmp_path / 'nights/A/000.csv').unlink()
     changed = replace(plant[0], settings=replace(plant[0].settings, folds=4))
     found = run((changed,), history, cluster)
-    (standing,) = standings((changed,), history, found, 100.0)
-    (remark,) = standing.remarks
+    (status,) = statuses((changed,), history, found, 100.0)
+    (remark,) = status.remarks
     assert remark.startswith('nights in the history by other settings or another chain')
     assert 'not compared: 1 (put their files back' in remark
     later = replace(changed, since=plants.when(1))
-    assert standings((later,), history, found, 100.0)[0].remarks == ()
+    assert statuses((later,), history, found, 100.0)[0].remarks == ()
 
 
 def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path):
@@ -276,17 +276,17 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     found = run(plant, history, cluster)
     assert found.filed == 1
     assert row.name in found.errors['A']['']
-    first, second = standings(plant, history, found, 100.0)
+    first, second = statuses(plant, history, found, 100.0)
     assert (first.robot.serial, first.state, first.last) == ('A', 'unreadable', None)
     assert (second.robot.serial, second.state) == ('B', 'fine')
     for number, rms in enumerate((0.1, 0.1, 0.5)):
         errors = {'rms_mm': rms, 'rms_freedom': 30.0}
         history.file(Row('B', 'verify', plants.when(number), 'holds', str(number), 's', **errors))
-    worst = standings(plant, history, found, 100.0)[0]
+    worst = statuses(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
     repaired = replace(plant[1], since=plants.when(2))
-    assert standings((repaired,), history, found, 100.0)[0].alarms == ()
+    assert statuses((repaired,), history, found, 100.0)[0].alarms == ()
 
 
 def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch):

@@ -41,7 +41,7 @@ ESCAPES = str.maketrans({'\\': r'\\', '"': r'\"', '\n': r'\n'})
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class RobotStatus:
     """A robot, its newest result, changes, unread sources, verifications and their `drift`."""
 
     robot: Robot
@@ -53,7 +53,7 @@ class Standing:
     remarks: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, robot: Robot, history: History, done: Run, years: float) -> Standing:
+    def of(cls, robot: Robot, history: History, done: Run, years: float) -> RobotStatus:
         """Return the state of a robot; each kind of false alarm occurs once in so many years."""
         try:
             return cls._of(robot, history.rows(robot.serial), done, years)
@@ -63,7 +63,7 @@ class Standing:
             return replace(found, errors=errors)
 
     @classmethod
-    def _of(cls, robot: Robot, rows: tuple[Row, ...], done: Run, years: float) -> Standing:
+    def _of(cls, robot: Robot, rows: tuple[Row, ...], done: Run, years: float) -> RobotStatus:
         own = results(robot, rows)
         last = own[-1] if own else None
         compared = tuple(row for row in own if robot.compares(row.time))
@@ -152,8 +152,8 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
         )
 
 
-def _without_twins(found: Sequence[Standing]) -> Iterator[Standing]:
-    """Yield standings; newest measurements that are those of another robot are unreadable."""
+def _without_twins(found: Sequence[RobotStatus]) -> Iterator[RobotStatus]:
+    """Yield statuses; newest measurements that are those of another robot are unreadable."""
     owners: dict[str, list[str]] = {}
     for one in found:
         if one.last is not None:
@@ -171,27 +171,27 @@ def _without_twins(found: Sequence[Standing]) -> Iterator[Standing]:
         yield replace(one, errors=errors)
 
 
-def standings(
+def statuses(
     robots: Sequence[Robot], history: History, done: Run, years: float
-) -> tuple[Standing, ...]:
+) -> tuple[RobotStatus, ...]:
     """Return the states of robots, worst first."""
-    found = _without_twins([Standing.of(robot, history, done, years) for robot in robots])
+    found = _without_twins([RobotStatus.of(robot, history, done, years) for robot in robots])
     order = list(STATES)
 
-    def rank(one: Standing) -> tuple[int, float, float, str]:
+    def rank(one: RobotStatus) -> tuple[int, float, float, str]:
         rms = (one.last and one.last.rms_mm) or 0.0
         return order.index(one.state), -one.share, -rms, one.robot.serial
 
     return tuple(sorted(found, key=rank))
 
 
-def counts(found: Sequence[Standing]) -> dict[str, int]:
+def counts(found: Sequence[RobotStatus]) -> dict[str, int]:
     """Return the number of robots in each state."""
     number = Counter(each.state for each in found)
     return {state: number[state] for state in STATES}
 
 
-def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
+def metrics(found: Sequence[RobotStatus], done: Run, ended: float) -> str:
     """Return metrics in the text format of Prometheus; `ended` is the time of the run [s]."""
     states = {f'{{state="{state}"}}': number for state, number in counts(found).items()}
     unread = sum(len(each.errors) for each in found)
@@ -224,7 +224,7 @@ def metrics(found: Sequence[Standing], done: Run, ended: float) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
+def write_report(out: Path, found: Sequence[RobotStatus], done: Run) -> str:
     """Write the page and the script shared with robots' pages; return what is missing."""
     script, page = plotly_script(), page_of(out, found, done)
     if script is None or page is None:
@@ -236,7 +236,7 @@ def write_report(out: Path, found: Sequence[Standing], done: Run) -> str:
     return ''
 
 
-def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
+def page_of(out: Path, found: Sequence[RobotStatus], done: Run) -> str | None:
     """Return the page, or None without jinja2."""
     shown = found[:MOST_ENTRIES]  # the worst
     return filled(
@@ -257,30 +257,30 @@ def page_of(out: Path, found: Sequence[Standing], done: Run) -> str | None:
     )
 
 
-def _link(out: Path, standing: Standing) -> str:
-    if standing.last is None:
+def _link(out: Path, status: RobotStatus) -> str:
+    if status.last is None:
         return ''
-    path = page_path(out, standing.last)
+    path = page_path(out, status.last)
     return quote(path.relative_to(out).as_posix()) if path.exists() else ''
 
 
-def _chart(standing: Standing) -> dict[str, Any]:
+def _chart(status: RobotStatus) -> dict[str, Any]:
     def times(rows: Iterable[Row | Change]) -> list[str]:
         return [each.time.isoformat(timespec='seconds') for each in rows]
 
-    nights = standing.watched.nights[-MOST_NIGHTS:]
+    nights = status.watched.nights[-MOST_NIGHTS:]
     joints = dict.fromkeys(joint for night in nights for joint in night.strength)
-    verified = standing.verified[-MOST_NIGHTS:]
+    verified = status.verified[-MOST_NIGHTS:]
     return {
-        'serial': standing.robot.serial,
-        'tolerance': standing.robot.tolerance,
+        'serial': status.robot.serial,
+        'tolerance': status.robot.tolerance,
         'time': times(night.row for night in nights),
         'rms': [night.row.rms_mm for night in nights],
-        'changes': times(standing.watched.changes),
+        'changes': times(status.watched.changes),
         'verified': {
             'time': times(verified),
             'rms': [row.rms_mm for row in verified],
-            'sums': standing.drift.sums[-MOST_NIGHTS:].round(3).T.tolist(),
+            'sums': status.drift.sums[-MOST_NIGHTS:].round(3).T.tolist(),
         },
         'joints': {
             joint: [
