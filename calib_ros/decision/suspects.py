@@ -11,8 +11,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.decision.misread import Turn, misread
 from calib_ros.decision.printed import size_of
+from calib_ros.decision.rotation_conventions import Turn, misread
 from calib_ros.estimation.levels import NEARER, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
