@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib_ros.decision.printed import size_of
+from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.rotation_conventions import Turn, misread
 from calib_ros.estimation.levels import NEARER, TELLING
 from calib_ros.estimation.observations import Observations

@@ -33,7 +33,7 @@ import numpy as np
 
 from calib_ros.decision.acceptance import out_of_scale
 from calib_ros.decision.misfits import explained
-from calib_ros.decision.printed import stretched
+from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
 from calib_ros.decision.result import Identification
