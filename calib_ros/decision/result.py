@@ -74,7 +74,7 @@ class Identification(Shown):
     step: Step | None = None
     """What moved during the measurement (`steps.py`)."""
     remarks: tuple[str, ...] = ()
-    """What is suspicious despite good figures, and what to do (`suspicions.py`)."""
+    """What is suspicious despite good figures, and what to do (`plausibility.py`)."""
     coupled: bool = False
     """Whether unfitted couplings of the wrist explain most of the residuals."""
     images: int = 0

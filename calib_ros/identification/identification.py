@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib_ros.decision import mistakes, suspicions
+from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import refusals, remarks
 from calib_ros.decision.comparison import Verdict, compare
 from calib_ros.decision.drift import chance_of_gain
@@ -128,7 +128,7 @@ def _identified(
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
     named = mistakes.remarked(problem, result)
-    return suspicions.remarked(problem, named, another=named is result)
+    return plausibility.remarked(problem, named, another=named is result)
 
 
 def _region(

@@ -11,7 +11,7 @@ from scipy import special
 
 from calib_ros import Chain, Observations, Problem, identify, load_chain, read_table
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.suspicions import _apart
+from calib_ros.decision.plausibility import _apart
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.estimation import start
 from calib_ros.estimation.evidence import posterior_of

@@ -10,8 +10,8 @@ from fits import SIGMAS, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.decision.plausibility import _motion
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.suspicions import _motion
 from calib_ros.kinematics.chain import Frame, Joint
 
 UR = load_chain('ur10e')
