@@ -42,7 +42,7 @@ from calib_ros.report.reports import (
     reasons_of,
     standing,
 )
-from calib_ros.sampling.gathered import with_lenses
+from calib_ros.sampling.dataset import with_lenses
 from calib_ros.settings import Settings
 from calib_ros.shown import of_them, rounded
 from calib_ros.texts import dump_json

@@ -32,7 +32,7 @@ from calib_ros.files.rows import (
 from calib_ros.identification.calibration import Calibration, calibration_file, load_calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.report import page
-from calib_ros.sampling.gathered import Gathered
+from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
@@ -150,7 +150,7 @@ def table(
     settings: Settings,
     screen: Screen,
     eye_in_hand: bool = False,
-) -> Gathered:
+) -> Dataset:
     """Return a table of measurements with the layout of the options."""
     foreign = foreign_of(options, chain)
     sessions = sessions_of(options)

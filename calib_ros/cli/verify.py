@@ -26,7 +26,7 @@ from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import each_in_words, likely, remarks, standing, verification_report
 from calib_ros.report.words import change
-from calib_ros.sampling.gathered import gathered
+from calib_ros.sampling.dataset import dataset_of
 from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
 
@@ -124,7 +124,7 @@ def _sets(
         screen.say(f'{read}; {session.account()}')
         if not session.usable:
             raise InputError(f'{options.measured} gives no poses: {session.account()}')
-        found = gathered(session.usable, settings.sigmas)
+        found = dataset_of(session.usable, settings.sigmas)
         found = replace(found, warnings=read.warnings)
     names = arm.frames_of(found.owners)
     sets = [each.between(names) for each in (*found.fitted, *found.held_out)]

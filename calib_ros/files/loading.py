@@ -22,7 +22,7 @@ from calib_ros.identification.identification import identify_model
 from calib_ros.identification.records import Owner
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.gathered import Gathered
+from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.sample import named
 from calib_ros.sampling.session import CalibrationSession, too_few
 from calib_ros.settings import Settings
@@ -97,7 +97,7 @@ def table(
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,
-) -> Gathered:
+) -> Dataset:
     """Return a table of measurements of a chain.
 
     Without a given layout, a table with other columns is read with the joints' names and another
@@ -111,7 +111,7 @@ def table(
     return read_table(*given, foreign, progress)
 
 
-def of_table(found: Gathered, chain: Chain, settings: Settings, **given: float) -> Loaded:
+def of_table(found: Dataset, chain: Chain, settings: Settings, **given: float) -> Loaded:
     """Return the problem of a table, with `given` arguments."""
     problem = found.problem(chain, settings, **given)
     fitted, held_out = (sum(map(len, sets)) for sets in (found.fitted, found.held_out))

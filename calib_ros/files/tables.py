@@ -46,7 +46,7 @@ from calib_ros.kinematics.lens import Lens
 from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
-from calib_ros.sampling.gathered import Gathered, gathered
+from calib_ros.sampling.dataset import Dataset, dataset_of
 from calib_ros.sampling.sample import Sample, View
 from calib_ros.settings import Settings
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
@@ -63,7 +63,7 @@ def read_table(
     eye_in_hand: bool = False,
     foreign: Foreign | None = None,
     progress: Notify = quiet,
-) -> Gathered:
+) -> Dataset:
     """Read a CSV table, or one in any other layout.
 
     Of several `sessions`, each after the first gets its own base and tool frames. `sigmas` are the
@@ -112,7 +112,7 @@ def _table(
     eye_in_hand: bool = False,
     warnings: tuple[str, ...] = (),
     by_line: bool = False,
-) -> Gathered:
+) -> Dataset:
     made = made.kept()
     made.check_frames()
     if made.test.all():
@@ -120,7 +120,7 @@ def _table(
     if eye_in_hand:
         made = replace(made, eye_in_hand=np.ones(len(made.lines), dtype=bool))
     if made.view[1] != ['']:
-        found = gathered([*_samples(made)], sigmas)
+        found = dataset_of([*_samples(made)], sigmas)
     else:  # arrays, with one example of each kind
         _, number = distinct(made.codes)
         examples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
@@ -129,7 +129,7 @@ def _table(
             rows = np.isin(number, members)
             return (made if rows.all() else made.select(rows)).observations()
 
-        found = gathered(examples, sigmas, observed=observed)
+        found = dataset_of(examples, sigmas, observed=observed)
     place, names = made.frame_id
     world_frame = next((names[k] for k in place.tolist() if names[k]), '')
     return replace(found, world_frame=world_frame, warnings=warnings, by_line=by_line)

@@ -46,7 +46,7 @@ from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.to_ros import LATCHED
-from calib_ros.sampling.gathered import check_settings
+from calib_ros.sampling.dataset import check_settings
 from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sample import Sample, socket_place

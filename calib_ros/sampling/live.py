@@ -44,7 +44,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
-from calib_ros.sampling.gathered import collect
+from calib_ros.sampling.dataset import collect
 from calib_ros.sampling.sample import Frames, Sample
 from calib_ros.settings import EXCEPTION, Settings
 

@@ -20,9 +20,9 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify_model
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account
+from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Part
-from calib_ros.sampling.gathered import Gathered, check_settings, collect, gathered
 from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.pictures import Pictures
@@ -299,7 +299,7 @@ class CalibrationSession:
         """Return samples as a problem; with `posed` boards as poses, not corners."""
         if all(sample.validation for sample in samples):
             raise InputError(f'no poses to fit: {self.summary}')
-        found = gathered(samples, self.settings.sigmas, posed)
+        found = dataset_of(samples, self.settings.sigmas, posed)
         return found.problem(self.chain, self.settings, of_messages=True)
 
     def identify(self) -> Identification:
@@ -337,7 +337,7 @@ class CalibrationSession:
         calibration, sets = self.since(NO_ACCIDENT)
         cameras = {each.camera for each in sets if each.pixels is not None}
         seen = {name: lens for name in cameras if (lens := calibration.chain.frame(name).lens)}
-        return calibration, Gathered(sets, lenses=seen).problem(self.chain, self.settings)
+        return calibration, Dataset(sets, lenses=seen).problem(self.chain, self.settings)
 
     def since(self, most: int | None = None) -> tuple[Calibration, list[Observations]]:
         """Return the calibration, and the samples since then in its frames, the last `most`."""

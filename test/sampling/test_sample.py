@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, strategies as st
 
-from calib_ros.sampling.gathered import collect
+from calib_ros.sampling.dataset import collect
 from calib_ros.sampling.sample import Frames, Sample
 
 SIGMAS = (1e-4, 3e-4)

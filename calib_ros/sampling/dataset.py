@@ -139,7 +139,7 @@ def with_lenses(chain: Chain, found: Mapping[str, Lens]) -> Chain:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Gathered(Shown):
+class Dataset(Shown):
     """The sets to fit and held out, each with its own frames."""
 
     fitted: Sequence[Observations]
@@ -166,15 +166,15 @@ class Gathered(Shown):
         )
 
 
-def gathered(
+def dataset_of(
     samples: Sequence[Sample],
     sigmas: tuple[float, float],
     posed: bool = False,
     observed: Callable[[Sequence[int]], Observations] | None = None,
-) -> Gathered:
+) -> Dataset:
     """Return the sets of samples with their frames; arguments as in `collect`."""
     frames = Frames()
     fitted, held_out = collect(samples, sigmas, frames, posed, observed)
     pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
     cameras = {} if posed else lenses(samples, frames)
-    return Gathered(fitted, held_out, pairs, world_frame, cameras, frames.owners)
+    return Dataset(fitted, held_out, pairs, world_frame, cameras, frames.owners)
