@@ -61,7 +61,7 @@ def play(made, *events, finish=True):
     give(made, come)
     if finish:
         made.finish()
-    return made.maker.take()[0]
+    return made.sampler.take()[0]
 
 
 def give(made, come):

@@ -19,8 +19,8 @@ import numpy as np
 from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
-from calib_ros.sampling.making import ROW_WIDTH, Found, Maker, Numbered
 from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sampler import ROW_WIDTH, Found, Numbered, Sampler
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
 from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
@@ -54,9 +54,9 @@ class Collector:
         self.delay_ns = round(settings.delay * 1e9)
         """Delay of measurement stamps after joint stamps."""
         self.holding = False  # true while the delay is estimated and nothing is sampled
-        self.maker = Maker(self._revolute, settings.pose_buffer)
-        self.dropped = self.maker.dropped
-        self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.maker.has)
+        self.sampler = Sampler(self._revolute, settings.pose_buffer)
+        self.dropped = self.sampler.dropped
+        self.waiting = Waiting(ROW_WIDTH, settings.pose_buffer, self.dropped, self.sampler.has)
         self.unused: Counter[str] = Counter()  # measurements normally not used, by cause
         self.notes: Counter[str] = Counter()
 
@@ -236,14 +236,14 @@ class Collector:
             stamps = stamps[stamps >= begin]
             joints = self.track.at(stamps, standing=True).joints
             approach = self.track.approach(stamps[:1], joints[:1])[0]
-            self.maker.in_socket(place, int(stamps[-1]), joints, approach)
+            self.sampler.in_socket(place, int(stamps[-1]), joints, approach)
             return 1, ''
         self._round(begin)  # end earlier stops
-        before, dropped = len(self.maker.fresh), self.dropped.copy()
+        before, dropped = len(self.sampler.fresh), self.dropped.copy()
         plan = Schedule(self._settled_ns, self._sampled_ns)
         plan.add(newest, '', begin)
         self._carry_out(plan)
-        count = len(self.maker.fresh) - before
+        count = len(self.sampler.fresh) - before
         if count:
             self._sampled_ns = self._settled_ns = newest
         causes = ', '.join(dict.fromkeys(self.dropped - dropped))
@@ -338,15 +338,15 @@ class Collector:
                 begins = np.arange(len(good)) if moving else begins
                 approach = self.track.approach(stamps[good[begins]], motion.joints[begins])
                 delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
-                found += self.maker.samples(seen, motion, begins, approach, delay, sigma)
+                found += self.sampler.samples(seen, motion, begins, approach, delay, sigma)
             rows.release(due)
         for stop in () if moving else plan.stops:
             self.unmeasured = 0 if stop in measured else self.unmeasured + 1
-        self.maker.add(found)
+        self.sampler.add(found)
 
     def forget(self, sample: Sample) -> None:
         """Allow another sample with the stamp of this one."""
-        self.maker.forget(sample)
+        self.sampler.forget(sample)
         self._known.forget(sample.stamp_ns - round(1e9 * sample.delay))
 
     def _count_causes(self, cause: Index) -> None:

@@ -23,7 +23,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved, stuck
-from calib_ros.sampling.making import POSITION, QUAT
+from calib_ros.sampling.sampler import POSITION, QUAT
 from calib_ros.sampling.slices import JOINTS, Piece, Series, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import NAMED

@@ -170,9 +170,9 @@ class Pipeline:
 
     def hand_over(self) -> None:
         """Hand over the samples made."""
-        made, shaken = self.collector.maker.take()
+        made, shaken = self.collector.sampler.take()
         count = self._taken(made)
-        self.clocks.wake(self.collector.maker.unrest, count - shaken, count)
+        self.clocks.wake(self.collector.sampler.unrest, count - shaken, count)
 
     def hints(self, measurements: int) -> list[Hint]:
         """Return what looks wrong with the stamps, given the number of measurements."""
@@ -181,10 +181,10 @@ class Pipeline:
 
     def unsettled(self) -> list[Hint]:
         """Return what looks wrong with measurements at stops, if no stamps explain it."""
-        maker, missed = self.collector.maker, self.collector.unmeasured
-        found = unsettled(maker.restless, maker.restless + maker.rested)
-        between = 0 if maker.rested else self.collector.unused[f'{POSES}: {MOVING}']
-        return found + (unmeasured(missed, between) if maker.rested or between else [])
+        sampler, missed = self.collector.sampler, self.collector.unmeasured
+        found = unsettled(sampler.restless, sampler.restless + sampler.rested)
+        between = 0 if sampler.rested else self.collector.unused[f'{POSES}: {MOVING}']
+        return found + (unmeasured(missed, between) if sampler.rested or between else [])
 
     def _up_to_work(self, given: Slice) -> Iterator[Slice]:
         begin = 0

@@ -152,7 +152,7 @@ class CalibrationSession:
                 )
             if sample.frame_id:
                 self._frames.note(sample.device, sample.frame_id, sample.count)
-        self._collector.maker.remember(samples)
+        self._collector.sampler.remember(samples)
         self.samples[:0] = samples
 
     @property

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.kinematics import se3
-from calib_ros.sampling.making import ROW_WIDTH, Found, Maker
+from calib_ros.sampling.sampler import ROW_WIDTH, Found, Sampler
 from calib_ros.sampling.slices import JOINTS, POSES, Piece, Slice, StreamKey
 from calib_ros.sampling.track import Motion
 
@@ -26,7 +26,7 @@ def samples(rotations, rng, spikes=(), stops=1):
     still = np.zeros((stops * count, 1))
     stamps = 1 + np.arange(stops * count)
     numbers = np.repeat(np.arange(stops), count)
-    made = Maker(np.array([True]), 100)
+    made = Sampler(np.array([True]), 100)
     found = Found(POSE, numbers, stamps, values)
     begins = count * np.arange(stops)
     made.add(list(made.samples(found, Motion(still), begins, still[begins], 0.0, NOISE)))

@@ -38,7 +38,7 @@ class Found(NamedTuple):
     values: FloatArray
 
 
-class Maker:
+class Sampler:
     """Makes samples, up to a capacity, and no two of one stream with the same stamp.
 
     A second one elsewhere, after a simulation began again, gets the next free nanosecond.
