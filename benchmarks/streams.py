@@ -33,7 +33,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.errors import CalibrationError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.entry import Part
+from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import Readings
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source

@@ -20,7 +20,7 @@ import numpy as np
 
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import alike, head
-from calib_ros.sampling.entry import Part
+from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
     LINKS,

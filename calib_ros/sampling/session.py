@@ -22,9 +22,9 @@ from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.entry import Entry, FrameNames, JointNames, Part
 from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
+from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter, Part
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
@@ -74,8 +74,8 @@ class CalibrationSession:
         self._collector, self._clocks = self._pipeline.collector, self._pipeline.clocks
         self._frames = FrameNames(settings.frame_id)
         self._names = JointNames(self.joint_names, self.chain.held)
-        self._entry = Entry(self._names, self._frames, len(self.chain.joints))
-        self.received = self._entry.received  # messages by kind
+        self._filter = MessageFilter(self._names, self._frames, len(self.chain.joints))
+        self.received = self._filter.received  # messages by kind
         self._live = LiveEstimate(partial(self.problem_of, posed=True))
         self.pictures.clear()
         self.samples: list[Sample] = []
@@ -94,13 +94,13 @@ class CalibrationSession:
     def take(self, parts: Sequence[Part]) -> None:
         """Take messages in the order of their places."""
         try:
-            self._pipeline.take(self._entry.pieces(parts, self.recording))
+            self._pipeline.take(self._filter.pieces(parts, self.recording))
         finally:
             self._settle()
 
     def miss(self, kind: str, count: int, cause: str) -> None:
         """Count received messages that cannot be used."""
-        self._entry.miss(kind, count, cause)
+        self._filter.miss(kind, count, cause)
 
     def finish(self) -> None:
         """Make samples of all waiting messages; no more will arrive."""
@@ -110,7 +110,7 @@ class CalibrationSession:
     @property
     def latest(self) -> tuple[int, Sequence[float]] | None:
         """Return stamp [ns] and values of the last joint state with all joints."""
-        return self._entry.latest
+        return self._filter.latest
 
     # Samples
 
@@ -126,7 +126,7 @@ class CalibrationSession:
         self._pipeline.hand_over()
         self._settle(wait=True)
         taken = len(self.samples) - before
-        if JOINTS in self._entry.refused:
+        if JOINTS in self._filter.refused:
             why = self.state
         return (taken, why) if taken or not count else (0, self.pictures.refused)
 
@@ -135,7 +135,7 @@ class CalibrationSession:
         if not self.samples:
             raise InputError('there is no pose to remove')
         sample = self.samples.pop()
-        self._entry.unused['measurements: of a removed pose'] += sample.count
+        self._filter.unused['measurements: of a removed pose'] += sample.count
         self._collector.forget(sample)
         if sample.frame_id:
             self._frames.note(sample.device, sample.frame_id, -sample.count)
@@ -187,7 +187,7 @@ class CalibrationSession:
             return f'nothing can be sampled: no more joint states of {", ".join(silent)}'
         if others := self._names.foreign_ones(track.missing):
             return others
-        if why := self._entry.refused.get(JOINTS):
+        if why := self._filter.refused.get(JOINTS):
             return f'nothing can be sampled: joint states are refused, {why}'
         return self._collector.state()
 
@@ -212,7 +212,7 @@ class CalibrationSession:
             len(fitted),
             len(self.samples) - len(fitted),
             distinct,
-            dict(sorted((self._entry.unused + collector.unused).items())),
+            dict(sorted((self._filter.unused + collector.unused).items())),
             dict(sorted(self._dropped.items())),
             dict(sorted(notes.items())),
             self._names.foreign,
@@ -222,7 +222,7 @@ class CalibrationSession:
     @property
     def _dropped(self) -> Counter[str]:
         gate, images = self._pipeline.gate.dropped, self.pictures.dropped
-        return self._entry.dropped + self._collector.dropped + images + gate
+        return self._filter.dropped + self._collector.dropped + images + gate
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -248,7 +248,7 @@ class CalibrationSession:
     @property
     def doubtful(self) -> bool:
         """Tell whether the status says that messages are refused, or something looks wrong."""
-        return bool(self._entry.refused) or any(hint.status for hint in self.hints)
+        return bool(self._filter.refused) or any(hint.status for hint in self.hints)
 
     @property
     def delay(self) -> Delay | None:
@@ -271,7 +271,7 @@ class CalibrationSession:
         What an operator must do comes first, so that a truncated line keeps it.
         """
         parts = [self.state, work]
-        if why := self._entry.refused.get(POSES):
+        if why := self._filter.refused.get(POSES):
             parts.append(f'measurements are refused, {why}')
         parts += [hint.status for hint in self.hints]
         if self.pictures.refused:

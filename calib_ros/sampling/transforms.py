@@ -22,7 +22,7 @@ from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.cdr import Layout
-from calib_ros.sampling.entry import Part
+from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, short_type, usable
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings

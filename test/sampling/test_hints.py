@@ -29,7 +29,7 @@ from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.account import too_much_lost
-from calib_ros.sampling.entry import Part
+from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import PICTURES, Readings
 from calib_ros.sampling.sources import Source
 

@@ -138,7 +138,7 @@ class Part(NamedTuple):
     readings: Readings
 
 
-class Entry:
+class MessageFilter:
     """Admission of usable messages; others are counted by cause."""
 
     def __init__(self, names: JointNames, frames: FrameNames, joint_count: int) -> None:
