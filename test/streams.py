@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from calib_ros.kinematics import se3
-from calib_ros.sampling.intake import Stream, feed
+from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import JOINT_STATE, Readings
 from calib_ros.sampling.sources import Source

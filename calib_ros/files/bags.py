@@ -17,7 +17,7 @@ from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.account import ALLOW, Account, allowing, too_much_lost
-from calib_ros.sampling.intake import Deserialise, Stream, batches, feed, links_of
+from calib_ros.sampling.batches import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose

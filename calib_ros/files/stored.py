@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.files import mcap
-from calib_ros.sampling.intake import Stream
+from calib_ros.sampling.batches import Stream
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.texts import LARGEST_TABLE, parse_yaml, read_text
 

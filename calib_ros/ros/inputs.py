@@ -26,7 +26,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from calib_ros.errors import ConfigError
-from calib_ros.sampling.intake import BATCH, Stream, links_of
+from calib_ros.sampling.batches import BATCH, Stream, links_of
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.slices import SILENCE
 

@@ -46,8 +46,8 @@ from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.to_ros import LATCHED
+from calib_ros.sampling.batches import Stream, feed, measured
 from calib_ros.sampling.dataset import check_settings
-from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sample import Sample, socket_place
 from calib_ros.sampling.session import CalibrationSession

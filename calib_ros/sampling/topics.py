@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from calib_ros.errors import InputError
-from calib_ros.sampling.intake import Deserialise, Intake, Stream, batches, measured
+from calib_ros.sampling.batches import DecodedBatch, Deserialise, Stream, batches, measured
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
     DECODERS,
@@ -96,7 +96,7 @@ def _others(recorded: Recorded) -> list[str]:
 
 def _learn(recorded: Recorded, streams: Mapping[str, Stream]) -> None:
     for batch, _ in batches(recorded.messages_on(streams)):
-        Intake(batch, recorded.deserialise)
+        DecodedBatch(batch, recorded.deserialise)
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
@@ -114,7 +114,7 @@ def check_joints(
     for batch, _ in batches(recorded.messages_on(streams)):
         for topic in {stream.topic for stream, _ in batch}:
             of_topic = [each for each in batch if each[0].topic == topic]
-            for part in Intake(of_topic, recorded.deserialise).parts:
+            for part in DecodedBatch(of_topic, recorded.deserialise).parts:
                 for name in topics.keys() & part.readings.strings[1:]:
                     topics[name].add(topic)
     twice = {name: found for name, found in topics.items() if len(found) > 1}

@@ -30,7 +30,7 @@ from rosbags.rosbag2 import Reader
 from calib_ros.errors import InputError
 from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag
-from calib_ros.sampling import intake
+from calib_ros.sampling import batches
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.session import CalibrationSession
 
@@ -287,7 +287,7 @@ def test_a_nan_of_a_foreign_joint_does_not_matter(tmp_path):
 
 
 def test_a_bag_tells_how_much_of_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(intake, 'BATCH', 100)
+    monkeypatch.setattr(batches, 'BATCH', 100)
     told = []
     path = record_in_chunks(tmp_path / 'bag', 'mcap')
     replay(path, CalibrationSession(ARM), told.append)

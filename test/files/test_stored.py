@@ -11,7 +11,7 @@ from rosbags.rosbag2 import Reader
 
 from calib_ros.files.mcap import MAGIC, Kind, records
 from calib_ros.files.stored import CHUNK, STORAGE, read
-from calib_ros.sampling.intake import Stream
+from calib_ros.sampling.batches import Stream
 from calib_ros.settings import STORAGES
 
 COMPRESSIONS = [

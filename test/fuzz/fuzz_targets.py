@@ -250,7 +250,7 @@ def metadata(path):
 def message(data):
     """The first byte chooses the type; messages are divided by a mark."""
     from calib_ros.files.bags import _deserialiser
-    from calib_ros.sampling.intake import Stream, feed
+    from calib_ros.sampling.batches import Stream, feed
     from calib_ros.sampling.messages import DECODERS, JOINT_STATE
     from calib_ros.sampling.session import CalibrationSession
     from calib_ros.sampling.sources import Source

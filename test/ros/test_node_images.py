@@ -31,7 +31,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling import pictures
-from calib_ros.sampling.intake import Stream, feed, measured
+from calib_ros.sampling.batches import Stream, feed, measured
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
 from calib_ros.sampling.pictures import Refusal
 from calib_ros.sampling.session import CalibrationSession

@@ -22,8 +22,8 @@ from recorded import (
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
+from calib_ros.sampling.batches import Stream, feed, measured
 from calib_ros.sampling.cdr import alike
-from calib_ros.sampling.intake import Stream, feed, measured
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources

@@ -9,7 +9,7 @@ from recorded import TYPESTORE, joint_state, point_stamped, pose_stamped
 from calib_ros import CalibrationSession, Settings, load_chain
 from calib_ros.apply.simulation import Cell, drive, faulty, measure
 from calib_ros.kinematics.se3 import to_quat
-from calib_ros.sampling.intake import Stream, feed
+from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import Source
 

@@ -123,7 +123,7 @@ def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) ->
 
     Batching makes no difference. `deserialise` decodes messages without a known layout.
     """
-    found = Intake(batch, deserialise, session.pictures)
+    found = DecodedBatch(batch, deserialise, session.pictures)
     for kind, causes in found.faults.items():
         for cause, count in causes.items():
             session.miss(kind, count, cause)
@@ -134,7 +134,7 @@ def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) ->
     return found.problems
 
 
-class Intake:
+class DecodedBatch:
     """The content of a batch of messages.
 
     Usable `parts`, counts of others by kind and cause (`faults`), and texts about messages that
