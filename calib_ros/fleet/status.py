@@ -245,7 +245,7 @@ def page_of(out: Path, found: Sequence[RobotStatus], done: Run) -> str | None:
         states=STATES,
         counts={state: number for state, number in counts(found).items() if number},
         total=len(found),
-        alarmed=[each for each in shown if each.alarms],
+        alarmed=[each for each in shown if each.actions],
         unreadable=[each for each in shown if each.errors],
         remarked=[each for each in shown if each.remarks],
         rows=[(each, _link(out, each)) for each in shown],

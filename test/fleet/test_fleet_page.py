@@ -68,9 +68,13 @@ def test_states_from_the_worst_to_the_best():
 
 
 def test_the_page_tells_all_that_is_to_be_said_of_a_robot():
-    fleet = [status('2', {'x.csv': 'damaged'}, verdict='refused')]
+    refused = {'verdict': 'refused', 'reasons': ('the arm is another one',)}
+    fleet = [status('2', {'x.csv': 'damaged'}, **refused)]
     page = page_of(Path('report'), fleet, Run())
     assert 'refused, beyond tolerance, unreadable</span>' in page
+    for action in fleet[0].actions:
+        assert f'<li>{action}</li>' in page
+    assert len(fleet[0].actions) == 2
 
 
 def test_a_night_that_does_not_determine_a_joint_leaves_a_gap_in_its_chart():
