@@ -84,10 +84,11 @@ def test_nobody_is_sent_to_the_model_just_used(rule):
         ((Rule.ENCODER, Rule.OUTLIERS), (True, False), 'OUTLIERS'),
         ((Rule.EXCITATION, Rule.GAIN), (True, False), 'GAIN'),
         ((Rule.OUTLIERS,), (True,), 'OUTLIERS'),
+        ((Rule.MOVED, Rule.CONFIGURATIONS), (True, False), 'MOVED'),
     ],
 )
 def test_what_follows_from_another_reason_sends_nobody_elsewhere(rules, steps, last):
-    """From a wrong setting, a bump, or a joint that hardly moved."""
+    """From a wrong setting, a bump, a joint that hardly moved, or too few poses."""
     here = advice.Situation(left=1000.0)
     told = advice.advice([Reason(rule, rule.name) for rule in rules], here)
     assert tuple(bool(each.steps) for each in told) == steps
