@@ -178,3 +178,15 @@ def test_plan_refuses_what_makes_no_sense(run, tmp_path, arguments, text, conten
     status, out, err = run('plan', '--chain', 'ur10e', *arguments)
     assert (status, out) == (1, '')
     assert text in err
+
+
+def test_poses_of_a_refused_table_of_another_layout_are_taken_as_advised(run, tmp_path):
+    chain = arm()
+    rows = simulation.measure(chain, some(chain, 9, 1), np.random.default_rng(2), 5e-5, 2e-4)
+    values = np.column_stack([np.degrees(rows.joints), 1e3 * rows.positions])
+    head = ','.join([*(f'J{k + 1} [deg]' for k in range(6)), 'X [mm]', 'Y [mm]', 'Z [mm]'])
+    np.savetxt(tmp_path / 'measured.csv', values, delimiter=',', header=head, comments='')
+    given = ('measured.csv', '--columns', 'q*=J*', '--chain', 'ur10e', '--out', 'result')
+    assert run('identify', *given)[0] == 3
+    taken = ('--taken', 'result/residuals.csv', '--poses', 3, '--draw', 50, '--out', 'plan.csv')
+    assert run('plan', '--chain', 'ur10e', *taken)[0] == 0
