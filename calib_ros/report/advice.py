@@ -79,9 +79,11 @@ WRONG_ARM = (Rule.MISTAKE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR)
 WRONG = {*WRONG_ARM, Rule.CONVERGENCE, Rule.DRIFT, Rule.GAIN}
 WRONG |= {Rule.REGION, Rule.ORIENTATION, Rule.SCALE}
 """Consequences of a description that does not fit."""
-BRINGS = {Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED}} | dict.fromkeys(WRONG_ARM, WRONG) | {
-    rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)
-}
+BRINGS = (
+    {Rule.CONFIGURATIONS: {Rule.ENCODER, Rule.MOVED}}
+    | dict.fromkeys(WRONG_ARM, WRONG)
+    | {rule: {rule, Rule.OUTLIERS, Rule.GAIN, Rule.REGION} for rule in (Rule.ENCODER, Rule.MOVED)}
+)
 BRINGS[Rule.LAG] = {*WRONG, Rule.OUTLIERS}
 BRINGS[Rule.MISTAKE] = {*WRONG, Rule.ENCODER, Rule.MOVED}
 BRINGS[Rule.EXCITATION] = {Rule.EXCITATION, Rule.GAIN, Rule.REGION}

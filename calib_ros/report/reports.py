@@ -26,6 +26,7 @@ from calib_ros.report.advice import GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Sit
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Origin, Report, Section, Verdict, section
 from calib_ros.report.poses import Poses
+from calib_ros.settings import Settings
 from calib_ros.shown import some
 
 NOT_YET = 'The robot itself is unchanged so far'
@@ -80,7 +81,7 @@ def identification_report(
             origin,
             poses,
             (
-                ('Stated device noise', f'{_stated(problem, poses)} (one sigma)'),
+                ('Stated device noise', f'{_stated(problem, poses)}; one sigma'),
                 ('Judged by', result.validated_by),
             ),
             corrected,
@@ -132,7 +133,7 @@ def _within(judged: Comparison, tolerance: float | None) -> str:
     """Return whether the remaining error is within the tolerance [m], if given."""
     if tolerance is None:
         return ''
-    wanted = f'within the tolerance of {1e3 * tolerance:g} mm'
+    wanted = f'within the tolerance of {1e3 * tolerance:g} mm RMS'
     lower, upper = interval_of(judged, 1)
     if upper <= tolerance:
         return f' and {wanted}'
@@ -237,13 +238,17 @@ def _sections(problem: Problem, result: Identification, poses: Poses) -> Iterato
 
 
 def _stated(problem: Problem, poses: Poses) -> str:
-    """Return the sigmas of what was measured."""
+    """Return the sigmas of what was measured, and which of them nobody stated."""
     found = {
-        f'{1e3 * problem.sigma_position:g} mm': not poses.corner.all(),
-        f'{1e3 * problem.sigma_orientation:.3g} mrad': poses.oriented,
-        f'{problem.sigma_pixel:g} px': poses.corner.any(),
+        'sigma_position': (not poses.corner.all(), f'{1e3 * problem.sigma_position:g} mm'),
+        'sigma_orientation': (poses.oriented, f'{1e3 * problem.sigma_orientation:.3g} mrad'),
+        'sigma_pixel': (poses.corner.any(), f'{problem.sigma_pixel:g} px'),
     }
-    return ', '.join(text for text, measured in found.items() if measured)
+    return ', '.join(
+        text + ' (default)' * (getattr(problem, name) == getattr(Settings, name))
+        for name, (measured, text) in found.items()
+        if measured
+    )
 
 
 def _unmodelled(result: Identification) -> list[str]:

@@ -189,7 +189,7 @@ def verification_report(
     if found.fitted:
         text.append('The interval allows for the refitted frames.')
     if found.limit is not None and not found.mistake:
-        names = ('Tolerance', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
+        names = ('Tolerance (RMS)', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
         if found.tolerance is None:
             size = rounded(1e3 * found.limit)
             what = f'Limit, at most {ALIKE:g} times the expected error'

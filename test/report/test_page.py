@@ -113,6 +113,12 @@ def test_the_page_says_whether_it_is_good_enough(solved):
     assert 'rms_lower_mm' not in told['fitted']['after']
 
 
+def test_a_noise_that_nobody_stated_is_marked(solved):
+    problem = replace(solved[0], sigma_position=5e-5, sigma_orientation=Problem.sigma_orientation)
+    identity = dict(report_of(problem, solved[1]).identity)
+    assert identity['Stated device noise'] == '0.05 mm, 0.333 mrad (default); one sigma'
+
+
 def test_what_others_named_is_text(solved):
     problem, result = solved
     names = [f'<b onclick=x>{k}</b>{HOSTILE}'.replace('.', '') for k in range(6)]

@@ -32,7 +32,7 @@ def test_identify_writes_what_it_was_told(table, run, tmp_path):
     told = ('--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012')
     status, said, _ = run(*IDENTIFY, *told, '--out', 'out', '--tolerance', 5, '--pdf')
     assert status == 0
-    assert 'Accepted and within the tolerance of 5 mm' in said
+    assert 'Accepted and within the tolerance of 5 mm RMS' in said
     out = tmp_path / 'out'
     content = (out / 'report.pdf').read_bytes()
     assert content.startswith(b'%PDF')
