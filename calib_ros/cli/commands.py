@@ -71,7 +71,8 @@ REPORT = """\
 for the report
   --operator NAME=  who measured
   --serial NAME=  serial number of the robot
-  --device NAME=  measuring device and its serial number"""
+  --device NAME=  measuring device and its serial number
+  --conditions TEXT=  temperature, load, speed and the like while measuring"""
 PDF = '  --pdf  also write report.pdf, starting with a certificate'
 WRITTEN = f"""
 ## First steps

@@ -115,7 +115,8 @@ def origin_of(
     """Return the origin of a result: the options, and the files read."""
     chain = Path(options.chain)
     known = (*inputs, chain if chain.is_file() else None)
-    people = {name: getattr(options, name, '') for name in ('operator', 'serial', 'device')}
+    told = ('operator', 'serial', 'device', 'conditions')
+    people = {name: getattr(options, name, '') for name in told}
     return page.Origin(inputs_of(*known), settings=settings, command=options.typed, **people)
 
 

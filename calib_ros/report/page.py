@@ -88,6 +88,7 @@ class Origin:
     device: str = ''
     settings: str = ''  # configuration to repeat it
     command: str = ''  # command to repeat it, if any
+    conditions: str = ''  # temperature, load and the like
 
     def document(self) -> dict[str, Any]:
         """Return it as plain values, without the settings, which have their own file."""

@@ -91,6 +91,7 @@ def identity_of(
         ('Joints', ', '.join(chain.joint_names)),
         ('Measuring device', origin.device),
         ('Operator', origin.operator),
+        ('Conditions', origin.conditions),
         ('Measured, by the stamps', _measured(poses)),
         *(((poses.things.capitalize(), f'{len(poses):,}'),) if poses else ()),
         *more,

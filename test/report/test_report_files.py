@@ -30,6 +30,7 @@ def test_exported_files_carry_the_hash_of_the_table(solved):
 
 def test_identify_writes_what_it_was_told(table, run, tmp_path):
     told = ('--operator', 'A. Smith', '--device', 'tracker 7', '--serial', '0012')
+    told += ('--conditions', '21 °C, 5 kg')
     status, said, _ = run(*IDENTIFY, *told, '--out', 'out', '--tolerance', 5, '--pdf')
     assert status == 0
     assert 'Accepted and within the tolerance of 5 mm RMS' in said
@@ -39,7 +40,7 @@ def test_identify_writes_what_it_was_told(table, run, tmp_path):
     assert len(content) < 2e6
     page = Page((out / 'report.html').read_text())
     digest = hashlib.sha256(table.read_bytes()).hexdigest()
-    for text in ('ur5e 0012', 'A. Smith', 'tracker 7', digest, 'tolerance of 5 mm'):
+    for text in ('ur5e 0012', 'A. Smith', 'tracker 7', '21 °C, 5 kg', digest, 'tolerance of 5 mm'):
         assert text in page.text
     assert page.data['explorer']['lines']
     document = json.loads((out / 'result.json').read_text())
