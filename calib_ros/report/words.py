@@ -54,7 +54,7 @@ def summary(
         where = ', see the report' if numbers is None else f': {_named(result.outliers, numbers)}'
         text += '; 1 outlier carries' if count == 1 else f'; {count} outliers carry'
         text += f' little or no weight{where}'
-    if result.region is not None:
+    if result.accepted and result.region is not None:
         text += f'; {result.region.in_words()}'
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'

@@ -11,6 +11,7 @@ from verified import in_words
 from calib_ros.apply.simulation import measure
 from calib_ros.apply.verification import verify
 from calib_ros.decision.comparison import Comparison, Residuals
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.noise import Noise
 from calib_ros.files.rows import Filing, verified
 from calib_ros.identification.calibration import Calibration
@@ -82,6 +83,13 @@ def test_a_held_out_gross_error_is_counted_where_the_figures_are(unsearched):
     problem.sets[0].positions[3] += 0.02
     folded = identify(replace(problem, held_out=None))
     assert folded.validated_by.endswith(' poses, 1 of them an outlier not in the figures')
+
+
+def test_a_refused_calibration_is_valid_nowhere(unsearched):
+    result = identify(problem_of())
+    assert 'valid over the whole joint range' in words.summary(result)
+    refused = replace(result, refusals=(Reason(Rule.MOVED, 'the target moved'),))
+    assert 'valid' not in words.summary(refused)
 
 
 def test_the_error_told_is_the_one_within_its_limits():
