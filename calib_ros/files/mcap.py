@@ -20,6 +20,7 @@ from calib_ros.errors import InputError
 from calib_ros.texts import LARGEST_TABLE
 
 MAGIC = b'\x89MCAP0\r\n'
+ZSTD = b'\x28\xb5\x2f\xfd'  # begins what zstd compressed
 _HEAD = struct.Struct('<BQ')  # kind and size
 _LOGGED = struct.Struct('<HIQQ')  # channel, sequence, log time, publish time
 MESSAGE_HEAD = _LOGGED.size

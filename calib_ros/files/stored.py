@@ -169,7 +169,8 @@ class Salvage:
 
     def on(self, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
         """Yield the messages of some streams."""
-        return ((streams[topic], data) for topic, data in self.messages() if topic in streams)
+        found = ((streams[topic], data) for topic, data in self.messages() if topic in streams)
+        return _unpacked(found)
 
 
 def salvage(path: Path) -> Salvage | None:
@@ -274,19 +275,24 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
         connections = _wanted(reader, streams)
         return ((streams[c.topic], data) for c, _, data in reader.messages(connections))
     found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
-    if reader.compression_mode == 'message':
-        return ((stream, _unpacked(data, largest(stream))) for stream, data in found)
-    return found
+    return _unpacked(found)
 
 
-def _unpacked(data: bytes, most: int) -> bytes:
-    """Return an unpacked message, empty if damaged: the next one may be readable."""
-    try:
-        return mcap.unpacked(data, 'zstd', most)
-    except OSError:  # no decompression module
-        raise
-    except Exception:  # decompressors have their own errors
-        return b''
+def _unpacked(messages: Iterator[tuple[Stream, bytes]]) -> Iterator[tuple[Stream, bytes]]:
+    """Unpack messages that were compressed one by one, as their first bytes tell.
+
+    Metadata, which would tell, may be missing. Damaged ones are empty: the next one may be
+    readable.
+    """
+    for stream, data in messages:
+        if isinstance(data, bytes) and data.startswith(mcap.ZSTD):
+            try:
+                data = mcap.unpacked(data, 'zstd', largest(stream))
+            except OSError:  # no decompression module
+                raise
+            except Exception:  # decompressors have their own errors
+                data = b''
+        yield stream, data
 
 
 def _wanted(storage: Any, streams: Mapping[str, Stream]) -> list[Any]:

@@ -217,3 +217,13 @@ def test_one_packed_message_that_is_damaged_costs_no_other(tmp_path):
     account = session.account()
     assert account.joint_states + account.poses == 279
     assert '1 of 280 messages are lost' in warning
+
+
+@storages
+@pytest.mark.parametrize('alone', [True, False])
+def test_packed_messages_need_no_metadata(tmp_path, storage, alone):
+    """Only metadata tell of compression; a killed recorder leaves none."""
+    path = record_in_chunks(tmp_path / 'bag', storage, 'message')
+    file = damage(path, metadata=alone)
+    account = session_of(file if alone else path)[0].account()
+    assert account.joint_states + account.poses == 280
