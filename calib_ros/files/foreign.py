@@ -40,6 +40,7 @@ from calib_ros.files.layouts import (
 from calib_ros.files.sheets import SIGNS, Sheet, name_and_unit, only, places, read_sheet
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.shown import some
 from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
@@ -64,7 +65,7 @@ class Foreign:
         """Return our columns of a table, and notes about guesses and omissions."""
         table = _Table(path, self.layout, self.chain, self.log is None)
         values, lines = table.values(), table.lines
-        notes = [f'{path}: {note}' for note in table.notes]
+        notes, matched = [f'{path}: {note}' for note in table.notes], ''
         if self.log is not None:
             log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
             joints = log.values()
@@ -75,16 +76,18 @@ class Foreign:
                     f'{self.log} has no column q1; {log.has}: give --columns "q*={like}" or '
                     '--joints-preset'
                 )
-            name, partners = _partners(table, log)
+            matched, partners = _partners(table, log)
             if len(partners) != len(lines):
                 raise InputError(
                     f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: give both a '
                     'column of the same name that names the poses, or a row for each measurement'
                 )
-            how = f'by the column "{name}"' if name else 'row by row'
+            how = f'by the column "{matched}"' if matched else 'row by row'
             notes += [f'{self.log}: {note}' for note in log.notes]
             notes.append(f'{self.log}: holds the joint values of {path}, matched {how}')
             values = {ours: each[partners] for ours, each in joints.items()} | values
+        if not self.layout.source:  # a preset is known to leave some out
+            notes += not_read(path, [name for name in table.unread() if name != matched])
         made = Columns(path, lines, table.words(), values, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
@@ -95,6 +98,12 @@ class Foreign:
             notes.append(f'{path}: nothing measured in {lines_in_words(lines)}: skipped')
             made = made.select(good)
         return finished(made, self.layout), tuple(notes)
+
+
+def not_read(path: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """Return a warning about columns that are not read, by their names in the file."""
+    named = [name for name in names if name and not name.startswith('#')]
+    return (f'{path}: columns not read: {", ".join(some(named))} (--columns)',) * bool(named)
 
 
 def as_csv(columns: Columns) -> str:
@@ -204,6 +213,14 @@ class _Table:
     def names(self) -> tuple[str, ...]:
         """Return the names of the columns without their units."""
         return tuple(name_and_unit(name)[0] for name in self.header)
+
+    def unread(self) -> list[str]:
+        """Return the names of the columns that nothing is made of."""
+        used = {n for each in self._expressions.values() for n in each.names}
+        used |= {_bare(self._ours[ours]) for ours in WORDS if ours in self._ours}
+        numbers = {self._sheet.number(name) for name in used}
+        header = enumerate(self._sheet.header, 1)
+        return [name for k, name in header if f'#{k}' not in numbers]
 
     def words(self) -> dict[str, str]:
         used = {ours: _bare(self._ours[ours]) for ours in WORDS if ours in self._ours}

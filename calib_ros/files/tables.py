@@ -31,8 +31,16 @@ from calib_ros.files.columns import (
     joints_left_out,
     lines_in_words,
 )
-from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, TURNS, UPPER, joint_columns
+from calib_ros.files.foreign import Foreign, not_read
+from calib_ros.files.layouts import (
+    COVARIANCE,
+    POSITION,
+    QUATERNION,
+    TURNS,
+    UPPER,
+    WORDS,
+    joint_columns,
+)
 from calib_ros.files.measurements import (
     DISTANCE,
     PLANE,
@@ -81,6 +89,11 @@ def read_table(
         read = _of_journal(path, joints, progress)
     if read is None:
         found = columns_of(path, read_bytes(path, LARGEST_TABLE, InputError), progress)
+        cells = {
+            low if (low := name.lower()) in WORDS and low not in found.words else name: text
+            for name, text in found.words.items()
+        }
+        found = replace(found, words=cells)
         read = found, tuple(_unread(found, joints))
     found, warnings = read
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
@@ -89,9 +102,11 @@ def read_table(
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
     yield from joints_left_out(found, joints)
+    known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     if {*TURNS} <= {*found.header} and QUATERNION[0] not in found.header:
         turns = ', '.join(TURNS)
         yield f'{found.path}: {turns} are left out: give --euler or --rotation-vector to use them'
+    yield from not_read(found.path, [name for name in found.header if name not in known])
 
 
 def _chosen(found: Columns, joints: int, sessions: Sequence[str]) -> Measurements:

@@ -209,6 +209,7 @@ def test_sessions_come_in_the_order_asked_for(tmp_path):
         ('q1,q2,q3,x,y,z\n0,0,0,1,2,3\n', 'the column q3 is left out: the arm has 2 joints'),
         ('q1,q2,x,y,z,rx,ry,rz\n0,0,1,2,3,0,0,0\n', 'rx, ry, rz are left out: give --euler'),
         ('q1,q2,x,y,z,rx,qx,qy,qz,qw\n0,0,1,2,3,0,0,0,0,1\n', ''),
+        ('q1,q2,x,y,z,q_w,,robot\n0,0,1,2,3,1,,left\n', 'columns not read: q_w, robot ('),
     ],
 )
 def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
@@ -226,6 +227,7 @@ def test_columns_that_someone_may_have_wanted_are_told(tmp_path, text, said):
         ('Q1,Q2,X,Y,Z', ',', 'no units are given'),
         ('q1,q2,x,y,z', ';', 'semicolon'),
         ('q1,q2,x,y,z,Prüfung', ',', 'Windows-1252'),
+        ('q1,q2,x,y,z,Prüfung', ',', 'columns not read: Prüfung ('),
         ('q1,q2,x,y,z,UTF-16', ',', 'no units are given'),
     ],
 )
@@ -239,6 +241,14 @@ def test_without_options_a_table_of_others_is_read_as_far_as_it_can_be_guessed(
     found = loading.table(path, Chain('arm', 'standard', joints), Settings())
     np.testing.assert_array_equal(found.fitted[0].joints, [[0.1, 0.2], [-0.3, 0.4]])
     assert noted in ' '.join(found.warnings)
+
+
+@pytest.mark.parametrize('name', ['Session', 'SESSION', 'session'])
+def test_columns_of_names_are_read_in_any_case(tmp_path, name):
+    path = tmp_path / 'cell.csv'
+    path.write_text(SESSIONS.replace('session', name))
+    with pytest.raises(InputError, match='holds several sessions, choose one of A, B'):
+        read_table(path, 2)
 
 
 def test_one_column_has_a_line_for_each_row(tmp_path):
