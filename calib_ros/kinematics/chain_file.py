@@ -58,15 +58,16 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     """
     path = Path(name_or_path)
     if path.suffix in URDF_SUFFIXES:
-        return replace(read_urdf(path), base=None, tool=None)
-    if not path.suffix and not path.is_file():
-        robots = shipped_robots()
-        if str(name_or_path) not in robots:
-            raise UnknownNameError(
-                'robot (or path of a chain file or URDF)', str(name_or_path), robots
-            )
-        path = robots[path.name]
-    chain = parse_chain(read_text(path), str(path))
+        chain = replace(read_urdf(path), base=None, tool=None)
+    else:
+        if not path.suffix and not path.is_file():
+            robots = shipped_robots()
+            if str(name_or_path) not in robots:
+                raise UnknownNameError(
+                    'robot (or path of a chain file or URDF)', str(name_or_path), robots
+                )
+            path = robots[path.name]
+        chain = parse_chain(read_text(path), str(path))
     _refuse_degrees(chain, str(path))
     return chain
 

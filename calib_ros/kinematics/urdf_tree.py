@@ -137,7 +137,10 @@ class Description:
         ends = [link for link in self.links if link in moved and link not in parents]
         if len(ends) != 1:
             found = f'ends in {", ".join(ends)}' if ends else f'moves nothing behind "{base}"'
-            raise ConfigError(f'the URDF {found}: name the tip_link of the arm (--tip-link)')
+            raise ConfigError(
+                f'the URDF {found}: name the tip_link of the arm (calib_ros chain FILE '
+                '--tip-link LINK --out arm.yaml; then --chain arm.yaml)'
+            )
         return ends[0]
 
     def poses(self, base: str) -> dict[str, FloatArray]:
@@ -258,7 +261,11 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
             for key, default in (('multiplier', '1'), ('offset', '0'))
         )
         follows = mimic.get('joint', ''), ratio, offset
-    origin, _ = _placed(_child(element, 'origin'), f'origin of {where}')
+    origin, rpy = _placed(_child(element, 'origin'), f'origin of {where}')
+    if (most := np.abs(rpy).max()) > 4.0 * math.pi:  # two turns
+        raise ConfigError(
+            f'the rpy of {where} must be in radians, not {most:g}: is it in degrees?'
+        )
     return DescribedJoint(name, kind, parent, child, origin, axis, lower, upper, follows)
 
 

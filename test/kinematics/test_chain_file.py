@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from hypothesis import given, settings, strategies as st
+from urdfs import ur10e
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import se3
@@ -284,10 +285,17 @@ def test_the_hash_of_a_table_stays_what_older_files_hold():
     assert table_hash(chain).startswith('a94e4899f2eac75b')
 
 
-def test_limits_in_degrees_are_refused(tmp_path):
+@pytest.mark.parametrize(
+    ('name', 'text'),
+    [
+        ('cell.yaml', BASE.replace('sign: 1', 'lower: -360', 1)),
+        ('cell.urdf', ur10e().replace('lower="-6.283185307179586"', 'lower="-360"', 1)),
+    ],
+)
+def test_limits_in_degrees_are_refused(tmp_path, name, text):
     """A program in degrees was between them, and corrected as if in radians."""
-    (tmp_path / 'cell.yaml').write_text(BASE.replace('sign: 1', 'lower: -360', 1))
+    (tmp_path / name).write_text(text)
     with pytest.raises(
         ConfigError, match=r'joint 1: lower must be in radians, not -360: .*-6.283'
     ):
-        load_chain(tmp_path / 'cell.yaml')
+        load_chain(tmp_path / name)
