@@ -63,7 +63,7 @@ class Columns:
             remedy = 'write it without the marks between thousands'
         of_units = row == 0 and text != '' and not re.search('[0-9]', text)
         if of_units:  # perhaps, as other tables have below their header
-            remedy += '; a line of units is read with --length and --joint-angle'
+            remedy += '; units in a line of their own are read above measurements only'
         return (ColumnsError if of_units else InputError)(
             f'{self.where(row, name)} must be a finite number, not {text!r}: {remedy}'
         )
@@ -323,14 +323,14 @@ def distinct(codes: Index) -> tuple[Index, Index]:
     return codes[first[order]], rank[number.reshape(-1)]
 
 
-def with_rows(found: Columns, needed: Sequence[str]) -> Columns:
+def with_rows(found: Columns, needed: Sequence[str], how: str = '') -> Columns:
     """Return columns; refuse those without rows or needed columns."""
     missing = [name for name in needed if name not in found.header]
     if missing:
         refuse_separator(found.path, found.header)
         raise InputError(
             f'{found.path} has no column {", ".join(missing)}; expected {", ".join(needed)}; '
-            f'found {", ".join(found.header) or "nothing"}: name the columns in the first line'
+            f'found {", ".join(found.header) or "nothing"}: name them in the first line{how}'
         )
     if not len(found.lines):
         raise InputError(f'{found.path} has no rows')

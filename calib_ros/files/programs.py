@@ -2,8 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Programs: tables of joint values or poses (CSV), and JointTrajectory messages (YAML).
 
-Joint values are in q1 ... qn, or in columns with the joints' names [rad or m], poses in x y z [m]
-and qx qy qz qw. Everything else in a program is written back unchanged.
+Joint values are in q1 ... qn, or in columns with the joints' names, in rad or m or in the units
+of the header, q1 [deg]; poses in x y z [m] and qx qy qz qw. Everything else in a program is
+written back unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from calib_ros.files.columns import (
     read_columns,
     with_rows,
 )
-from calib_ros.files.layouts import POSITION, QUATERNION, joint_columns
+from calib_ros.files.layouts import ANGLES, LENGTHS, POSITION, QUATERNION, joint_columns
+from calib_ros.files.sheets import name_and_unit, places
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
@@ -46,13 +48,16 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     Columns of held joints may be missing.
     """
     found = read_columns(path, ())
-    names, program = _program(found, chain)
+    names, _, program = _program(found, chain)
     values, _ = joint_values(chain, program)
-    check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ')
+    remedy = f': name columns in degrees {names[0]} [deg]'
+    check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ', remedy)
     return values
 
 
-def check_limits(values: FloatArray, chain: Chain, where: Callable[[int, int], str]) -> None:
+def check_limits(
+    values: FloatArray, chain: Chain, where: Callable[[int, int], str], remedy: str = ''
+) -> None:
     """Refuse joint values (N, n) 1e-3 beyond their limits, or as `check_turns`."""
     check_turns(values, chain, where)
     lower, upper = limits(chain)
@@ -60,7 +65,7 @@ def check_limits(values: FloatArray, chain: Chain, where: Callable[[int, int], s
     for k, i in np.argwhere(beyond)[:1].tolist():
         raise InputError(
             f'{where(k, i)}{values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
-            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m, not degrees)'
+            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m, not degrees{remedy})'
         )
 
 
@@ -81,23 +86,41 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
         )
 
 
-def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], Program]:
-    """Return the columns of all joints, and the program; those of held ones may be missing."""
+def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], FloatArray, Program]:
+    """Return the columns (n) of all joints, their units [rad or m], and the program in rad or m.
+
+    Columns of held joints may be missing.
+    """
     joints = chain.joint_names
     *names, more = joint_columns(len(joints) + 1)
+    header = [name_and_unit(name)[0] for name in found.header]
 
     def needed(names: Sequence[str]) -> list[str]:
         return [name for k, name in enumerate(names) if k not in chain.held]
 
     ways = (names, [*joints], [name.upper() for name in names])
-    names = next((each for each in ways if {*needed(each)} <= {*found.header}), names)
-    if {more, more.upper()} & {*with_rows(found, needed(names)).header}:
+    names = next((each for each in ways if {*needed(each)} <= {*header}), names)
+    columns, units = [], []
+    for joint, name in zip(chain.joints, names, strict=True):
+        several = [found.header[k] for k in places(found.header, name)]
+        if len(several) > 1:
+            raise InputError(f'{found.path} has several columns {", ".join(several)}: keep one')
+        columns.append((several or [name])[0])
+        unit = name_and_unit(columns[-1])[1]
+        known = ANGLES if joint.type == 'revolute' else LENGTHS
+        if unit and unit not in known:
+            raise InputError(f'{found.path}: {columns[-1]} must be in {" or ".join(known)}')
+        units.append(known.get(unit, 1.0))
+    how = '; values are in rad or m, or in the unit named there: q1 [deg]'
+    how += '; of a Fanuc q3 = J3 + J2' * ('J3' in header)
+    with_rows(found, needed(columns), how)
+    if {more, more.upper()} & {*header}:
         raise InputError(
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
-    pairs = zip(joints, names, strict=True)
-    given = {joint: column for joint, column in pairs if column in found.header}
-    return tuple(names), Program(tuple(given), found.block(list(given.values())))
+    given = [k for k, column in enumerate(columns) if column in found.header]
+    values = found.block([columns[k] for k in given]) * np.array(units)[given]
+    return tuple(columns), np.array(units), Program(tuple(joints[k] for k in given), values)
 
 
 def read_poses(path: Path) -> FloatArray:
@@ -153,7 +176,7 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 
 def _read_csv(text: str, path: Path, chain: Chain) -> ProgramFile:
     found = columns_of(path, text.encode())
-    names, program = _program(found, chain)
+    names, units, program = _program(found, chain)
     signs = joint_columns(len(names), 's')
     known = [k for k, sign in enumerate(signs) if sign in found.header]
     if len({*known, *chain.held}) == len(signs):
@@ -163,8 +186,9 @@ def _read_csv(text: str, path: Path, chain: Chain) -> ProgramFile:
 
     def text_with(corrected: Program) -> str:
         header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
-        at = [found.header.index(name) for name in names if name in found.header]
-        for row, values in zip(rows, corrected.positions.tolist(), strict=True):
+        given = [k for k, name in enumerate(names) if name in found.header]
+        at = [found.header.index(names[k]) for k in given]
+        for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
                 row[k] = repr(value)
         return csv_text([header, *rows])

@@ -15,7 +15,7 @@ from calib_ros.cli.common import Status
 from calib_ros.cli.main import main
 from calib_ros.errors import InputError
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.programs import joints_csv, program_of, read_program
+from calib_ros.files.programs import joints_csv, program_of, read_joints, read_program
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics import se3
@@ -171,6 +171,22 @@ def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
     assert read_program(again, UR).text_with(source.program) == text
 
 
+def test_units_are_those_of_the_header(tmp_path):
+    path = tmp_path / 'program.csv'
+    given = 'a [deg],b / mm,speed [mm]\n90.0,250.0,1\n-45.0,0.5,2\n'
+    path.write_text(given)
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b', 'prismatic')))
+    source = read_program(path, arm)
+    wanted = [[np.pi / 2, 0.25], [-np.pi / 4, 0.0005]]
+    np.testing.assert_allclose(source.program.positions, wanted)
+    np.testing.assert_array_equal(read_joints(path, arm), source.program.positions)
+    further = np.add(source.program.positions, [np.pi, 1.0])
+    moved = replace(source.program, positions=further)
+    written = [line.split(',') for line in source.text_with(moved).splitlines()]
+    assert written[0] == given.splitlines()[0].split(',')
+    np.testing.assert_allclose(np.array(written[1:], float), [[270, 1250, 1], [135, 1000.5, 2]])
+
+
 def test_signs_in_a_table_are_the_approach(tmp_path):
     path = tmp_path / 'program.csv'
     path.write_text('q1,q2,s1,s2\n1,2,-0.5,0\n3,4,1,7\n')
@@ -245,7 +261,9 @@ WRONG = [
     ('.csv', 'q1,q2,q3,q4,q5\n1,2,3,4,5\n', 'has no column q6'),
     ('.csv', 'q1,q2,q3,q4,q5,q6,q7\n1,0,0,1,0,1,0\n', 'q7, but the arm has 6 joints only'),
     ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'several columns q1'),
-    ('.csv', 'J1,J2,J3,J4,J5,J6\n1,2,3,4,5,6\n', 'J6: name the columns in the first line'),
+    ('.csv', 'J1,J2,J3,J4,J5,J6\n1,2,3,4,5,6\n', 'J6: name them in the first line; .*q3 = J3'),
+    ('.csv', 'q1,q2,q3,q4,q5,q6 [mm]\n1,2,3,4,5,6\n', 'q6 .mm. must be in rad or deg'),
+    ('.csv', 'q1,q2,q3,q4,q5,q6,q6 [deg]\n1,2,3,4,5,6,6\n', 'columns q6, q6 .deg.: keep one'),
     ('.csv', '# picks\nq1,q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', 'header; remove other lines above'),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a finite number, not ''"),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5,x\n', "line 2: q6 must be a finite number, not 'x'"),
