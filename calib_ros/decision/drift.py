@@ -9,8 +9,7 @@ Of residuals r, columns A added to the columns F of the previous model explain t
 where L holds the inverse variances of priors. It is compared with the share of residuals shifted
 in time (docs/model.md, Judgement). Each series is closed to a circle by its mirror image, and its
 slowest, non-stationary part is removed: a few cosines over the session. Samples of one stop move
-together, as their sum; pixels also with their first moments. All shifts of X^T r are one circular
-correlation, computed by fast Fourier transforms.
+together, as their sum; pixels also with their first moments.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import fft
+from numpy.lib.stride_tricks import sliding_window_view
 
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
@@ -50,44 +48,35 @@ class Shifts:
         numbers = [samples.observations.stops for samples in system.sets]
         self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
         count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
-        self._share = np.arange(count) / count
         self._weights = [
             _weights(samples.observations, begins)
             for samples, begins in zip(system.sets, self._begins, strict=True)
         ]
-        self._circles: list[NDArray[np.complex128]] = []
-        self._energy = np.zeros(count)
+        windows = []
         for begins, weights, residual in zip(self._begins, self._weights, residuals, strict=True):
             series = _by_stop(residual, begins, weights)
-            circle = np.concatenate([series, series[:, ::-1]], axis=1)
-            length = len(begins)
-            again = np.concatenate([circle, series], axis=1)  # the reach of a shifted series
-            self._circles.append(fft.rfft(again, _period(length)))
-            squares = np.concatenate([[0.0], np.cumsum(np.tile((circle**2).sum(axis=0), 2))])
-            slow = _correlated(slow_cosines(length)[:, np.newaxis], self._circles[-1], each=True)
-            energy = squares[length : 3 * length] - squares[: 2 * length]
-            self._energy += self._sampled(energy - (slow**2).sum(axis=(0, 1)))
+            circle = np.concatenate([series, series[:, ::-1], series], axis=1)
+            every = sliding_window_view(circle, len(begins), axis=1).swapaxes(0, 1)
+            starts = (np.arange(count) / count * 2 * len(begins)).astype(int)
+            windows.append(_detrended(every[starts]).reshape(count, -1))
+        self._shifted = np.concatenate(windows, axis=1)
+        self._energy = (self._shifted**2).sum(axis=1)
 
     def columns(self, columns: Iterable[Sequence[FloatArray]]) -> Columns:
         """Return the products of weighted columns, (P, c, N) for each set, in one or more lots."""
-        rows, products = [], []
+        rows = []
         for lot in columns:
             parts = []
-            products.append(np.zeros((len(lot[0]), len(self._share))))
-            for begins, weights, circle, column in zip(
-                self._begins, self._weights, self._circles, lot, strict=True
-            ):
+            for begins, weights, column in zip(self._begins, self._weights, lot, strict=True):
                 series = _by_stop(column, begins, weights)
                 whole = np.linalg.norm(series, axis=(1, 2))
-                slow = slow_cosines(len(begins))
-                series -= series @ slow.T @ slow
+                series = _detrended(series)
                 rounding = np.linalg.norm(series, axis=(1, 2)) <= HALF_THE_DIGITS * whole
                 series[rounding] = 0.0
-                products[-1] += self._sampled(_correlated(series, circle))
                 parts.append(series.reshape(len(series), -1))
             rows.append(np.concatenate(parts, axis=1))
         every = np.concatenate(rows)
-        return every @ every.T, np.concatenate(products)
+        return every @ every.T, every @ self._shifted.T
 
     def shares(
         self,
@@ -114,10 +103,6 @@ class Shifts:
         explained = ((np.swapaxes(roots, 1, 2) @ products) ** 2).sum(axis=1)
         left = np.maximum(self._energy - (removed**2).sum(axis=0), 1e-300)
         return np.asarray(explained / left)
-
-    def _sampled(self, shifted: FloatArray) -> FloatArray:
-        """Return the shifts to try (..., S) of all shifts (..., 2 n) of a set."""
-        return shifted[..., (self._share * shifted.shape[-1]).astype(int)]
 
 
 def _by_stop(values: FloatArray, begins: Index, weights: FloatArray) -> FloatArray:
@@ -152,23 +137,10 @@ def slow_cosines(length: int) -> FloatArray:
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
 
 
-def _period(length: int) -> int:
-    """Return the period of the transforms: the circle of a series if that length is fast."""
-    circle = 2 * length
-    if fft.next_fast_len(circle, real=True) == circle:
-        return circle
-    return int(fft.next_fast_len(3 * length, real=True))
-
-
-def _correlated(
-    series: FloatArray, circle: NDArray[np.complex128], each: bool = False
-) -> FloatArray:
-    """Return products (P[, c], 2 n) of series (P, c, n) with the circle (c, K) at each shift."""
-    length = _period(series.shape[-1])
-    spectrum = fft.rfft(series, length)
-    np.conj(spectrum, out=spectrum)
-    found = fft.irfft(np.einsum('pck,ck->pck' if each else 'pck,ck->pk', spectrum, circle), length)
-    return np.asarray(found[..., : 2 * series.shape[-1]])
+def _detrended(series: FloatArray) -> FloatArray:
+    """Return series (..., n) without their constant and slowest cosines."""
+    slow, flat = slow_cosines(series.shape[-1]), series.reshape(-1, series.shape[-1])
+    return np.asarray((flat - flat @ slow.T @ slow).reshape(series.shape))
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
