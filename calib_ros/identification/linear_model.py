@@ -21,15 +21,14 @@ from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import group_of
 from calib_ros.estimation.identifiability import independent
-from calib_ros.estimation.leastsquares import Folds, System, owners, products_of, stacked
+from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
-from calib_ros.estimation.samples import gram
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 
 HARMONICS = range(3, 41)
@@ -42,8 +41,8 @@ are the same within 1e-4 (benchmarks/real_robots.py)."""
 class LinearModel:
     """The linear model about a geometric fit; columns of effects are computed on demand.
 
-    Rows are ordered sample by sample. At sockets no device could drift, so residuals are not
-    shifted in time and no spectrum is searched.
+    Rows are ordered by folds; the first column is the residual. At sockets no device could drift,
+    so residuals are not shifted in time and no spectrum is searched.
     """
 
     def __init__(self, problem: Problem, geometric: Identification) -> None:
@@ -72,15 +71,16 @@ class LinearModel:
             new = np.unique(each[blocks[each] < 0])
             blocks[new] = np.arange(len(new)) * problem.folds // max(len(new), 1)
         rows = self._rows(self._names)
-        *columns, self._residual = stacked(rows).T
-        self._columns = np.array(columns).reshape(len(columns), -1)
-        self._number = {name: k for k, name in enumerate(self._names)}
         self._ends = np.cumsum([each[-1].size for each in rows])
-        owner, ends = owners(rows), np.cumsum([len(each) for each in sets])[:-1]
-        dealings = (self._groups % problem.folds, blocks[self._groups])
-        self._folds = [dealing[owner] for dealing in dealings]
-        self._dealt = [_sorted(self._system, np.split(dealing, ends)) for dealing in dealings]
-        self._products = self._all_products()
+        owner = owners(rows)
+        dealings = np.array([self._groups % problem.folds, blocks[self._groups]])[:, owner]
+        self._order = np.lexsort(dealings)  # by folds, for products
+        self._folds = dealings[:, self._order]
+        *columns, residual = stacked(rows).T
+        self._columns = np.zeros((0, len(owner)))
+        self._products = [np.zeros((1 + int(each.max(initial=0)), 0, 0)) for each in self._folds]
+        self._add(np.array([residual, *columns]))
+        self._number = {name: k for k, name in enumerate(self._names, 1)}
         self._pairs = [
             effects.waves(joint.name, harmonic)
             for joint in self._chain.joints
@@ -94,6 +94,7 @@ class LinearModel:
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
         self._errors: dict[tuple[int, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
+        self._sigmas: dict[str, float] = {}
         self._seen: Columns | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -191,17 +192,23 @@ class LinearModel:
         """Return the column numbers of effects, adding missing columns."""
         missing = [name for name in names if name not in self._number]
         if missing:
-            added = stacked(self._rows(missing)).T[:-1]
             self._number |= {name: k for k, name in enumerate(missing, len(self._columns))}
-            self._columns = np.concatenate([self._columns, added])
-            self._products = self._all_products()
+            self._add(stacked(self._rows(missing)).T[:-1])
         return [self._number[name] for name in names]
 
-    def _all_products(self) -> list[FloatArray]:
-        """Return by dealing the products (K, P + 1, P + 1) of each fold, the residual last."""
-        names = [*self._number]
-        fitted = self._with(names), names
-        return [products_of(*fitted, *dealt).sum(axis=1) for dealt in self._dealt]
+    def _add(self, columns: FloatArray) -> None:
+        """Add columns (K, R) and their products with all, by fold of each dealing."""
+        count = len(self._columns)
+        self._columns = np.concatenate([self._columns, np.take(columns, self._order, axis=1)])
+        grown = (0, 0), (0, len(columns)), (0, len(columns))
+        self._products = [np.pad(each, grown) for each in self._products]
+        for cell, folds in _cells(self._folds):
+            old, new = np.split(self._columns[:, cell], [count])
+            own, cross = new @ new.T, old @ new.T
+            for products, fold in zip(self._products, folds, strict=True):
+                products[fold, count:, count:] += own
+                products[fold, :count, count:] += cross
+                products[fold, count:, :count] += cross.T
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
         return self._system.rows_of(self._with(names), names)
@@ -212,28 +219,30 @@ class LinearModel:
 
     def _left_out(self, dealing: int, chosen: Sequence[str]) -> FloatArray:
         """Return held-out position errors (N, 3) [m] of every sample, by the other folds."""
-        which = [*range(len(self._names)), *self._columns_of(chosen)]
+        which = [*range(1, 1 + len(self._names)), *self._columns_of(chosen)]
         key = (dealing, *which)
         if key in self._errors:
             return self._errors[key]
-        priors = self._priors(chosen)
         extra, offset = self._system.extra_rows(self._chain, self._names)
-        offset = np.append(offset, np.zeros(len(priors)))
-        extra = np.column_stack([linalg.block_diag(extra, np.diag(priors)), offset])
-        products, ends = self._products[dealing], [*which, -1]
-        parts = products[np.ix_(range(len(products)), ends, ends)]
-        rest = parts.sum(axis=0) + gram(extra.T)
+        extra = np.column_stack([offset, extra])
+        ends = [0, *which]
+        parts = np.array([each[np.ix_(ends, ends)] for each in self._products[dealing]])
+        rest = parts.sum(axis=0)
+        rest[: len(extra.T), : len(extra.T)] += extra.T @ extra
+        rest[np.diag_indices(len(rest))] += np.append(0.0 * extra[0], self._priors(chosen) ** 2)
         # a fold may hold all of a column
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[:-1], 1e-300))
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[1:], 1e-300))
         weights = np.zeros((len(parts), len(self._columns)))
+        weights[:, 0] = 1.0
         for fold, part in enumerate(parts):
-            left = (rest - part)[:-1]
-            scaled = left[:, :-1] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
+            left = (rest - part)[1:]
+            scaled = left[:, 1:] * np.outer(scale, scale) + ROUNDING * np.eye(len(scale))
             factor = linalg.cho_factor(scaled)
-            weights[fold, which] = scale * linalg.cho_solve(factor, scale * left[:, -1])
-        fold_of = self._folds[dealing][np.newaxis]
-        predicted = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
-        pieces = np.split(self._residual - predicted, self._ends[:-1])
+            weights[fold, which] = -scale * linalg.cho_solve(factor, scale * left[:, 0])
+        fold_of = self._folds[[dealing]]
+        left_out = np.empty(self._columns.shape[1])
+        left_out[self._order] = np.take_along_axis(weights @ self._columns, fold_of, axis=0)[0]
+        pieces = np.split(left_out, self._ends[:-1])
         sets = self._system.sets
         errors = [s.position_errors(p) for s, p in zip(sets, pieces, strict=True)]
         self._errors[key] = np.concatenate(errors)
@@ -244,18 +253,22 @@ class LinearModel:
 
         Effects have the usual size, or that found in the data if larger.
         """
-        sigmas, fitted = self._problem.prior_sigmas, {*self._names}
-        found = np.zeros(len(names))
-        for k, name in enumerate(names):
-            size = sigmas.get(name, 0.0)
-            if name not in fitted:
+        sigmas = np.array([self._sigma(name) for name in names])
+        return np.asarray(np.where(sigmas > 0.0, self._noise / np.where(sigmas, sigmas, 1.0), 0.0))
+
+    def _sigma(self, name: str) -> float:
+        """Return the standard deviation [m or rad] of the prior of a parameter, or 0."""
+        if name not in self._sigmas:
+            size = self._problem.prior_sigmas.get(name, 0.0)
+            if name not in self._names:
                 group = str(group_of(self._chain, name))
                 size = max(effects.expected(name), self._sizes.get(group, 0.0))
-            found[k] = self._noise / size if size else 0.0
-        return found
+            self._sigmas[name] = size
+        return self._sigmas[name]
 
 
-def _sorted(system: System, folds: Folds) -> tuple[System, Folds]:
-    """Return the samples by fold, for products."""
-    order = [np.argsort(each, kind='stable') for each in folds]
-    return system.select(order), [each[k] for each, k in zip(folds, order, strict=True)]
+def _cells(folds: Index) -> Iterator[tuple[slice, list[int]]]:
+    """Yield the runs of rows that share their folds (D, R), and these, for each of D dealings."""
+    begins = np.flatnonzero(np.diff(folds, prepend=-1).any(axis=0))
+    for first, last in itertools.pairwise([*begins.tolist(), folds.shape[1]]):
+        yield slice(first, last), folds[:, first].tolist()
