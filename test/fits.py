@@ -13,9 +13,19 @@ from calib_ros.estimation import fitting
 from calib_ros.estimation.fitted import parameter_rows
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain_file import load_chain, parse_chain
 
 UR10E = load_chain('ur10e')
+SCARA = parse_chain("""
+name: scara
+convention: standard
+joints:
+- {name: arm, type: revolute, a: 0.35, alpha: 0.0, d: 0.4, theta: 0.0, lower: -2.3, upper: 2.3}
+- {name: elbow, type: revolute, a: 0.3, alpha: 3.141592653589793, d: 0.0, theta: 0.0,
+   lower: -2.4, upper: 2.4}
+- {name: quill, type: prismatic, a: 0.0, alpha: 0.0, d: 0.0, theta: 0.0, lower: 0.0, upper: 0.3}
+- {name: spindle, type: revolute, a: 0.0, alpha: 0.0, d: 0.05, theta: 0.0, lower: -2.5, upper: 2.5}
+""")
 NOISE = (5e-5, 2e-4)
 """Of positions [m] and orientations [rad]."""
 SIGMAS = {'sigma_position': NOISE[0], 'sigma_orientation': NOISE[1]}

@@ -219,11 +219,12 @@ class Columns:
         frames: Sequence[str] = (),
         scaled: bool = False,
     ) -> None:
-        arm = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
-        mapped, left = gauged(chain, names, arm, free=not frames)
+        every = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
+        every += (name for frame in frames for name in parameters_of(frame))
+        mapped, left = gauged(chain, names, every, free=not frames)
         shows = np.abs(mapped).max(axis=0, initial=0.0) > HALF_THE_DIGITS
         seen = shows & (left < HALF_THE_DIGITS)
-        self._columns = {n: c for n, c, yes in zip(arm, mapped.T, seen, strict=True) if yes}
+        self._columns = {n: c for n, c, yes in zip(every, mapped.T, seen, strict=True) if yes}
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
         for joint in chain.joint_names:
@@ -277,6 +278,18 @@ def gauged(
     taken, wanted, left = followed(chain, fitted, others, q, LEVER, approach=approach)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
     return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size
+
+
+def shown(
+    chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter]
+) -> list[Parameter]:
+    """Return those of the names in which changes of others show.
+
+    A target at another height on a SCARA shows as a device at another height.
+    """
+    mapped, left = gauged(chain, names, others, free=False)
+    sizes = np.abs(mapped[:, left < HALF_THE_DIGITS]).max(axis=1, initial=0.0)
+    return [name for name, size in zip(names, sizes, strict=True) if size > HALF_THE_DIGITS]
 
 
 def predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:

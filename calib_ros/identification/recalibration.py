@@ -29,7 +29,13 @@ from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import Doubts, doubted_products
-from calib_ros.estimation.leastsquares import System, minimise, products_of
+from calib_ros.estimation.identifiability import excited
+from calib_ros.estimation.leastsquares import (
+    System,
+    minimise,
+    products_of,
+    triangular_factor,
+)
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
@@ -118,22 +124,26 @@ def _recalibrated(
     sets = problem.all_sets
     arm = _Arm.of(previous, sets, years, growth)
     system = _system(problem, sets, previous)
-    names = [name for frame in new for name in parameters_of(frame) if name in arm.names]
+    # corrected axes are never quite parallel
+    nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
+    own = [name for frame in new for name in parameters_of(frame)]
+    names = changes.shown(nominal, arm.names, own)
     if names:
+        seen = excited(triangular_factor(arm.chain, own, system), own)
         free = [k for k, name in enumerate(arm.names) if name in names]
         square = arm.square.copy()
         square[free], square[:, free] = 0.0, 0.0
         square[free, free] = 100.0  # m^2, rad^2: anywhere
-        arm = replace(arm, chain=minimise(arm.chain, names, system).chain, square=square)
+        arm = replace(arm, chain=minimise(arm.chain, seen, system).chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
-    columns = Columns(arm.chain, arm.names, movable, _may_be_scaled(arm.chain, sets))
+    columns = Columns(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
     earlier, before = arm.changed(np.zeros(len(arm.names)), arm.square), arm.square
     found = arm.solved(system)
     while len(changed) < SEVERAL and (reasons := arm.reasons(found.information, columns)):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
-            columns = Columns(arm.chain, arm.names, movable)  # as much is usual
+            columns = Columns(nominal, arm.names, movable)  # as much is usual
             continue
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E as UR
+from fits import NOISE, SCARA, SIGMAS, UR10E as UR
 from measured import bent
 from robots import DATA, needs_data
 
@@ -20,7 +20,6 @@ from calib_ros.decision.changes import (
     reasons_of,
 )
 from calib_ros.errors import InputError
-from calib_ros.kinematics.chain_file import parse_chain
 from calib_ros.kinematics.parameter import Parameter
 
 UR10 = DATA / 'ur10_ipa_leica'
@@ -203,27 +202,14 @@ def test_two_nights_of_a_measured_robot_are_not_known_well_enough_to_differ():
     assert 'bumped' not in found.in_words()
 
 
-SCARA = """
-name: scara
-convention: standard
-joints:
-- {name: arm, type: revolute, a: 0.35, alpha: 0.0, d: 0.4, theta: 0.0, lower: -2.3, upper: 2.3}
-- {name: elbow, type: revolute, a: 0.3, alpha: 3.141592653589793, d: 0.0, theta: 0.0,
-   lower: -2.4, upper: 2.4}
-- {name: quill, type: prismatic, a: 0.0, alpha: 0.0, d: 0.0, theta: 0.0, lower: 0.0, upper: 0.3}
-- {name: spindle, type: revolute, a: 0.0, alpha: 0.0, d: 0.05, theta: 0.0, lower: -2.5, upper: 2.5}
-"""
-
-
 def test_axes_that_are_all_nearly_parallel_are_the_same_on_another_night():
     """Their tool's length trades against the base's height; once corrected, hardly any longer."""
-    scara = parse_chain(SCARA)
-    true = faulty(scara, Cell(), np.random.default_rng(3))
+    true = faulty(SCARA, Cell(), np.random.default_rng(3))
     nights = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
-        seen = measure(true, scara.random_joints(60, rng), rng, *NOISE)
-        nights.append(Calibration.of(identify(Problem(scara, seen))))
+        seen = measure(true, SCARA.random_joints(60, rng), rng, *NOISE)
+        nights.append(Calibration.of(identify(Problem(SCARA, seen))))
     found = difference(*nights)
     assert found.same
     assert found.limit < 1e-4

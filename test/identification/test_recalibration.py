@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SIGMAS, UR10E, rms
+from fits import NOISE, SCARA, SIGMAS, UR10E, rms
 from measured import rows_of, write_csv
 from robots import DATA, needs_data
 
@@ -344,3 +344,23 @@ def test_poses_that_tell_of_new_frames_only_do_not_make_the_arm_worse():
         if not helps:
             assert 'in new frames, fits the new poses better' in done.refusal()[0]
     assert done.after.rms_mm < done.before.rms_mm  # with frames fitted to 360 rows
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_heights_on_a_scara_are_told_from_each_other(seed):
+    """Corrected axes are not quite parallel, and the height of its target is that of its base."""
+    rng = np.random.default_rng(seed)
+    true = faulty(SCARA, Cell(), rng)
+
+    def seen(now, count):
+        measured = measure(now, SCARA.random_joints(count, rng), rng, *NOISE)
+        return Problem(SCARA, measured, **SIGMAS)
+
+    previous = Calibration.of(identify(seen(true, 60)))
+    slipped = seen(true.with_offsets({'quill.d': 5e-4}), 8)
+    ((*reasons,),) = recalibrate(previous, slipped, 0.1).changed
+    assert 'quill.d' in {name for each in reasons for name in each.names}
+    other = seen(replace(true, tool=random_frame(rng, 0.2)), 8)
+    found = recalibrate(previous, other, 0.1, new=('tool',))
+    assert found.accepted
+    assert not found.changed
