@@ -35,7 +35,7 @@ from calib_ros.estimation.robust import SUSPICIOUS, weights_of
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import ROUNDING, Flags, FloatArray, Index
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
 
 FRAMES = ('base', 'tool')
@@ -237,22 +237,18 @@ class _Scan:
         cross = products[:, :, : self._fitted] @ self._root
         matrix = own - cross @ np.swapaxes(cross, 1, 2)
         vector = products[:, :, -1] - cross @ self._known
-        scale = 1.0 / np.sqrt(np.maximum(np.einsum('bii->bi', own), 1e-300))
+        lengths = np.einsum('bii->bi', own)
         found: _Found | None = None
         lowest, total = np.inf, float(self._left.sum())
         for group in self._groups:
             columns = [self._added.index(name) for name in group.names]
-            size = scale[:, columns]
-            own = matrix[:, columns][:, :, columns] * size[:, :, np.newaxis] * size[:, np.newaxis]
-            values, axes = np.linalg.eigh(own)
-            good = values > ROUNDING
-            rank = good.sum(axis=1)
-            along = np.einsum('bij,bi->bj', axes, size * vector[:, columns]) * good
-            inverse = 1.0 / np.where(good, values, 1.0)
+            root = inverse_root(matrix[:, columns][:, :, columns], lengths[:, columns])
+            rank = root.any(axis=1).sum(axis=1)
+            along = np.einsum('bij,bi->bj', root, vector[:, columns])
             equations, freedom, left = self._budget(group)
             if left <= STEP_TOLERANCE**2 * equations or freedom <= rank.max() + 1.0:
                 continue
-            gain = (along**2 * inverse).sum(axis=1) * ((places > 0) | group.held)
+            gain = (along**2).sum(axis=1) * ((places > 0) | group.held)
             share = np.minimum(gain / left, 1.0 - 1e-12)
             k = int(np.argmax(share))
             rest = (1.0 - share[k]) / (freedom - rank[k])
@@ -265,8 +261,8 @@ class _Scan:
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
             if beyond > least and by_chance < 1.0 - SURE and criterion < lowest:
                 lowest = criterion
-                change = size[k] * (axes[k] @ (along[k] * inverse[k]))
-                found = _Found(group, int(places[k]), change, float(beyond), float(left * rest))
+                size = root[k] @ along[k]
+                found = _Found(group, int(places[k]), size, float(beyond), float(left * rest))
         return found
 
     def _to_the_end(self, places: Index) -> FloatArray:
