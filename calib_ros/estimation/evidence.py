@@ -163,7 +163,10 @@ def posterior_of(
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
     beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
     size, slope = evidence.most_probable(beside_it)
-    rival = _rival(evidence, matrix, vector, len(every), size, beside_it) if unsure else None
+    arm, rival = np.s_[: len(every)], None
+    if unsure:
+        odds, centre, about = evidence.rival('scale', OUT_OF_SCALE, size, beside_it)
+        rival = odds, float(centre[-1]), centre[arm], about[arm, arm]
     near = evidence.near(size, slope) if judging else ()
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
@@ -171,7 +174,6 @@ def posterior_of(
         evidence.widen(size)
     weights = [weight for weight, _ in near] or [1.0]
     precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
-    arm = np.s_[: len(every)]
     along = (alone @ offsets + plain[:-1, -1])[arm]
     each_alone = [solved(alone[arm, arm], along, each[arm]) for each in precisions]
     mean, covariance = mixed(each_alone, weights)
@@ -183,21 +185,6 @@ def posterior_of(
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
     posterior = Posterior(chain, every, *found, doubted, rival)
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
-
-
-def _rival(
-    evidence: Evidence,
-    matrix: FloatArray,
-    vector: FloatArray,
-    count: int,
-    size: FloatArray,
-    considered: set[str | None],
-) -> tuple[float, float, FloatArray, FloatArray]:
-    """Return log odds, scale, mean and covariance of `count` columns for a device out of scale."""
-    odds, precision = evidence.rival('scale', OUT_OF_SCALE, size, considered)
-    mean, root = solved(matrix, vector, precision)
-    arm = np.s_[:count]
-    return odds, float(mean[-1]), mean[arm], (root @ root.T)[arm, arm]
 
 
 def _device(

@@ -119,8 +119,8 @@ class Evidence:
 
     def rival(
         self, group: str, typical: float, size: FloatArray, considered: set[str | None]
-    ) -> tuple[float, FloatArray]:
-        """Return the log odds of a group being of another `typical` size, and the precision (P,).
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Return the log odds of a group being of another `typical` size; mean (P,), covariance.
 
         Against the most probable log sizes (G,); all are searched again.
         """
@@ -130,7 +130,8 @@ class Evidence:
         found, _ = other.most_probable(considered - {group})
         more = other._probable(found) - self._probable(size)
         other.widen(found)
-        return more, other.precision(found)
+        mean, root = solved(self._matrix, self._vector, other.precision(found))
+        return more, mean, root @ root.T
 
     def _probable(self, size: FloatArray) -> float:
         """Return the log probability of data and log sizes (G,), but for a constant (Laplace)."""

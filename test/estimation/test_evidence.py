@@ -133,10 +133,10 @@ def test_a_rival_is_of_the_size_that_the_data_tell(scale):
     typical = {'length': 1.0, 'angle': 0.5, 'scale': 1e-2}
     found = Evidence(matrix, matrix @ mean, np.zeros(5), groups, typical)
     size, _ = found.most_probable(set())
-    odds, precision = found.rival('scale', 0.25, size, set())
-    assert precision[0] == 0.0
+    odds, _, covariance = found.rival('scale', 0.25, size, set())
     assert odds > 1.0 if scale > 1.0 else odds < 1.0
-    size = precision[4] ** -0.5
+    assert covariance[0, 0] == pytest.approx(1.0)  # without a prior
+    size = (1.0 / covariance[4, 4] - 1e6) ** -0.5
     assert (size < 0.1, 0.1 < size < 0.5, size > 0.5) == (scale == 0.0, scale == 0.25, scale > 1.0)
 
 
