@@ -56,10 +56,8 @@ def rms_limits(
     return lower, upper
 
 
-def rms_interval(
-    errors: FloatArray, group: Index, confidence: float = CONFIDENT
-) -> tuple[float, float]:
-    """Return the interval [m] of the RMS of errors (N, 3) over poses like these.
+def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
+    """Return the 95 % interval [m] of the RMS of errors (N, 3) over poses like these.
 
     `group` (N,) are the configurations, each counted once; with a single one they are (0, inf).
     """
@@ -70,7 +68,7 @@ def rms_interval(
     if rms == 0.0:
         return 0.0, 0.0
     freedom = np.array([freedom_of(moments) * len(moments)])
-    lower, upper = rms_limits(rms, freedom, confidence)
+    lower, upper = rms_limits(rms, freedom, CONFIDENT)
     return float(lower[0]), float(upper[0])
 
 

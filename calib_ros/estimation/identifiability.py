@@ -175,7 +175,6 @@ def followed(
     others: Sequence[str],
     joints: FloatArray,
     lever: float,
-    ends: tuple[str, str] = ('base', 'tool'),
     approach: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return how P named parameters follow a unit of each of K others.
@@ -185,7 +184,7 @@ def followed(
     [m] by the others and its rest follow.
     """
     every = list(dict.fromkeys([*names, *others]))
-    rows = ErrorModel(chain, every, *ends).jacobian(joints, approach)
+    rows = ErrorModel(chain, every).jacobian(joints, approach)
     rows[:, 3:] *= lever
     flat = rows.reshape(-1, len(every))
     own, wanted = flat[:, : len(names)], flat[:, [every.index(name) for name in others]]

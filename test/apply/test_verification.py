@@ -148,7 +148,7 @@ def test_the_limits_hold_as_often_as_they_say(shape, count):
     rng = np.random.default_rng(5)
     truth = np.linalg.norm(shape)
     errors = rng.normal(size=(2000, count, 3)) * shape
-    lower, upper = np.transpose([rms_interval(each, np.arange(count), 0.95) for each in errors])
+    lower, upper = np.transpose([rms_interval(each, np.arange(count)) for each in errors])
     held = np.array([lower <= truth, truth <= upper])
     assert (held.mean(axis=1) > stats.binom.ppf(1e-3, 2000, 0.97) / 2000).all()
     assert held.mean() < 0.999  # wide enough, and no wider
@@ -158,7 +158,7 @@ def test_the_limits_of_a_verdict_are_those(arm, monkeypatch):
     monkeypatch.setattr(verification, 'DECIDING', 5)  # fewer than were measured
     errors = np.random.default_rng(0).normal(scale=1e-4, size=(7, 3))
     found = verify(arm, [with_errors(arm, errors)], 1e-4)
-    wanted = rms_interval(errors, np.arange(7), 0.95)
+    wanted = rms_interval(errors, np.arange(7))
     assert (found.lower, found.upper) == pytest.approx(wanted, rel=1e-6)
 
 
@@ -307,7 +307,7 @@ def test_limits_hold_where_some_places_are_worse_than_others():
     """As compliance leaves them: squares that scatter more than those of Gaussian noise."""
     rng = np.random.default_rng(0)
     errors = np.abs(rng.normal(size=(2000, 20, 1))) * rng.normal(size=(2000, 20, 3))
-    lower, upper = np.transpose([rms_interval(each, np.arange(20), 0.95) for each in errors])
+    lower, upper = np.transpose([rms_interval(each, np.arange(20)) for each in errors])
     held = np.array([lower <= np.sqrt(3.0), np.sqrt(3.0) <= upper])
     assert held.all(axis=0).mean() > stats.binom.ppf(1e-3, 2000, 0.95) / 2000
 
