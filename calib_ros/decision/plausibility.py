@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Suspicious results with good figures: one sentence each, and what to do (docs/model.md).
+"""Implausible results with good figures: one sentence each, and what to do (docs/model.md).
 
 Lens. If other intrinsics of a camera explain most of the residuals, the given ones belong to
 another zoom, focus or image size. If the arm imitates the lens, the result is refused: fitted with
