@@ -209,7 +209,8 @@ class _Forms:
         basis, residual, known = self._basis[part], self._residual[part], self._known[part]
         product = (links @ basis.reshape(len(basis), -1)).reshape(basis.shape)
         product *= known[:, :, np.newaxis]
-        white, linked = self._white[part], _inner(basis, product)
+        white = self._white[part]
+        linked = basis.reshape(-1, len(white)).T @ product.reshape(-1, len(white))
         pairs = float((known * (links @ known)).sum())
         size = float((residual**2).sum())
         freedom = float(known.sum() - np.trace(white))
@@ -251,12 +252,6 @@ def nonnegative(moments: FloatArray, values: FloatArray) -> FloatArray:
     along = (values / scale) @ directions / roots
     sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, along)[0]
     return np.asarray(sizes / scale)
-
-
-def _inner(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return products (P, P) of columns (n, c, P)."""
-    size = first.shape[2]
-    return np.asarray(first.reshape(-1, size).T @ second.reshape(-1, size))
 
 
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:

@@ -188,8 +188,8 @@ class Evidence:
         return mean, np.einsum('pk,pk->p', root, root)
 
     def precision(self, size: FloatArray) -> FloatArray:
-        """Return the prior precision (P,) of the parameters for log sizes (G,)."""
-        return np.asarray(self._given + self._weight(size).sum(axis=0))
+        """Return the prior precision (..., P) of the parameters for log sizes (..., G)."""
+        return np.asarray(self._given + self._weight(size).sum(axis=-2))
 
     def named(self, size: FloatArray) -> dict[str, float]:
         """Return the size [m, rad] of each group from log sizes (G,)."""
@@ -206,13 +206,12 @@ class Evidence:
         self._tails = np.where(self._own, freedom / (TAILS + far), 1.0)
 
     def _weight(self, size: FloatArray) -> FloatArray:
-        """Return the inverse variances (G, P) of the parameters of each group."""
-        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[:, np.newaxis])
+        """Return the inverse variances (..., G, P) of the parameters of each group."""
+        return np.asarray(self._member * self._tails * np.exp(-2.0 * size)[..., np.newaxis])
 
     def _of(self, sizes: FloatArray) -> FloatArray:
         """Return the log evidence of log sizes (S, G)."""
-        weights = (self._member * self._tails) * np.exp(-2.0 * sizes)[..., np.newaxis]
-        scaled, scale = _scaled(self._matrix, self._given + weights.sum(axis=1))
+        scaled, scale = _scaled(self._matrix, self.precision(sizes))
         factors = [_factor(each) for each in scaled]
         seen = zip(factors, scale * self._vector, strict=True)
         fit = [(lapack.dtrtrs(factor, each, lower=1)[0] ** 2).sum() for factor, each in seen]
