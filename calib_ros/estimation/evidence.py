@@ -138,46 +138,42 @@ def posterior_of(
     """
     problem, names, system = fitted.problem, fitted.names, fitted.system
     nominal, every = problem.model, (*names, *more)
-    known: dict[str, float] = {**problem.given} | {**lenses(nominal)}
-    if problem.sigma_scale:
-        known['scale'] = problem.sigma_scale
+    arm = np.s_[: len(every)]  # all columns but the scale of the device
     own = [n for n in more if not (Parameter(n).of_dh or nominal.owns_frame(n))]
     chain = fitted.chain.with_effects(own)
     beside = {name: std for name, std in (rounding or {}).items() if name in names}
     whole, lengths, scale = lengths_of(chain, system) if more else (chain, {}, SCALE)
-    unsure = judging and bool(lengths) and scale < PRINTED and 'scale' not in known
     if more or beside:
         sums = doubted_products(whole, every, system, Doubts(beside, lengths, bool(more)), noise)
     else:
-        alone = fitted.products / noise**2
-        sums = Doubted(alone, alone[:, :0], alone[:0, :0])
-    plain, cross, doubtful = sums
-    offsets = np.append(fitted.offsets, np.zeros(len(plain) - 1 - len(names)))
-    reduced = sums.reduced
-    alone, matrix = plain[:-1, :-1], reduced[:-1, :-1]
-    vector = matrix @ offsets + reduced[:-1, -1]
-    also = ['scale'] if lengths else []
-    groups = [None if n in known else group_of(chain, n) for n in every]
-    groups += [None if n in known else n for n in also]
-    given = np.array([known.get(n, np.inf) for n in (*every, *also)]) ** -2
+        products = fitted.products / noise**2
+        sums = Doubted(products, products[:, :0], products[:0, :0])
+    offsets = np.append(fitted.offsets, np.zeros(len(sums.plain) - 1 - len(names)))
+    alone, along = _about_nominal(sums.plain, offsets)
+    matrix, vector = _about_nominal(sums.reduced, offsets)
+    known: dict[str, float] = {**problem.given} | {**lenses(nominal)}
+    if problem.sigma_scale:
+        known['scale'] = problem.sigma_scale
+    columns = [*every, *['scale'] * bool(lengths)]
+    groups = [None if n in known else n if n == 'scale' else group_of(chain, n) for n in columns]
+    given = np.array([known.get(n, np.inf) for n in columns]) ** -2
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
-    beside_it = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
-    size, slope = evidence.most_probable(beside_it)
-    arm, rival = np.s_[: len(every)], None
-    if unsure:
-        odds, centre, about = evidence.rival('scale', OUT_OF_SCALE, size, beside_it)
-        rival = odds, float(centre[-1]), centre[arm], about[arm, arm]
-    near = evidence.near(size, slope) if judging else ()
+    considered = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
+    size, slope = evidence.most_probable(considered)
+    rival = None
+    if judging and lengths and scale < PRINTED and 'scale' not in known:
+        odds, mean, covariance = evidence.rival('scale', OUT_OF_SCALE, size, considered)
+        rival = odds, float(mean[-1]), mean[arm], covariance[arm, arm]
+    near = evidence.near(size, slope) if judging else []
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
     if judging:
         evidence.widen(size)
-    weights = [weight for weight, _ in near] or [1.0]
-    precisions = [evidence.precision(each) for _, each in near or [(1.0, size)]]
-    along = (alone @ offsets + plain[:-1, -1])[arm]
-    each_alone = [solved(alone[arm, arm], along, each[arm]) for each in precisions]
+    weights, tried = zip(*(near or [(1.0, size)]), strict=True)
+    precisions = [evidence.precision(each) for each in tried]
+    each_alone = [solved(alone[arm, arm], along[arm], each[arm]) for each in precisions]
     mean, covariance = mixed(each_alone, weights)
-    other = alone, cross[:-1], doubtful, evidence.precision(size), len(every)
+    other = alone, sums.cross[:-1], sums.doubtful, evidence.precision(size), len(every)
     device = _device(*other) if judging else np.zeros((len(every), 0))
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
@@ -185,6 +181,12 @@ def posterior_of(
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
     posterior = Posterior(chain, every, *found, doubted, rival)
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
+
+
+def _about_nominal(products: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the normal equations (P, P), (P,) of all offsets from the products of their rows."""
+    matrix = products[:-1, :-1]
+    return matrix, matrix @ offsets + products[:-1, -1]
 
 
 def _device(
