@@ -36,7 +36,7 @@ from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
 LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -187,16 +187,14 @@ class _Forms:
         """Return the traces (F, F) tr(A B C B) of forms with matrices (K, n, n) by part."""
         inner, alone = list[FloatArray](), list[FloatArray]()
         for part, own in matrices.items():
-            basis, known, count = self._basis[part], self._known[part], len(own)
-            products = np.matmul(own, basis.reshape(len(basis), -1))
-            products = products.reshape(count, *basis.shape)
-            products *= known[:, :, np.newaxis]
-            columns = basis.reshape(-1, basis.shape[2])
-            crossed = np.matmul(columns.T, products.reshape(count, *columns.shape))
-            inner.append(crossed.reshape(count, -1))
-            flat = own.reshape(count, -1)
-            both = (flat * (known @ known.T).ravel()) @ flat.T
-            alone.append(both - 2.0 * gram(products))
+            basis, known, flat = self._basis[part], self._known[part], own.reshape(len(own), -1)
+            crossed = [gram(_rooted(basis, matrix).transpose(2, 0, 1)) for matrix in own]
+            inner.append(np.reshape(crossed, (len(own), -1)))
+            alone.append(np.zeros((len(own), len(own))))
+            for seen in np.unique(known, axis=1).T:
+                alike = (known == seen[:, np.newaxis]).all(axis=0)
+                white = alike.sum() * np.diag(seen) - 2.0 * gram(basis[:, alike])
+                alone[-1] += (seen[:, np.newaxis] * (own @ white)).reshape(flat.shape) @ flat.T
         return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
 
     def _values(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
@@ -252,6 +250,14 @@ def nonnegative(moments: FloatArray, values: FloatArray) -> FloatArray:
     along = (values / scale) @ directions / roots
     sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, along)[0]
     return np.asarray(sizes / scale)
+
+
+def _rooted(basis: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Return C^T Q of columns Q (n, c, P), with C C^T the positive matrix (n, n)."""
+    size = len(matrix)
+    root = np.linalg.cholesky(matrix + ROUNDING * np.diag(np.diag(matrix)))
+    turned = linalg.blas.dtrmm(1.0, root.T, basis.reshape(size, -1).T, side=1, trans_a=1)
+    return np.asarray(turned.T.reshape(basis.shape))
 
 
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:
