@@ -154,6 +154,16 @@ class Normal:
         """Return the shares (2, P, P) of H by position and orientation."""
         return self.products[:, :-1, :-1]
 
+    def after(self, step: FloatArray) -> Normal:
+        """Return the equations after a step (P,) that leaves the Jacobian as it is."""
+        along = np.append(-step, 1.0)
+        products = self.products.copy()
+        products[:, -1] = products[:, :, -1] = self.products @ along
+        products[:, -1, -1] = products[:, -1] @ along
+        moved = self.matrix @ step
+        cost = self.cost + float(step @ (moved - 2.0 * self.gradient))
+        return Normal(self.matrix, self.gradient - moved, cost, products)
+
     def factor(self) -> FloatArray | None:
         """Return R (P, P) with R^T R = H; None if H has lost too many digits."""
         scale = np.sqrt(np.diag(self.matrix))
@@ -226,9 +236,10 @@ def triangular_factor(chain: Chain, names: Sequence[str], system: System) -> Flo
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Fit(Shown):
-    """The chain at the minimum, and the last normal equations.
+    """The chain at the minimum, and the normal equations, linearised before the last step.
 
-    `left` is the last RMS step of the predictions (as `STEP_TOLERANCE`).
+    `left` is the RMS step of the predictions (as `STEP_TOLERANCE`) to expect next: at most the
+    last one, or ten times as much as if it were as much shorter again.
     """
 
     chain: Chain
@@ -260,7 +271,7 @@ def minimise(
     if not names:
         return Fit(chain, normal, True)
     best, best_chain = normal, chain
-    damping, growth, patience, expected = 0.0, 2.0, PATIENCE, 0.0
+    damping, growth, patience, expected, last = 0.0, 2.0, PATIENCE, 0.0, 0.0
     iteration, stalled, least_cost, least_left = 0, 0, np.inf, np.inf
     while iteration < iterations and stalled < ROUNDS:
         iteration += 1
@@ -269,8 +280,9 @@ def minimise(
             break
         chain = chain.with_offsets(dict(zip(names, step, strict=True)))
         if settled:
-            return Fit(chain, normal, True, left)
-        stalled += 1
+            left = min(left, 10.0 * left**2 / (last or left or 1.0))
+            return Fit(chain, normal.after(step), True, left)
+        stalled, last = stalled + 1, left
         if best.cost < 0.999 * least_cost or left < 0.5 * least_left:
             stalled, least_cost, least_left = 0, best.cost, min(left, least_left)
         predicted = float(step @ (2.0 * normal.gradient - normal.matrix @ step))

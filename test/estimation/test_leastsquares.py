@@ -229,3 +229,25 @@ def test_the_factor_is_refused_where_the_normal_matrix_has_lost_its_digits(scale
         np.testing.assert_allclose(some.T @ some, matrix[[2, 0]][:, [2, 0]], rtol=1e-9)
     for value in (np.nan, np.inf, 0.0):
         assert replace(normal, matrix=value * np.eye(3)).factor() is None
+
+
+def test_equations_after_a_step_are_those_of_the_moved_chain():
+    start, _, system = still_joint('ur10e', 0)
+    step = {'base.x': 1e-3, 'base.y': -2e-3, 'base.z': 5e-4}
+    system = replace(system, prior=Prior(start, {'base.x': 1e-3}, 2.0))
+    after = normal_equations(start, [*step], system).after(np.array([*step.values()]))
+    found = normal_equations(start.with_offsets(step), [*step], system)
+    for name in ('matrix', 'gradient', 'cost', 'products'):
+        np.testing.assert_allclose(getattr(after, name), getattr(found, name), rtol=1e-9)
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_a_fit_knows_how_long_its_next_step_would_be(seed):
+    """At most: a fit that is started again has no steps to conclude from."""
+    *_, seen = measured_arm(seed, 40)
+    problem = Problem(UR10E, seen)
+    names = structurally_independent(problem.model, problem.free, problem.kinds)
+    system = problem.system(problem.sets)
+    found = minimise(start_frames(problem), names, system, tolerance=1e-2)
+    assert found.left < 0.1 * 1e-2
+    assert minimise(found.chain, names, system, tolerance=np.inf).left < found.left
