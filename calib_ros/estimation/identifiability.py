@@ -224,8 +224,12 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     inverse *= scale[:, np.newaxis]
     if middle is None:
         return np.asarray(inverse @ inverse.T)
-    sizes, directions = np.linalg.eigh(inverse.T @ middle @ inverse)
-    root = inverse @ (directions * np.sqrt(np.maximum(sizes, 0.0)))  # no rounding below zero
+    turned = inverse.T @ middle @ inverse
+    root, failed = lapack.dpotrf(turned, lower=1)
+    if failed:
+        sizes, directions = np.linalg.eigh(turned)
+        root = directions * np.sqrt(np.maximum(sizes, 0.0))  # no rounding below zero
+    root = inverse @ root
     return np.asarray(root @ root.T)
 
 

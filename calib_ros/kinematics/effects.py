@@ -119,7 +119,7 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
     """Return the effects of a group or a single name."""
     if name in GROUPS:
         return members(chain, name)
-    joint = Parameter(name).owner
+    joint, _, kind = name.partition('.')
     if joint not in chain.joint_names:
         if name in (alone := ('geometric', 'auto')):
             raise ConfigError(f'model {name} stands alone: no effects can be joined to it')
@@ -127,7 +127,7 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
             raise UnknownNameError('model', name, (*alone, *GROUPS))
         raise UnknownNameError(f'joint in effect {name}', joint, chain.joint_names)
     check(name, chain.joint_names)
-    if Parameter(name).kind in PLAY and name not in (known := members(chain, 'backlash')):
+    if kind in PLAY and name not in (known := members(chain, 'backlash')):
         raise UnknownNameError('effect', name, known)
     return (name,)
 
