@@ -80,16 +80,16 @@ def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
         ) from err
 
 
-def csv_lines(text: str, where: str) -> Iterator[str]:
-    """Yield the lines of a table for csv, which reads lines of any length."""
+def csv_lines(data: bytes, where: str) -> io.TextIOWrapper:
+    """Return the lines of a table in UTF-8 for csv, which reads lines of any length."""
     most = MOST_ENTRIES**2
     csv.field_size_limit(most)  # of the whole process
-    for line in io.TextIOWrapper(io.BytesIO(text.encode()), encoding='utf-8', newline=''):
-        if len(line) > most:
-            raise InputError(
-                f'{where} has a line of {len(line)} characters, more than {most}: is it a table?'
-            )
-        yield line
+    end = 0
+    while len(data) - end > most:
+        end = 1 + max(data.rfind(mark, end, end + most) for mark in (b'\n', b'\r'))
+        if not end:
+            raise InputError(f'{where} has a line of more than {most} bytes: is it a table?')
+    return io.TextIOWrapper(io.BytesIO(data), encoding='utf-8-sig', newline='')
 
 
 def dump_json(value: Any, indent: str = '') -> str:

@@ -144,9 +144,9 @@ def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] =
     lines: list[int] = []
     columns: list[list[str]] = []  # of each block
     for block in filter(None, blocks):
-        lines += [line for line, _ in block]
-        cells = zip_longest(*[cells for _, cells in block], fillvalue='')
-        columns.append([BETWEEN.join(column) for column in cells])
+        numbers, rows = zip(*block, strict=True)
+        lines += numbers
+        columns.append([*map(BETWEEN.join, zip_longest(*rows, fillvalue=''))])
     width = max([len(header), *map(len, columns)])
     names = [*header, *(f'#{k + 1}' for k in range(len(header), width))]
     words = {}
@@ -157,11 +157,13 @@ def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] =
     return Columns(path, np.array(lines, dtype=np.intp), words)
 
 
-def _with_zeros(path: Path, line: int) -> ColumnsError:
-    return ColumnsError(
-        f'{path} is not UTF-8 text, line {line} has zero bytes: is it a workbook, or damaged? '
-        'Save it as CSV in UTF-8'
-    )
+def _refuse_zeros(path: Path, data: bytes, above: int) -> None:
+    if (place := data.find(b'\0')) >= 0:
+        line = above + 1 + data.count(b'\n', 0, place)
+        raise ColumnsError(
+            f'{path} is not UTF-8 text, line {line} has zero bytes: is it a workbook, or damaged? '
+            'Save it as CSV in UTF-8'
+        )
 
 
 def joined(parts: Sequence[Columns]) -> Columns:
@@ -181,16 +183,15 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
 
     `above` is the number of lines of the file before it.
     """
-    if (place := data.find(b'\0')) >= 0:
-        raise _with_zeros(path, above + 1 + data.count(b'\n', 0, place))
-    text = decoded(data, str(path), ColumnsError)
-    blocks = csv_blocks(path, text, strict=True, above=above)
+    _refuse_zeros(path, data, above)
+    decoded(data, str(path), ColumnsError)  # all of it, before any row
+    blocks = csv_blocks(path, data, strict=True, above=above)
     first: list[Row] = next(blocks, [(above, [])])
     header = [name.strip() for name in first[0][1]]
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise ColumnsError(f'{path} has several columns {", ".join(twice)}: rename all but one')
-    end = above + text.count('\n') + 1
+    end = above + data.count(b'\n') + 1
     return of_rows(path, _below(path, header, chain([first[1:]], blocks), end, progress), header)
 
 
@@ -200,15 +201,14 @@ def _below(
     """Yield the rows below a header, up to a last line; refuse more values than names."""
     width, count = len(header), 0
     for block in blocks:
-        for line, cells in block:
-            if len(cells) > width:
-                if any(cells[width:]):
-                    refuse_separator(path, header)
-                    raise ColumnsError(
-                        f'{path}, line {line}: more values than the {width} columns of its '
-                        'header; remove other lines above that (of measurements: calib_ros import)'
-                    )
-                del cells[width:]
+        for line, cells in [row for row in block if len(row[1]) > width]:
+            if any(cells[width:]):
+                refuse_separator(path, header)
+                raise ColumnsError(
+                    f'{path}, line {line}: more values than the {width} columns of its '
+                    'header; remove other lines above that (of measurements: calib_ros import)'
+                )
+            del cells[width:]
         count += len(block)
         if count > MOST_ROWS:
             raise InputError(
@@ -219,15 +219,14 @@ def _below(
 
 
 def csv_blocks(
-    path: Path, text: str, separator: str = ',', strict: bool = False, above: int = 0
+    path: Path, data: bytes, separator: str = ',', strict: bool = False, above: int = 0
 ) -> Iterator[list[Row]]:
     """Yield rows that are not blank: the line at which each ends, and its cells.
 
-    `above` lines precede the text.
+    `above` lines precede the content, which is in UTF-8.
     """
-    if (place := text.find(BETWEEN)) >= 0:
-        raise _with_zeros(path, above + 1 + text.count('\n', 0, place))
-    reader = csv.reader(csv_lines(text, str(path)), delimiter=separator, strict=strict)
+    _refuse_zeros(path, data, above)
+    reader = csv.reader(csv_lines(data, str(path)), delimiter=separator, strict=strict)
     line, block = 0, list[Row]()
     try:
         for row in reader:

@@ -178,7 +178,7 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
 def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[Row]]:
     """Yield the rows of a text from a line on."""
     body = text[_after(text, start - 1) :]
-    for block in csv_blocks(path, body, separator, above=start - 1):
+    for block in csv_blocks(path, body.encode(), separator, above=start - 1):
         rows = [(line, [*map(str.strip, cells)]) for line, cells in block]
         yield [(line, cells) for line, cells in rows if any(cells)]
 
@@ -290,7 +290,7 @@ def _cells(path: Path, text: str, separator: str) -> list[Row]:
     """Return the cells of all non-empty lines, with line numbers."""
     found: list[Row] = [
         (line, [' '.join(cell.split()) for cell in row])
-        for block in csv_blocks(path, text, separator)
+        for block in csv_blocks(path, text.encode(), separator)
         for line, row in block
         if any(cell.strip() for cell in row)
     ]
