@@ -246,11 +246,16 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         published = 'swap them in joint_names, start without resume'
         change = (_joints(same[order]),)
         yield Suspect(what, remedy, change, 2, published=published, part='order')
-    if len(names) > 3:
-        columns = ','.join(f'q{k}=q{len(names) + 1 - k}' for k in range(1, len(names) + 1))
-        what = 'the joints are in the order from tool to base'
-        published = 'reverse joint_names, start without resume'
-        change = (_joints(same[::-1]),)
+    last = len(names)
+    orders = {'in the order from tool to base': [*range(last)][::-1]} if last > 3 else {}
+    for more in (1, 2) if last > 6 else ():  # external axes, which controllers name last
+        where = f'in another order, {" and ".join(names[:more])} last'
+        orders[where] = [*range(last - more, last), *range(last - more)]
+    for where, places in orders.items():
+        columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(places, 1))
+        published = 'set the order of joint_names, start without resume'
+        change = (_joints(same[places]),)
+        what = f'the joints are {where}'
         yield Suspect(what, f'--columns {columns}', change, 2, published=published, part='order')
     for k, stands in ((0, 'device moves'), (len(names) - 1, 'target does not move')):
         what = f'the {stands} with {names[k]}'

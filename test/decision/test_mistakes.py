@@ -131,7 +131,7 @@ PUBLISHED = {
     'sign': 'sign: -1 in the chain file',
     'zero': 'theta -90 degrees in the chain file',
     'swapped': 'swap them in joint_names',
-    'reversed': 'reverse joint_names',
+    'reversed': 'set the order of joint_names',
     'shift': 'check the stamps',
 }
 POSITIONS_TELL = ('mm', 'both, and a lost beam', 'left-handed', 'sign', 'coupled')
