@@ -18,7 +18,7 @@ from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice
 from calib_ros.sampling.stops import MOVING
 from calib_ros.settings import Settings
 
-STRAY = 'stamp far from those before and after'
+STRAY = 'stamp far from those before and after (do the clocks of all publishers agree?)'
 
 
 class Gate:

@@ -27,6 +27,8 @@ MARKERS = {
     'dh_parameters': 'std_msgs/msg/Float64MultiArray',
 }
 """Topics that together identify a calibration node."""
+OF_TAGS = ('Detection', 'ArucoMarker', 'PoseArray')
+"""Parts of message types of what detectors of tags, such as apriltag_ros, publish beside /tf."""
 MessagesOn: TypeAlias = Callable[[Mapping[str, Stream]], Iterator[tuple[Stream, bytes]]]
 """Returns the messages of a recording on some topics."""
 
@@ -91,6 +93,8 @@ def _others(recorded: Recorded) -> list[str]:
                 f'images of a board need --sources "{topic} board=board.yaml", with '
                 'eye_in_hand=true if the camera is on the flange'
             )
+        elif any(word in short_type(kind) for word in OF_TAGS):
+            found.append(f'{topic} is not read: record /tf with it, where tags are published')
     return found
 
 

@@ -10,6 +10,7 @@ from recorded import (
     header,
     joint_state,
     observations_of,
+    pose,
     pose_stamped,
     record,
     session_of,
@@ -80,6 +81,13 @@ def test_a_recording_of_images_names_the_option_for_them(tmp_path):
     image = TYPES['sensor_msgs/msg/Image'](header(5 * MS), 1, 1, 'mono8', 0, 1, pixels)
     path = record(tmp_path / 'bag', [*standing([]), ('/camera/image_raw', image)])
     with pytest.raises(InputError, match=r'no pose topic .*--sources "/camera/image_raw board='):
+        session_of(path)
+
+
+def test_a_recording_of_tags_without_their_frames_says_where_those_are(tmp_path):
+    tags = TYPES['geometry_msgs/msg/PoseArray'](header(5 * MS), [pose()])
+    path = record(tmp_path / 'bag', [*standing([]), ('/tags', tags)])
+    with pytest.raises(InputError, match=r'no pose topic .*/tags is not read: record /tf with it'):
         session_of(path)
 
 
