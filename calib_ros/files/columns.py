@@ -25,7 +25,7 @@ from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, from_c
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
-THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}([ .,'][0-9]{3})+([.,][0-9]*)?")
+THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
 Row = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
 Codes = tuple[Index, list[str]]

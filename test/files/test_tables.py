@@ -114,6 +114,8 @@ FAULTS = [
     (POINTS.replace('5.5', '1e7'), r'line 3: y must be at most 1e\+06, not 1e\+07'),
     (f'{POINTS}0.1,0.2,1,2\n', 'line 4: z must be a finite number'),
     (f'{POINTS}0.1,0.2,1,2,\n', 'line 4: z must be a finite number'),
+    *((POINTS.replace('5.5', each), 'line 3: y .* without the marks between thousands')
+      for each in ('1 554.25', '1\u202f554.25', '1\u2019554.25')),
     (f'{POINTS}0.1\n', 'line 4: q2 must be a finite number'),
     ('q1,q2,x,y,z,session\n1,0,1,0,0,A\n2,0,2,0,0\n', r'cell\.csv'),
     *((POSES.replace(TURN, each), r'cell\.csv, line 3: quaternion .* expected 1') for each in
