@@ -33,6 +33,7 @@ from calib_ros.apply.compensation import Compensator
 from calib_ros.apply.confidence import freedom_of, moments_of, rms_limits
 from calib_ros.decision import mistakes
 from calib_ros.decision.comparison import Comparison, compare
+from calib_ros.decision.steps import Step
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.identifiability import excited
@@ -119,6 +120,8 @@ class Verification(Shown):
     """Configurations without which the others would be within the limit."""
     mistake: mistakes.Explained | None = None
     """What explains measurements that are further off than any arm."""
+    step: Step | None = None
+    """What moved during the measurement, if the arm exceeds the limit."""
 
     @property
     def configurations(self) -> int:
@@ -178,9 +181,7 @@ def verify(
     numbers = np.unique(np.geomspace(count, max(count, DECIDING), 200).round().astype(int))
     freedom = freedom_of(moments) * (numbers - lost)
     lower, upper = rms_limits(rms, freedom, confidence)
-    mistake: mistakes.Explained | None = None
-    if rms > Settings.largest_error:
-        mistake = mistakes.explained(Problem(arm.before, sets[0], more=sets[1:]), far=True)
+    mistake = _mistake(arm, sets) if rms > Settings.largest_error else None
     reused, common = arm.reused(sets), 1.0
     verdict: tuple[Verdict, int | None] = ('no verdict', None)
     limit = tolerance or arm.limit(sets)
@@ -194,7 +195,8 @@ def verify(
     if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
         common = _rms(moments_of(left, group), in_base, least=0) / rms
     found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    known = (commanded is not None, fitted, reused, uncorrected, odd, mistake)
+    step = arm.step(sets) if verdict[0] in ('FAIL', 'does not hold') else None
+    known = (commanded is not None, fitted, reused, uncorrected, odd, mistake, step)
     return Verification(comparison, tolerance, limit, confidence, group, *found, *known)
 
 
@@ -223,6 +225,11 @@ def _compared(
     reached = compare(before, after, wanted).after
     shaped = compare(before, _rebased(after, wanted), wanted).after
     return replace(compare(before, after, sets), after=reached), shaped.position, uncorrected
+
+
+def _mistake(arm: Calibration, sets: Sequence[Observations]) -> mistakes.Explained | None:
+    problem = Problem(arm.before, sets[0], more=sets[1:])
+    return mistakes.explained(problem, far=True) or mistakes.explained_alone(problem, arm.chain)
 
 
 def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from calib_ros.decision.comparison import residuals
 from calib_ros.decision.lost_rows import lost
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
@@ -36,7 +37,7 @@ from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import LEVER
 
 
@@ -140,6 +141,21 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     if problem.of_messages:
         named = tuple(replace(each, remedy=each.published) for each in named)
     return replace(found, suspects=named, where=where)
+
+
+def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
+    """Return what explains the measurements that a known chain misses by more than faulty arms."""
+    sets = [each for each in problem.all_sets if each.pixels is None]
+    errors = [norms(residuals(chain, each).position) for each in sets]
+    far = [np.flatnonzero(each > problem.largest_error) for each in errors]
+    parts = [each.select(rows) for each, rows in zip(sets, far, strict=True) if len(rows)]
+    if not parts:
+        return None
+    found = explained(
+        replace(problem, observations=parts[0], more=tuple(parts[1:]), held_out=None), far=True
+    )
+    where = f'in {sum(map(len, parts))} of {sum(map(len, sets))} measurements alone, '
+    return found and replace(found, where=found.where or where)
 
 
 def _unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -30,11 +30,14 @@ import numpy as np
 import calib_ros
 from calib_ros.decision.region import Region, packed, region_of_record, rows_of
 from calib_ros.decision.result import Identification
+from calib_ros.decision.steps import Step, find_step
 from calib_ros.errors import ConfigError, InputError, UnknownNameError
+from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import Observations
+from calib_ros.estimation.problem import Problem
 from calib_ros.identification import records
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
@@ -224,6 +227,19 @@ class Calibration(Shown):
     def reused(self, sets: Sequence[Observations]) -> float:
         """Return the share of measurements that this calibration was fitted to, if known."""
         return 0.0 if self.rows is None else self.rows.share(sets)
+
+    def step(self, sets: Sequence[Observations]) -> Step | None:
+        """Return what moved while new measurements were taken, if that explains most errors."""
+        chain = self.chain
+        arm = tuple(name for name in chain.parameter_names if not chain.owns_frame(name))
+        for name in chain.frame_names:
+            chain = chain.with_frame(name, replace(chain.frame(name), fixed=False))
+        try:
+            _, _, fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
+        except InputError:  # too few for frames of their own
+            return None
+        found = find_step(fitted)
+        return found and replace(found, unused='')  # here every measurement counts
 
     def frames_of(self, owners: Mapping[str, records.Owner]) -> dict[str, str]:
         """Return the calibration's frame for each frame of new measurements.

@@ -10,6 +10,7 @@ from typing import Any
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Explanation
 from calib_ros.decision.comparison import Comparison, ErrorFigures
+from calib_ros.decision.steps import Step
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import reused_in_words
@@ -27,7 +28,7 @@ class Recalibration(Shown):
     change. If new frames are fitted to all new poses for `before`, `refitted` is the ratio by
     which held-out errors are larger. `reused` is the share of poses that the earlier calibration
     was fitted to: they would count twice. `odd` names a pose without which the others would be
-    accepted.
+    accepted, `step` tells what moved while they were measured.
     """
 
     calibration: Calibration
@@ -40,6 +41,7 @@ class Recalibration(Shown):
     reused: float = 0.0
     refitted: float = 1.0
     odd: str = ''
+    step: Step | None = None
 
     @property
     def before(self) -> ErrorFigures:
@@ -103,6 +105,9 @@ class Recalibration(Shown):
         if self.odd:
             why = f'{self.odd} contradicts all others, which would pass without it'
             return why, 'measure it again, or leave it out'
+        if self.step:
+            why = f'something moved while the new poses were measured: {self.step}'
+            return why, 'measure again, or give only the poses from there on'
         if self.unexplained <= changes.FALSE:
             return 'no change of a few parameters explains the new poses', 'identify again'
         if not self.determined:

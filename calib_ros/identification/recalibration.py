@@ -94,6 +94,10 @@ def recalibrate(
             where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
             held_out = 'held-out ' if number >= len(problem.sets) else ''
             return replace(found, odd=f'{held_out}pose {pose + 1}{where}')
+    if found.unexplained <= changes.FALSE:
+        if mistake := mistakes.explained_alone(problem, arm):
+            raise InputError(f'the new poses do not fit the arm at all: {mistake}')
+        return replace(found, step=previous.step(problem.all_sets))
     return found
 
 

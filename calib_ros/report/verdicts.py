@@ -145,7 +145,11 @@ def hints(found: Verification) -> list[str]:
     rms = 1e-3 * found.comparison.figures[1].rms_mm
     if found.mistake:
         return lines
-    if found.odd:
+    if found.step:
+        side = 'before' if found.odd and found.odd[0] else 'after'
+        within = f'; the poses {side} that are within the limit' * bool(found.odd)
+        lines.append(f'something moved while you measured: {found.step}{within}')
+    elif found.odd:
         lines.append(_apart(found))
     elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
         lines.append(

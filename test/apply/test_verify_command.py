@@ -140,11 +140,40 @@ def test_a_moment_from_which_errors_are_within_or_beyond_the_limit_is_named(arm,
     assert words in text
 
 
+@pytest.mark.parametrize(
+    ('moved', 'words'),
+    [
+        ({'shoulder_lift_joint.theta': 1e-3}, 'the zero of shoulder_lift_joint moved by '),
+        ({'elbow_joint.theta': 2e-3}, 'the zero of elbow_joint moved by '),
+        ({'base.x': 1e-3}, "the measuring device or the robot's foot moved by 1 mm (base)"),
+        ({'tool.x': 1e-3}, 'the target moved by 1 mm (tool)'),
+    ],
+)
+@pytest.mark.parametrize('seed', range(2))
+def test_what_moved_while_poses_were_measured_is_named(cell, arm, moved, words, seed):
+    joints = UR.random_joints(24, np.random.default_rng(seed))
+    first, then = (measured(true, joints, 1) for true in (cell[0], cell[0].with_offsets(moved)))
+    places = np.concatenate([first.positions[:10], then.positions[10:]])
+    seen = replace(first, positions=places, oriented=np.zeros(24, dtype=bool))
+    text = in_words(found := verify(arm, [seen], 2e-4))
+    assert found.verdict == 'FAIL'
+    assert f'something moved while you measured: {words}' in text
+    assert ' before line 11 ' in text
+    assert 'the poses before that are within the limit' in text
+    text = in_words(verify(arm, [then], 2e-4))  # before the first pose
+    assert 'something moved' not in text
+
+
 def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, arm):
     seen = measured(cell[0], UR.random_joints(10, np.random.default_rng(3)), 1)
+    late = np.arange(10)[:, np.newaxis] > 3
     for wrong, words in (
         (replace(seen, positions=1e3 * seen.positions), 'in mm, not metres: --length mm'),
         (replace(seen, joints=np.degrees(seen.joints)), 'are in degrees, not radians'),
+        (
+            replace(seen, positions=seen.positions * np.where(late, 1e3, 1.0)),
+            'n 6 of 10 measurements alone, the positions are in mm, not metres',
+        ),
     ):
         for tolerance in (None, 1e-3):
             found = verify(arm, [wrong], tolerance)

@@ -264,13 +264,26 @@ def test_new_poses_in_other_units_are_named(earlier):
 
 
 @pytest.mark.parametrize('seed', range(1, 4))
-def test_new_poses_of_which_half_are_in_other_units_are_refused(earlier, seed):
+def test_new_poses_of_which_half_are_in_other_units_are_named(earlier, seed):
     true, previous = earlier
     seen = problem(true, 15, seed)
     positions = seen.observations.positions.copy()
     positions[7:] *= 1e3
     wrong = replace(seen, observations=replace(seen.observations, positions=positions))
-    assert recalibrate(previous, wrong, 0.1).refusal()[1] == 'identify again'
+    with pytest.raises(InputError, match='in 8 of 15 measurements alone, the positions are in mm'):
+        recalibrate(previous, wrong, 0.1)
+
+
+def test_what_moves_while_new_poses_are_measured_is_named(earlier):
+    true, previous = earlier
+    now = true.with_offsets({'elbow_joint.theta': 1e-3})
+    first, then = (problem(arm, 16, 1).observations for arm in (true, now))
+    positions = np.concatenate([first.positions[:9], then.positions[9:]])
+    mixed = replace(first, positions=positions, oriented=np.zeros(16, dtype=bool))
+    found = recalibrate(previous, Problem(UR10E, mixed, **SIGMAS), 0.1)
+    assert not found.accepted
+    why, _ = found.refusal()
+    assert 'measured: the zero of elbow_joint moved by 0.95 mrad before line 10' in why
 
 
 def test_swapped_columns_of_new_poses_are_named(earlier):
