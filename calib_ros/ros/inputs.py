@@ -31,8 +31,8 @@ from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.slices import SILENCE
 
 QUEUE, IMAGE_QUEUE = 10 * BATCH, BATCH // 100
-"""Messages and images of a topic that may wait while the node is busy: for seconds, if poses that
-do not fit the arm are judged on a busy machine."""
+"""Messages and images of a topic that may wait while the node is busy: for seconds, on a busy
+machine."""
 
 
 @dataclass

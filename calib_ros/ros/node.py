@@ -341,12 +341,12 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         tried('taking messages', self._take_messages)
         tried('the journal', self._archive.write)
         status = tried('the status', self._publish_status) or ''
-        tried('the next pose', self._guide.advise)
+        tried('expected accuracy or next pose', self._guide.advise)
         self._diagnostics.publish(status, self._answers)
 
     def _publish_status(self) -> str:
         """Return the status; publish its first words when they change."""
-        words = self.session.status(str(self._identifying.progress))
+        words = self.session.status(str(self._identifying.progress), learn=False)
         trouble = textwrap.shorten(self._archive.trouble, STATUS_LENGTH // 2, placeholder=' ...; ')
         state, _, rest = words.partition('; ')
         text = '; '.join((f'{trouble} {state}', *self._inputs.failures, rest))

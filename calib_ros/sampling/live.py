@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -90,11 +90,23 @@ class Estimate:
         return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))
 
 
+class Known(NamedTuple):
+    """What an update has found."""
+
+    estimate: Estimate | None = None  # None with too few samples
+    refused: str = ''  # why the samples make no valid problem; empty if they do
+    suspicious: tuple[Sample, ...] = ()  # too far from the prediction of the others, ignored
+
+
 class LiveEstimate:
-    """Information filter over the parameters of a growing problem."""
+    """Information filter over the parameters of a growing problem.
+
+    One thread may update it while others read what is `known`.
+    """
 
     def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
         self._problem_of = problem_of
+        self.known = Known()  # by the last update
         self.restart()
 
     def restart(self) -> None:
@@ -108,15 +120,18 @@ class LiveEstimate:
         self._pending: list[Sample] = []
         self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
-        """Samples too far from the prediction of the others, ignored here."""
-        self.refused = ''  # why the samples make no valid problem; empty if they do
+        self.refused = ''
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
         """Add the samples that are new since the last call, or restart with another list.
 
-        Returns None while there are too few. Updates are short, to be called between messages: at
-        most MOST_AT_ONCE samples each.
+        Returns None while there are too few. An update takes at most MOST_AT_ONCE samples.
         """
+        estimate = self._updated(samples)
+        self.known = Known(estimate, self.refused, tuple(self.suspicious))
+        return estimate
+
+    def _updated(self, samples: Sequence[Sample]) -> Estimate | None:
         known = len(self._seen)
         if self._seen != list(samples[:known]):
             self.restart()

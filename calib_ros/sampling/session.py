@@ -76,7 +76,7 @@ class CalibrationSession:
         self._names = JointNames(self.joint_names, self.chain.held)
         self._filter = MessageFilter(self._names, self._frames, len(self.chain.joints))
         self.received = self._filter.received  # messages by kind
-        self._live = LiveEstimate(partial(self.problem_of, posed=True))
+        self._relearn()
         self.pictures.clear()
         self.samples: list[Sample] = []
 
@@ -89,7 +89,10 @@ class CalibrationSession:
         self.settings = settings
         self._collector.settings = self._clocks.settings = settings
         self._frames.wanted = settings.frame_id
-        self._live.restart()
+        self._relearn()
+
+    def _relearn(self) -> None:
+        self._live = LiveEstimate(partial(self.problem_of, posed=True))
 
     def take(self, parts: Sequence[Part]) -> None:
         """Take messages in the order of their places."""
@@ -262,24 +265,34 @@ class CalibrationSession:
 
     @property
     def estimate(self) -> Estimate | None:
-        """Return the estimate from the samples so far; None if they are too few."""
-        return self._live.update(self.usable)
+        """Return the estimate by its last update; None with too few samples."""
+        return self._live.known.estimate
 
-    def status(self, work: str = '') -> str:
+    def learning(self) -> Callable[[], object]:
+        """Return an update of the estimate by the samples so far.
+
+        It may take seconds, and may run on another thread, one at a time.
+        """
+        return partial(self._live.update, self.usable)
+
+    def status(self, work: str = '', learn: bool = True) -> str:
         """Return arm state, other `work`, warnings and the progress of sampling as text.
 
-        What an operator must do comes first, so that a truncated line keeps it.
+        What an operator must do comes first, so that a truncated line keeps it. The estimate is
+        updated before, or only by `learning`.
         """
+        if learn:
+            self.learning()()
         parts = [self.state, work]
         if why := self._filter.refused.get(POSES):
             parts.append(f'measurements are refused, {why}')
         parts += [hint.status for hint in self.hints]
         if self.pictures.refused:
             parts.append(f'the last image is not used: {self.pictures.refused}')
-        estimate = self.estimate
-        parts.append(self._live.refused)
-        for sample in self._live.suspicious[-1:]:
-            number = self.samples.index(sample) + 1
+        estimate, refused, suspicious = self._live.known
+        parts.append(refused)
+        if suspicious and suspicious[-1] in self.samples:
+            number = self.samples.index(suspicious[-1]) + 1
             parts.append(f'pose {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
         parts += progress(self.chain, fitted, estimate, self.settings)

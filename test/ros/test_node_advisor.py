@@ -10,6 +10,7 @@ from builtin_interfaces.msg import Duration
 from diagnostic_msgs.msg import DiagnosticArray
 from ros_cell import PATIENCE, STOPS, Cell, joint_messages, part, pose_messages, topics, values_of
 from sensor_msgs.msg import JointState, PointCloud2, Range
+from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from calib_ros.apply.compensation import Compensator, compensate
@@ -19,6 +20,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import advisor as guide_module
+from calib_ros.sampling.live import LiveEstimate
 
 UR = load_chain('ur10e')
 NODE = 'calibration_node'
@@ -54,6 +56,24 @@ def test_the_next_pose_follows_the_samples_and_is_latched(cell, recording):
     for message in (*early, *late):
         assert (limits[:, 0] <= message.position).all()
         assert (message.position <= limits[:, 1]).all()
+
+
+def test_an_estimate_that_takes_long_holds_up_nothing(cell, recording, monkeypatch):
+    """With fifty targets it takes seconds; calls and the status waited for it."""
+    status = cell.listen(String, f'{NODE}/status')
+    go_on, update = threading.Event(), LiveEstimate.update
+
+    def slow(self, samples):
+        assert go_on.wait(PATIENCE)
+        return update(self, samples)
+
+    monkeypatch.setattr(LiveEstimate, 'update', slow)
+    cell.play(topics(recording))
+    cell.spin_until(lambda: status and '; 22 poses' in status[-1].data)
+    cell.done('remove_last')
+    cell.spin_until(lambda: status[-1].data.endswith('; 21 poses'))
+    go_on.set()
+    cell.spin_until(lambda: 'mm expected' in status[-1].data)
 
 
 def test_the_next_pose_is_one_of_the_candidates_that_was_not_taken(tmp_path, recording):

@@ -17,6 +17,7 @@ from calib_ros.ros import inputs as inputs_module, node as node_module
 from calib_ros.ros.advisor import Guide
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.outputs import Keeper
+from calib_ros.sampling.live import LiveEstimate
 from calib_ros.sampling.session import CalibrationSession
 
 # Sources
@@ -27,7 +28,7 @@ BROKEN = {
     'the corrected pose': (Keeper, 'publish_pose'),
     'the journal': (Archive, 'write'),
     'the status': (CalibrationSession, 'status'),
-    'the next pose': (Guide, 'advise'),
+    'expected accuracy or next pose': (LiveEstimate, 'update'),
     'the account': (CalibrationSession, 'account'),
     'judging': (Diagnostics, '_judged'),
     'the figures': (Guide, 'figures'),
@@ -42,7 +43,7 @@ def test_a_part_that_fails_does_not_silence_the_others(monkeypatch, cell, record
     cell.play(part(recording, 0, 10))
     for k, (what, part_of_it) in enumerate(BROKEN.items()):
 
-        def fail(*arguments, what=what):
+        def fail(*arguments, what=what, **more):
             raise ZeroDivisionError(f'{what} is broken')
 
         with monkeypatch.context() as broken:
