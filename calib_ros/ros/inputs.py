@@ -30,9 +30,9 @@ from calib_ros.sampling.batches import BATCH, Stream, links_of
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.sampling.slices import SILENCE
 
-QUEUE, IMAGE_QUEUE = 10 * BATCH, BATCH // 100
+QUEUE, IMAGE_QUEUE = 5 * BATCH // 2, BATCH // 100
 """Messages and images of a topic that may wait while the node is busy: for seconds, on a busy
-machine."""
+machine. From a deeper queue Fast DDS drops the newest messages beyond 5,000, and reports none."""
 
 
 @dataclass
@@ -119,7 +119,7 @@ class Inputs:
         for subscription, (stream, hearing) in self._inputs.items():
             found = _waiting(subscription)
             hearing.count += len(found)
-            hearing.full += len(found) >= subscription.qos_profile.depth
+            hearing.full += len(found) >= min(subscription.qos_profile.depth, QUEUE)
             come += [(stamp, stream, data) for stamp, data in found]
         come.sort(key=itemgetter(0))
         return [(stream, data) for _, stream, data in come]

@@ -11,7 +11,7 @@ from geometry_msgs.msg import PointStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_cell import Cell, Child, joint_messages, topics, values_of
+from ros_cell import Cell, Child, joint_messages, stamp_ns, topics, values_of
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
@@ -106,6 +106,25 @@ def test_messages_of_seconds_wait_while_the_node_is_busy(tmp_path, recording):
             publisher.publish(message)
             assert k % 500 or publisher.wait_for_all_acked(Duration(seconds=60))
         cell.spin_until(lambda: cell.node.session.received['joints'] == 3600)
+
+
+@pytest.mark.parametrize('depth', [{}, {'depth': 8000}])
+def test_a_queue_holds_no_more_than_fast_dds_and_an_overflow_is_told(tmp_path, recording, depth):
+    """Of 20,000 asked for it kept the first 5,000, and nobody was told of the others."""
+    policies = {'reliability': 'reliable', **depth}
+    override = {f'qos_overrides./joint_states.subscription.{k}': v for k, v in policies.items()}
+    with Cell(chain='ur10e', data_dir=str(tmp_path), **override) as cell:
+        heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        publisher = cell.publisher(JointState, 'joint_states')
+        for k, message in enumerate(joint_messages(recording) * 5):
+            publisher.publish(message)
+            assert depth or k % 500 or publisher.wait_for_all_acked(Duration(seconds=60))
+        said = 'messages are lost on /joint_states'
+        cell.spin_until(lambda: any(said in each.status[0].message for each in heard))
+        assert int(values_of(heard[-1])['queue of /joint_states full']) > 0
+        if not depth:
+            assert cell.node.session.received['joints'] == 5000
+            assert cell.node.session.latest[0] == stamp_ns(joint_messages(recording)[-1])
 
 
 def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, recording):
