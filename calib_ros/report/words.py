@@ -207,10 +207,15 @@ def verdict(
 
 
 def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
-    """Return the 95 % interval [m] of the RMS error; the figure alone without positions."""
+    """Return the 95 % interval [m] of the RMS error; the figure alone without positions.
+
+    One pose shows at least its error, and leaves open the largest one.
+    """
+    least, most = interval_of(found, when)
+    if np.isfinite(most):
+        return least, most
     rms = 1e-3 * found.figures[when].rms_mm
-    limits = interval_of(found, when)
-    return limits if np.isfinite(limits[1]) else (rms, rms)
+    return rms, np.inf if np.isfinite(found.after.position).any() else rms
 
 
 LOST = (

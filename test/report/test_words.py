@@ -60,6 +60,16 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
     assert [each.accepted for each in updates] == [rms_mm < 0.15, True]
 
 
+@pytest.mark.parametrize(('rms_mm', 'says'), [(0.1, 'UNDECIDED'), (0.3, 'does not hold')])
+def test_a_single_pose_does_not_prove_that_it_holds(rms_mm, says):
+    """It did, where four poses were too few to tell."""
+    arm = load_chain('ur10e')
+    away = np.array([[1e-3 * rms_mm, 0.0, 0.0]])
+    off = Residuals(away, np.nan * away, np.arange(1), np.nan * away)
+    both = Comparison(off, off, np.ones(1, bool))
+    assert verdict(Calibration(arm, arm, residual=1e-4), both)[0] == says
+
+
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])
 def test_what_holds_no_more_is_filed_as_that(bumped, verdict):
     """Without a tolerance, too: a history tells no less than the screen."""
