@@ -101,7 +101,8 @@ def publisher(rates, namespace, frames):
         JointState: node.create_publisher(JointState, 'joint_states', QoSProfile(depth=2000)),
         kind: node.create_publisher(kind, topic, QoSProfile(depth=2000)),
     }
-    probes = JointState(), made(PoseStamped(header=Header(frame_id='tracker')))
+    unstamped = JointState(name=names, position=[0.0] * len(names))
+    probes = unstamped, made(PoseStamped(header=Header(frame_id='tracker')))
     os.set_blocking(0, False)
     while not sys.stdin.buffer.read(1):
         for probe in probes:
