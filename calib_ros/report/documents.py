@@ -43,6 +43,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'converged': result.converged,
         'accepted': result.accepted,
         'refusals': list(result.refusals),
+        'rules': [each.rule.name for each in result.refusals],
         'remarks': list(result.remarks),
         'rank': result.rank,
         'unidentifiable': list(result.unidentifiable),

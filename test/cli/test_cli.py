@@ -192,7 +192,9 @@ def test_a_damaged_bag_is_refused_or_warns_and_says_so_in_the_report(run, tmp_pa
     given = ('identify', bag, '--chain', 'ur5e', '--json')
     status, said, _ = run(*given)
     assert status == Status.NOT_ACCEPTED
-    assert 'of the messages could not be read' in json.loads(said)['refusals'][0]
+    refused = json.loads(said)
+    assert 'of the messages could not be read' in refused['refusals'][0]
+    assert refused['rules'] == ['UNREADABLE']
     status, said, err = run(*given, '--out', tmp_path / 'out', '--largest-loss', '0.5')
     assert status == 0
     assert err.startswith('warning: ')
