@@ -148,7 +148,7 @@
     const wide = { type: 'scatter3d', hoverinfo: 'skip', mode: 'lines', showlegend: false };
     const traces = [
       { type: 'scatter3d', mode: 'markers', name: e.things, ...dots(), hoverinfo: 'text',
-        marker: { size: e.cells ? 5 : 3.5, color: errors(), colorscale: 'Viridis', reversescale: true, cmin: 0, cmax: e.largest[state.when],
+        marker: { size: e.cells ? 2.5 : 3.5, color: errors(), colorscale: 'Viridis', reversescale: true, cmin: 0, cmax: e.largest[state.when],
           colorbar: { title: { text: 'error [mm]' }, thickness: 12, len: 0.7, ...(narrow() ? { orientation: 'h', len: 1, y: -0.2 } : {}) } } },
       { type: 'scatter3d', mode: 'markers', name: 'outliers', ...at(outliers), text: outliers.map((i) => 'outlier, ' + words(i)),
         customdata: outliers, hoverinfo: 'text', marker: { size: 5, symbol: 'diamond', color: OUT } },
