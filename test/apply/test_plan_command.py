@@ -102,6 +102,7 @@ def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
 
     assert last(after) < 0.9 * last(alone)
     assert 'the tool' not in alone
+    assert '--measured' not in alone
 
 
 def test_plan_says_how_many_poses_a_wanted_error_needs(run, tmp_path):
