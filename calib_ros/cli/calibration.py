@@ -31,6 +31,7 @@ def _compare(options: argparse.Namespace, screen: Screen) -> int:
     else:
         screen.title(found.in_words(), found.same)
         if not found.same:
+            screen.say('with all parameters free, the most significant changes:')
             screen.table(dict(found.rows()))
     return 0 if found.same else common.Status.NOT_ACCEPTED
 

@@ -82,10 +82,11 @@ def _run_history(options: argparse.Namespace, screen: Screen) -> int:
             raise UnknownNameError('robot', options.robot, serials)
         serials = (options.robot,)
     width = max(map(len, serials))
-    screen.data(f'{"robot":{width}}  time (UTC)        what      verdict    poses  RMS [mm]  from')
+    columns = 'time (UTC)        what      verdict        poses  RMS [mm]  from'
+    screen.data(f'{"robot":{width}}  {columns}')
     for row in (row for serial in serials for row in history.rows(serial)):
         rms = '' if row.rms_mm is None else f'{row.rms_mm:.3f}'
         line = f'{row.serial:{width}}  {row.time:%Y-%m-%d %H:%M}  {row.kind:8}  '
-        line += f'{row.verdict:9}  {row.poses:5}  {rms:>8}  {row.source}'
+        line += f'{row.verdict:13}  {row.poses:5}  {rms:>8}  {row.source}'
         screen.data(line.rstrip())
     return 0

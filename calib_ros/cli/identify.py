@@ -147,6 +147,8 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
         perhaps = 'perhaps ' if why else ''
         for reasons in found.changed:
             screen.bullet(perhaps + reason_in_words(reasons))
+    if found.accepted:
+        screen.bullet(f'{NOT_YET}: {BRING}')
 
 
 def _intervals(judged: Comparison | None) -> str:
