@@ -213,6 +213,8 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
         lines += _paragraphs(*report.steps)
     elif report.steps:
         lines += [*_section('What to do next'), *_listed(report.steps)]
+    if report.remarks:
+        lines += [*_section('Please note'), *_listed(report.remarks)]
     for each in (report.accuracy, *report.sections):
         if each is None:
             continue
@@ -225,10 +227,7 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
     pairs = [*report.identity, *((COUNTED.get(k, k), v) for k, v in samples.items() if v)]
     pairs += [(each.name, f'SHA-256 {each.sha256}') for each in report.origin.inputs]
     identity = [f'{name}: {value}' for name, value in pairs]
-    lists = {'Please note': report.remarks, 'Identity': identity}
-    for title, points in lists.items():
-        lines += [*_section(title), *_listed(points)] if points else []
-    return '\n'.join(lines)
+    return '\n'.join([*lines, *_section('Identity'), *_listed(identity)])
 
 
 def _section(title: str, *text: str) -> list[str]:

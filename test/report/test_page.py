@@ -386,3 +386,10 @@ def test_held_out_poses_that_were_fitted_too_are_in_no_figure(solved):
     assert validation.figures[1].rms_mm == pytest.approx(np.sqrt(np.mean(after**2)))
     assert validation.figures[1].count == len(after) < result.validation.figures[1].count
     assert 'one direction' not in page_of(report_of(problem, result)).text
+
+
+def test_what_is_to_be_noted_comes_before_the_figures(solved):
+    report = replace(report_of(*solved), remarks=('a pose was hit',))
+    for text in (page_of(report).text, markdown(report, {})):
+        assert text.index('What to do next') < text.index('a pose was hit')
+        assert text.index('a pose was hit') < text.index('Accuracy before and after')
