@@ -239,6 +239,8 @@ def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
                     yield _Content(rows, notes, title=sheet.title)
     except InputError:
         raise
+    except zipfile.BadZipFile as err:
+        raise InputError(f'{path} is no workbook, or damaged: save it as .xlsx or CSV') from err
     except Exception as err:  # a broken workbook fails in many ways
         raise InputError(f'cannot read {path}: {" ".join(str(err).split())}') from err
 

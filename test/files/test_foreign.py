@@ -366,7 +366,7 @@ def test_workbooks(tmp_path, monkeypatch):
             smaller.writestr(name, text)
     assert_same(read_table(tmp_path / 'smaller.xlsx', 2, foreign=Foreign(Layout())), None)
     path.write_bytes(b'no workbook')
-    with pytest.raises(InputError, match='cannot read'):
+    with pytest.raises(InputError, match='no workbook, or damaged: save it as'):
         read_table(path, 2, foreign=Foreign(Layout()))
     columns = {'eye_in_hand': 'e'} | {f'q{k}': f'q{k}' for k in (1, 2)}
     for rows, said in (
