@@ -164,15 +164,15 @@ def compare(
 
 
 def joined(
-    pieces: Sequence[Residuals], configurations: Index, index: Index | slice = slice(None)
+    pieces: Sequence[Residuals], configurations: Index, index: Index | None = None
 ) -> Residuals:
     """Return the residuals of all pieces, or those at an index (K,), with configurations (N,)."""
-    return Residuals(
-        np.concatenate([piece.position for piece in pieces])[index],
-        np.concatenate([piece.orientation for piece in pieces])[index],
-        configurations,
-        np.concatenate([piece.pixels for piece in pieces])[index],
-    )
+
+    def rows(name: str) -> FloatArray:
+        found = np.concatenate([getattr(piece, name) for piece in pieces])
+        return found if index is None else found.take(index, axis=0)
+
+    return Residuals(rows('position'), rows('orientation'), configurations, rows('pixels'))
 
 
 def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:

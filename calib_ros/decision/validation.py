@@ -111,7 +111,9 @@ def left_out(
             out = each.select(slice(first, first + np.count_nonzero(numbers == k)))
             for side, chain in zip(pieces, pair, strict=True):
                 side.append(residuals(chain, out))
-    index = np.argsort(np.argsort(np.concatenate(folds), kind='stable'))
+    order = np.argsort(np.concatenate(folds), kind='stable')
+    index = np.empty_like(order)
+    index[order] = np.arange(len(order))
     before, after = (joined(side, np.concatenate(groups), index) for side in pieces)
     return before, after
 

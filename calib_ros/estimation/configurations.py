@@ -45,8 +45,8 @@ def _still(change: FloatArray) -> Flags:
     return np.asarray(left.max(axis=1) <= STILL)
 
 
-def configurations(joints: FloatArray) -> Index:
-    """Return the configuration number (N,) of joint values (N, n).
+def configurations(joints: FloatArray, number: Index | None = None) -> Index:
+    """Return the configuration number (N,) of joint values (N, n), with the stops (N,) if known.
 
     Values within STILL of each other are one configuration, whenever they were taken: a program in
     a loop revisits it instead of measuring another. So are values that are close together compared
@@ -54,7 +54,7 @@ def configurations(joints: FloatArray) -> Index:
     """
     if len(joints) == 0:
         return np.zeros(0, dtype=np.intp)
-    number = stops(joints)
+    number = stops(joints) if number is None else number
     standing = joints[np.flatnonzero(np.diff(number, prepend=-1))]  # one row a stop
     place = np.concatenate(cos_sin(standing), axis=1)  # modulo a turn
     close = _pairs(place, SCATTER)

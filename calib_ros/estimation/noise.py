@@ -113,12 +113,12 @@ def squares_of(chain: Chain, system: System) -> FloatArray:
     sums, counts, joint_sums, joint_counts = found  # views
     for samples in system.sets:
         for k, part in enumerate(samples.whitened_residuals(chain)):
-            weights = np.ones(len(part)) if samples.weights is None else samples.weights**2
-            known = ~np.isnan(part[:, 0])
-            sums[k] += weights[known] @ (part[known] ** 2).sum(axis=1)
-            counts[k] += part.shape[1] * weights[known].sum()
+            known = np.flatnonzero(~np.isnan(part[:, 0]))
+            roots = np.ones(len(known)) if samples.weights is None else samples.weights[known]
+            weighted = roots * part.take(known, axis=0).T
+            sums[k] += np.sum(weighted**2)
+            counts[k] += part.shape[1] * (roots @ roots)
             groups = samples.observations.configurations[known]
-            weighted = np.sqrt(weights[known]) * part[known].T
             joint_sums[k] += sum((np.bincount(groups, row) ** 2).sum() for row in weighted)
             joint_counts[k] += part.shape[1] * np.count_nonzero(np.bincount(groups))
     return found

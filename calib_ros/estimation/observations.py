@@ -264,7 +264,7 @@ class Observations(Shown):
     @cached_property
     def configurations(self) -> Index:
         """Return the configuration number (N,) of each pair."""
-        return configurations(self.joints)
+        return configurations(self.joints, self.stops)
 
     @cached_property
     def stops(self) -> Index:

@@ -94,7 +94,7 @@ class Samples:
         found = np.zeros((count, 2, size, size))
         for parts, phi in samples._motions(model):
             width = phi.shape[1]
-            cuts = np.clip(ends - done, 0, width).tolist()
+            cuts = np.minimum(np.maximum(ends - done, 0), width).tolist()  # np.clip is slow
             done += width
             phi = phi[by_motion]
             for fold, (first, last) in enumerate(pairwise(cuts)):
@@ -148,15 +148,20 @@ class Samples:
             moving = None if velocity is None else velocity[:, part]
             axes, origin, *found, phi = model.linearise(joints[:, part], approach, moving, out)
             out = found[0], found[1]
-            shift, turn = found[0], np.zeros_like(found[0])
-            turn[: model.rotations] = found[1][:-1]
+            shift = found[0]
             if self.distances is not None:
                 shift = _along(origin, shift, self.distances[part], self.observations.plane)
             else:
                 np.subtract(self.positions[:, part], origin, out=shift[-1])
+            weights = 1.0 if self.weights is None else self.weights[part]
+            if not self.oriented and self.whitening is None:
+                shift *= weights / self.sigmas[0]
+                yield (shift,), phi
+                continue
+            turn = np.zeros_like(shift)
+            turn[: model.rotations] = found[1][:-1]
             if self.oriented:
                 turn[-1] = orientation_error(self.rotations[:, :, part], axes)
-            weights = 1.0 if self.weights is None else self.weights[part]
             if self.whitening is not None:
                 both = np.concatenate([shift, turn], axis=1) * weights
                 whitening = self.whitening[:, :, part]
@@ -165,7 +170,7 @@ class Samples:
                 continue
             shift *= weights / self.sigmas[0]
             turn *= weights / self.sigmas[1]
-            yield ((shift, turn) if self.oriented else (shift,)), phi
+            yield (shift, turn), phi
 
     @property
     def width(self) -> int:

@@ -56,6 +56,8 @@ class ErrorModel:
         self.chain = chain
         self.names = tuple(names)
         self._ends = (base, tool)
+        self._base = chain.frame(base).matrix
+        self._origin = np.vstack([np.eye(3), self._base[:3, 3]])[..., np.newaxis]
         turning = tuple(bool(turns) for turns in chain.walk.turning)
         known = dict(chain.effects)
         fitted = tuple(name for name in self.names if name in known)
@@ -118,13 +120,11 @@ class ErrorModel:
         an origin, and the y axes that b shifts along; q (n, B) holds effective joint values.
         """
         count, samples = q.shape
-        base, walk = self.chain.frame(self._ends[0]).matrix, self.chain.walk
-        behind = self._layout.behind
+        walk, behind = self.chain.walk, self._layout.behind
         frames = np.empty((count + 3 + self._layout.beside * count, 4, 3, samples))
-        walk.frames(q, base, frames[: count + 1])
+        walk.frames(q, self._base, frames[: count + 1])
         target = self.chain.at_the_tool(frames[count], self._ends[1])
-        frames[count + 1] = np.eye(4, 3)[..., np.newaxis]
-        frames[count + 1, 3] += base[:3, 3, np.newaxis]
+        frames[count + 1] = self._origin
         frames[count + 2, :3] = frames[count, :3]
         if self._layout.beside:
             after = frames[behind, :3]
