@@ -19,7 +19,7 @@ from calib_ros.decision.result import Identification
 from calib_ros.decision.steps import Step
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.identifiability import DEGENERATE
-from calib_ros.estimation.levels import ALIKE, CERTAIN, CONFIDENT, MOST_OUTLIERS
+from calib_ros.estimation.levels import ALIKE, CERTAIN, CLEARLY, CONFIDENT, MOST_OUTLIERS
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.se3 import Flags
 from calib_ros.settings import EXCEPTION
@@ -174,7 +174,8 @@ def _of_harm(validation: Comparison, may_be_rounding: bool, helps: bool) -> Iter
         first, second = validation.figures_of_all
         gain, limit = _gain(validation, 'position', validation.counting, CERTAIN)
         limit = max(limit, _loss_by_chance(validation), COUNTS)
-        if second.mean_mm > first.mean_mm or gain < -limit:
+        caused = second.rms_mm > first.rms_mm and _caused(validation)
+        if second.mean_mm > first.mean_mm or gain < -limit or caused:
             yield Reason(
                 Rule.GAIN_WITH_OUTLIERS,
                 f'with the outliers the error on held-out poses got worse (RMS {first.rms_mm:.3f} '
@@ -210,6 +211,23 @@ def _loss_by_chance(validation: Comparison) -> float:
     error = np.diff(means, axis=0).std(ddof=1) / np.sqrt(count)
     likely = special.stdtrit(count - 1, CERTAIN) * error
     return 0.5 * float(likely / max(means[0].mean(), 1e-300))
+
+
+def _caused(validation: Comparison) -> bool:
+    """Tell whether the correction itself causes outliers, so that these are no gross errors.
+
+    Gross errors e do not know the correction c: 2 e c, by which their squares before exceed those
+    after (beside c^2), has either sign and a variance of 4/3 |e|^2 |c|^2. Errors clearly larger
+    than the correction are not caused by it.
+    """
+    which = validation.counting & ~validation.judged
+    before, after = (each.position[which] for each in (validation.before, validation.after))
+    change = before - after
+    lengths, errors = (np.linalg.norm(each, axis=1) for each in (change, after))
+    near = errors < CLEARLY * lengths
+    along = (after * change)[near].sum()
+    chance = special.ndtri(CERTAIN) * np.linalg.norm((errors * lengths)[near]) / np.sqrt(3.0)
+    return bool(along < -chance)
 
 
 def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:

@@ -68,13 +68,14 @@ def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
 def test_an_arm_that_fits_is_not_called_wrong_for_a_bad_correction(rng, before, after, rules):
     away = rng.normal(size=(40, 3))
     worse = np.where(np.arange(40)[:, np.newaxis] < 2, 100.0, 1.0)
-    numbers, pixels = np.arange(40), np.full((40, 2), np.nan)
-    parts = [
-        Residuals(x, np.full((40, 3), np.nan), numbers, pixels)
-        for x in (before * away, after * worse * away)
-    ]
-    comparison = Comparison(*parts, worse[:, 0] == 1.0)
-    problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0)
+    assert rules_of(before * away, after * worse * away, worse[:, 0] == 1.0) == rules
+
+
+def rules_of(before, after, judged):
+    """Return the rules that fail by position errors (N, 3) [m] on pairs that were left out."""
+    numbers, none = np.arange(len(judged)), np.full((len(judged), 3), np.nan)
+    parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
+    problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0, sets=())
     result = SimpleNamespace(
         step=None,
         converged=True,
@@ -82,10 +83,22 @@ def test_an_arm_that_fits_is_not_called_wrong_for_a_bad_correction(rng, before, 
         parameters=(),
         chance=None,
         region=1,
-        validation=comparison,
+        validation=Comparison(*parts, judged),
     )
-    problem.sets = ()
-    assert {each.rule for each in refusals(problem, result, None, False, True)} == rules
+    return {each.rule for each in refusals(problem, result, None, False, True)}
+
+
+@pytest.mark.parametrize('size', [2e-3, 5e-3, 5e-2])
+def test_outliers_that_the_correction_causes_are_no_gross_errors(rng, size):
+    judged = np.arange(40) >= 10
+    for _ in range(20):
+        change = 1e-3 * rng.normal(size=(40, 3))
+        after = 1e-4 * rng.normal(size=(40, 3))
+        gross = rng.normal(size=(10, 3))
+        after[:10] += size * gross / np.linalg.norm(gross, axis=1, keepdims=True)
+        assert rules_of(after + change, after, judged) == set()
+        after[:10] = -3.0 * change[:10]  # two thirds as large before
+        assert rules_of(after + change, after, judged) == {Rule.GAIN_WITH_OUTLIERS}
 
 
 def row(name, offset, std, freedom=np.inf):
