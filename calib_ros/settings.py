@@ -12,8 +12,8 @@ from calib_ros.errors import MOST_ENTRIES, ConfigError, UnknownNameError
 
 Criterion: TypeAlias = Literal['d', 'o2', 'o3', 'o4', 'o5', 'task']
 CRITERIA: tuple[Criterion, ...] = get_args(Criterion)
-Aim: TypeAlias = Literal['mean', 'worst']
-AIMS: tuple[Aim, ...] = get_args(Aim)
+Objective: TypeAlias = Literal['mean', 'worst']
+AIMS: tuple[Objective, ...] = get_args(Objective)
 Model: TypeAlias = Literal['corrected', 'nominal']
 MODELS: tuple[Model, ...] = get_args(Model)
 STORAGES = ('mcap', 'sqlite3')

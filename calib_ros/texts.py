@@ -49,7 +49,7 @@ def read_text(
     what: str = '',
 ) -> str:
     """Return the text of a UTF-8 file, described by `what`; raise `error` if that fails."""
-    return decoded(read_bytes(path, largest, error, what), f'{what}{path}', error)
+    return as_text(read_bytes(path, largest, error, what), f'{what}{path}', error)
 
 
 def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: str = '') -> bytes:
@@ -70,7 +70,7 @@ def read_bytes(path: Path, largest: int, error: type[CalibrationError], what: st
     return data
 
 
-def decoded(data: bytes, where: str, error: type[CalibrationError]) -> str:
+def as_text(data: bytes, where: str, error: type[CalibrationError]) -> str:
     """Return bytes as text."""
     try:
         return data.decode('utf-8-sig')

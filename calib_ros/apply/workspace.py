@@ -23,7 +23,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.progress import Notify, quiet
-from calib_ros.settings import AIMS, EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Aim, Model
+from calib_ros.settings import AIMS, EXACT, LEVER, LEVER_IN_PART, TURN_IN_PART, Model, Objective
 from calib_ros.shown import Shown
 
 
@@ -172,7 +172,7 @@ class Placements(Shown):
 def place(
     arm: Calibration,
     task: FloatArray,
-    aim: Aim = 'mean',
+    aim: Objective = 'mean',
     model: Model = 'corrected',
     region: FloatArray | None = None,
     cells: int = 9,
@@ -233,7 +233,7 @@ class _Search:
         self,
         arm: Calibration,
         task: FloatArray,
-        aim: Aim,
+        aim: Objective,
         model: Model,
         starts: int,
         drawn: int,

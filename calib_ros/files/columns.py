@@ -21,7 +21,7 @@ from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.shown import some
-from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, csv_lines, decoded, from_cell, read_bytes
+from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, as_text, csv_lines, from_cell, read_bytes
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
@@ -184,7 +184,7 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
     `above` is the number of lines of the file before it.
     """
     _refuse_zeros(path, data, above)
-    decoded(data, str(path), ColumnsError)  # all of it, before any row
+    as_text(data, str(path), ColumnsError)  # all of it, before any row
     blocks = csv_blocks(path, data, strict=True, above=above)
     first: list[Row] = next(blocks, [(above, [])])
     header = [name.strip() for name in first[0][1]]
