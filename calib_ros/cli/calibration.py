@@ -14,7 +14,7 @@ from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.inputs import calibration_of
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
-from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
+from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.settings import Limits
 from calib_ros.shown import NAMED, some
 from calib_ros.texts import dump_json
@@ -86,11 +86,11 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
     links = {'base_link': options.base_link, 'tip_link': options.tip_link}
     urdf = ''
     if options.urdf is not None:
-        urdf = read_text(options.urdf)
+        urdf = chain_text(options.urdf)
         text = corrected_urdf(urdf, chain, **links) + urdf_foot(chain)
         found = (*found, Export(f'{options.urdf.stem}{CORRECTED_URDF}', text, 0.0))
     elif Path(options.chain).suffix in URDF_SUFFIXES:
-        urdf = read_text(Path(options.chain))
+        urdf = chain_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
     with common.results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
         contents |= {each.name: each.content for each in found}

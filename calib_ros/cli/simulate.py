@@ -18,7 +18,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.files.loading import of_bag
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import dump_chain, load_chain, parse_chain, read_text
+from calib_ros.kinematics.chain_file import chain_text, dump_chain, load_chain, parse_chain
 from calib_ros.report import documents, words
 from calib_ros.settings import Settings
 
@@ -47,7 +47,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say('4. writing the report')
         contents = result_files(found, screen, options.out)
         write_files(folder, contents)
-        against = words.against_truth(found.result, parse_chain(read_text(truth)))
+        against = words.against_truth(found.result, parse_chain(chain_text(truth)))
     screen.say('identified offsets against the true ones [mm, mrad]:')
     screen.say(against)
     show(found, screen)

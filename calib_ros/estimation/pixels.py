@@ -24,7 +24,7 @@ from calib_ros.estimation.robust import INNER
 from calib_ros.estimation.samples import BLOCK, Samples, seen_residuals
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.lens import View, require_lens, view
+from calib_ros.kinematics.lens import Projection, require_lens, view
 from calib_ros.kinematics.parameter import LENS_KINDS, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, Index
 
@@ -45,7 +45,7 @@ class _Images:
     columns: FloatArray
     twist: FloatArray
     lens: list[int]
-    seen: View
+    seen: Projection
 
 
 class PixelSamples(Samples):

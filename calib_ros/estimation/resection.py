@@ -19,8 +19,8 @@ from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.lens import Lens, View, view
-from calib_ros.kinematics.newton import Normal, minimise
+from calib_ros.kinematics.lens import Lens, Projection, view
+from calib_ros.kinematics.newton import NormalBatch, minimise_batch
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, Flags, FloatArray, Index
 
 
@@ -82,7 +82,7 @@ def uncertainty(observations: Observations, poses: FloatArray, lens: Lens) -> Fl
     return np.asarray(np.linalg.inv(image_products(rows, begins)))
 
 
-def _seen(lens: Lens, poses: FloatArray, index: Index, points: FloatArray) -> View:
+def _seen(lens: Lens, poses: FloatArray, index: Index, points: FloatArray) -> Projection:
     """Return the view of points (3, C) at board poses (M, 4, 4)."""
     axes, origin = poses[:, :3, :3].transpose(2, 1, 0), poses[:, :3, 3].T
     return view(lens, axes, origin, index, points, False)
@@ -177,7 +177,7 @@ def _refined(
     """Return poses (M, 4, 4) refined on the pixels (N, 2), and RMS residuals (M,) [px]."""
     count = np.bincount(index)
 
-    def linearise(poses: FloatArray, which: Index) -> Normal:
+    def linearise(poses: FloatArray, which: Index) -> NormalBatch:
         moving = np.zeros(len(count), dtype=bool)
         moving[which] = True
         these = np.flatnonzero(moving[index])
@@ -187,7 +187,7 @@ def _refined(
         seen.by_twist(rows[:6])
         rows[6] = pixels[these].T - seen.pixels
         found = image_products(rows, np.cumsum(count[which]) - count[which]).transpose(1, 2, 0)
-        return Normal(found[:6, :6], found[:6, 6], found[6, 6])
+        return NormalBatch(found[:6, :6], found[:6, 6], found[6, 6])
 
     def move(poses: FloatArray, step: FloatArray) -> FloatArray:
         moved = poses.copy()
@@ -196,5 +196,5 @@ def _refined(
         moved[:3, :3] = np.einsum('ijb,jkb->ikb', turn, poses[:3, :3])
         return moved
 
-    found = minimise(linearise, poses.transpose(1, 2, 0), move, fall=HALF_THE_DIGITS)
+    found = minimise_batch(linearise, poses.transpose(1, 2, 0), move, fall=HALF_THE_DIGITS)
     return found.x.transpose(2, 0, 1), np.sqrt(found.cost / count)

@@ -42,10 +42,10 @@ from calib_ros.identification import records
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.kinematics.chain_file import (
+    chain_text,
     dump_chain,
     frames_document,
     parse_chain,
-    read_text,
     table_hash,
 )
 from calib_ros.kinematics.se3 import FloatArray, norms
@@ -308,7 +308,7 @@ def calibration_file(path: str | os.PathLike[str]) -> Path:
 def load_calibration(path: str | os.PathLike[str], nominal: Chain | None = None) -> Calibration:
     """Read a calibration from its file or an identification's folder (`parse_calibration`)."""
     file = calibration_file(path)
-    return parse_calibration(read_text(file), str(file), nominal)
+    return parse_calibration(chain_text(file), str(file), nominal)
 
 
 def parse_calibration(

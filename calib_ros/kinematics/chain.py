@@ -305,7 +305,7 @@ class Chain(Shown):
     def effective(self, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
         """Return the effective joint values (n, B) for reported ones (n, B)."""
         names = tuple(name for name, value in self.effects if value)
-        return effects.moved(self, names, effects.basis(self, names, q, approach), q)
+        return effects.moved_joints(self, names, effects.basis(self, names, q, approach), q)
 
     def trace(
         self, q: FloatArray, base: str = 'base', tool: str = 'tool'

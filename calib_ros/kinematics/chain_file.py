@@ -67,7 +67,7 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
                     'robot (or path of a chain file or URDF)', str(name_or_path), robots
                 )
             path = robots[path.name]
-        chain = parse_chain(read_text(path), str(path))
+        chain = parse_chain(chain_text(path), str(path))
     _refuse_degrees(chain, str(path))
     return chain
 
@@ -91,10 +91,10 @@ def read_urdf(
     convention: Convention = 'standard',
 ) -> Chain:
     """Read the chain between two links of a URDF, with its frames (`urdf.chain_from_urdf`)."""
-    return chain_from_urdf(read_text(path), base_link, tip_link, convention)
+    return chain_from_urdf(chain_text(path), base_link, tip_link, convention)
 
 
-def read_text(path: Path) -> str:
+def chain_text(path: Path) -> str:
     """Return the text of a chain file."""
     return texts.read_text(path, what='chain file ')
 

@@ -126,14 +126,14 @@ def resolve(chain: _Arm, name: str) -> tuple[str, ...]:
         if '.' not in name:
             raise UnknownNameError('model', name, (*alone, *GROUPS))
         raise UnknownNameError(f'joint in effect {name}', joint, chain.joint_names)
-    check(name, chain.joint_names)
+    check_effect(name, chain.joint_names)
     if kind in PLAY and name not in (known := members(chain, 'backlash')):
         raise UnknownNameError('effect', name, known)
     return (name,)
 
 
 @lru_cache(maxsize=1024)
-def check(name: str, joints: tuple[str, ...]) -> None:
+def check_effect(name: str, joints: tuple[str, ...]) -> None:
     """Refuse an unknown effect."""
     first, rest = Parameter(name).effect
     if first in ('coupling', 'gravity'):
@@ -203,7 +203,7 @@ def _wave(
     return np.asarray(circles[joint][orders.astype(int) - 1])
 
 
-def moved(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
+def moved_joints(chain: _Arm, names: Sequence[str], phi: FloatArray, q: FloatArray) -> FloatArray:
     """Return joint values (n, B) plus effects with phi (E, B); of held joints their limit."""
     known = dict(chain.effects)
     values = [known[name] for name in names]

@@ -33,7 +33,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain, Frame
 from calib_ros.kinematics.inverse import Aim, limits
 from calib_ros.kinematics.jacobian import orientation_error
-from calib_ros.kinematics.newton import Minimum, Normal, minimise
+from calib_ros.kinematics.newton import Minimum, NormalBatch, minimise_batch
 from calib_ros.kinematics.se3 import (
     HALF_THE_DIGITS,
     ROUNDING,
@@ -194,16 +194,16 @@ class Follower:
         """Minimise |e|^2 + x^T D x; without `settle`, samples with |x| > 1 are given up."""
         stiffness = np.broadcast_to(stiffness, (*stiffness.shape[:2], len(task.q[0])))
 
-        def linearise(x: FloatArray, which: Index) -> Normal:
+        def linearise(x: FloatArray, which: Index) -> NormalBatch:
             some, soft = task.select(which), stiffness[..., which]
             error, columns = self._linearise(some, x, weight)
             pull = np.einsum('ijb,jb->ib', soft, x)
             slope = np.where(some.held, 0.0, np.einsum('ikb,kb->ib', columns, error) - pull)
             cost = np.einsum('kb,kb->b', error, error) + np.einsum('ib,ib->b', x, pull)
-            return Normal(np.einsum('ikb,jkb->ijb', columns, columns) + soft, slope, cost)
+            return NormalBatch(np.einsum('ikb,jkb->ijb', columns, columns) + soft, slope, cost)
 
         fall, longest = (ROUNDING, np.inf) if settle else (0.0, 1.0)
-        return minimise(linearise, task.start, fall=fall, longest=longest, rounds=ROUNDS)
+        return minimise_batch(linearise, task.start, fall=fall, longest=longest, rounds=ROUNDS)
 
     def _linearise(
         self, task: _Task, x: FloatArray, weight: float

@@ -20,7 +20,7 @@ import numpy as np
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
-from calib_ros.kinematics.newton import Normal, minimise
+from calib_ros.kinematics.newton import NormalBatch, minimise_batch
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, Flags, FloatArray, Index
 from calib_ros.settings import LEVER
 from calib_ros.values import SAME
@@ -59,20 +59,20 @@ def solve(
     positions = np.ascontiguousarray(poses[:, :3, 3].T)
     axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))
 
-    def linearise(q: FloatArray, which: Index) -> Normal:
+    def linearise(q: FloatArray, which: Index) -> NormalBatch:
         turns = lever if part.stop > 3 else 0.0
         error, columns = aim.linearise(q, None, positions[:, which], axes[..., which], turns)
         error, columns = error[part], columns[:, part]
         normal = np.einsum('ikb,jkb->ijb', columns, columns)
         normal[np.diag_indices(len(q))] += ROUNDING
         slope = np.einsum('ikb,kb->ib', columns, error)
-        return Normal(normal, slope, np.einsum('kb,kb->b', error, error))
+        return NormalBatch(normal, slope, np.einsum('kb,kb->b', error, error))
 
     def within(q: FloatArray, step: FloatArray | float) -> FloatArray:
         return _within(chain, q + step)
 
     begin = within(np.array(start, dtype=float).T, 0.0)
-    q = minimise(linearise, begin, within, enough=SAME**2, rounds=iterations).x
+    q = minimise_batch(linearise, begin, within, enough=SAME**2, rounds=iterations).x
     error, _ = aim.linearise(q, None, positions, axes, lever)
     apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / lever))
     return Inverse(q.T, apart, turned, np.linalg.norm(error[part], axis=0) <= SAME)

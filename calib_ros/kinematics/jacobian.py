@@ -32,8 +32,8 @@ from calib_ros.errors import UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import (
-    ANGLES,
     DELAY,
+    DH_ANGLES,
     LENS_KINDS,
     ROW_KINDS,
     Parameter,
@@ -94,7 +94,7 @@ class ErrorModel:
         layout, walk, samples = self._layout, self.chain.walk, q.shape[1]
         names = tuple(dict.fromkeys((*layout.effects, *(n for n, v in self.chain.effects if v))))
         phi = effects.basis(self.chain, names, q, approach)
-        frames, target = self._frames(effects.moved(self.chain, names, phi, q))
+        frames, target = self._frames(effects.moved_joints(self.chain, names, phi, q))
         flat = frames.reshape(4 * len(frames), 3, samples)
         axes = flat[layout.axes]
         levers = np.zeros((len(axes) + 1, 3, samples))  # the last stays zero
@@ -212,7 +212,7 @@ def _lines(
         for name in parameters_of(joint, ROW_KINDS):
             frame_row = i + 1 if standard and name.kind in along else i
             frame_row = i + 3 + len(joints) if name.kind == 'b' else frame_row
-            found[name] = (frame_row, along.get(name.kind, 2), name.kind in ANGLES)
+            found[name] = (frame_row, along.get(name.kind, 2), name.kind in DH_ANGLES)
     return found
 
 

@@ -127,7 +127,7 @@ class Lens:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class Projection:
     """Points of a board in a camera.
 
     `points` and `arm` (3, C) [m] are in the camera's frame, from the camera and from the chain's
@@ -170,7 +170,7 @@ def view(
     owner: Index,
     points: FloatArray,
     on_flange: bool,
-) -> View:
+) -> Projection:
     """Return the view of points (3, C) [m] of a board in some images, `owner` (C,) of the points.
 
     `axes` (3, 3, M) and `origin` (3, M) are those of the end of the chain, for each image: the
@@ -182,11 +182,11 @@ def view(
     if on_flange:
         inside = np.einsum('kcn,cn->kn', turned, points - placed[9:])
         pixels, by_point = lens.project(inside)
-        return View(inside, inside, pixels, -by_point, turned)
+        return Projection(inside, inside, pixels, -by_point, turned)
     arm = np.einsum('kcn,kn->cn', turned, points)
     inside = arm + placed[9:]
     pixels, by_point = lens.project(inside)
-    return View(inside, arm, pixels, by_point, None)
+    return Projection(inside, arm, pixels, by_point, None)
 
 
 def require_lens(lens: Lens | None, camera: str) -> Lens:

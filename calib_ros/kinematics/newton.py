@@ -17,7 +17,7 @@ import numpy as np
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, ROUNDS, Flags, FloatArray, Index
 
 
-class Normal(NamedTuple):
+class NormalBatch(NamedTuple):
     """Normal matrices (n, n, B), downward slopes (n, B) and costs (B,) of problems."""
 
     matrix: FloatArray
@@ -33,8 +33,8 @@ class Minimum(NamedTuple):
     settled: Flags
 
 
-def minimise(
-    linearise: Callable[[FloatArray, Index], Normal],
+def minimise_batch(
+    linearise: Callable[[FloatArray, Index], NormalBatch],
     start: FloatArray,
     move: Callable[[FloatArray, FloatArray], FloatArray] = np.add,
     fall: float = 0.0,
@@ -74,12 +74,12 @@ def minimise(
         x, tried = x[..., going], tried[..., going]
         if not going.size:
             break
-        now = Normal._make(part[..., going] for part in now)
+        now = NormalBatch._make(part[..., going] for part in now)
         new = linearise(tried, active)
         taken = new.cost < now.cost * (1.0 + slack)
         still = np.abs(new.cost - now.cost) < fall * now.cost
         x = np.where(taken, tried, x)
-        now = Normal._make(np.where(taken, *pair) for pair in zip(new, now, strict=True))
+        now = NormalBatch._make(np.where(taken, *pair) for pair in zip(new, now, strict=True))
         still |= now.cost <= (enough or 0.0)
         settled[active[still]] = True
         damping = np.where(taken, 0.1 * damping, np.maximum(10.0 * damping, least))

@@ -12,7 +12,7 @@ from functools import lru_cache
 DH_KINDS = ('a', 'alpha', 'd', 'theta', 'beta')
 ROW_KINDS = (*DH_KINDS, 'b')
 """Parameters of a joint's row; b is zero unless axes coincide."""
-ANGLES = ('alpha', 'theta', 'beta')
+DH_ANGLES = ('alpha', 'theta', 'beta')
 FRAME_KINDS = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 DELAY = 'delay'
 """Parameter [s] of a base frame: delay of the stamps of its device."""

@@ -24,8 +24,8 @@ from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.texts import LARGEST_TEXT
 from calib_ros.values import LARGEST, SAME, parse_name
 
-MOVING = ('revolute', 'continuous', 'prismatic')
-TYPES = (*MOVING, 'fixed', 'floating', 'planar')
+MOVING_TYPES = ('revolute', 'continuous', 'prismatic')
+JOINT_TYPES = (*MOVING_TYPES, 'fixed', 'floating', 'planar')
 USUAL_TIPS = ('tool0', 'flange')
 ENDS = ('lower', 'upper')
 MOST_LINKS = 10 * MOST_ENTRIES
@@ -54,7 +54,7 @@ class DescribedJoint:
     @property
     def moves(self) -> bool:
         """Tell whether one number drives the joint."""
-        return self.type in MOVING
+        return self.type in MOVING_TYPES
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,14 +234,14 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
     name = parse_name(element.get('name', ''), 'the name of a joint')
     kind = element.get('type', '')
     where = f'joint "{name}"'
-    if kind not in TYPES:
-        raise UnknownNameError(f'type of {where}', kind, TYPES)
+    if kind not in JOINT_TYPES:
+        raise UnknownNameError(f'type of {where}', kind, JOINT_TYPES)
     parent, child = (_child(element, key).get('link', '') for key in ('parent', 'child'))
     for link in (parent, child):
         if link not in links:
             raise UnknownNameError(f'link at {where}', link, links)
     axis = np.zeros(3)
-    if kind in MOVING:
+    if kind in MOVING_TYPES:
         axis = _numbers(_child(element, 'axis'), 'xyz', f'axis of {where}', '1 0 0')
         size = np.abs(axis).max()
         if size < SAME:  # a rounded zero
@@ -254,7 +254,7 @@ def _joint(element: ET.Element, links: Mapping[str, object]) -> DescribedJoint:
         ends = (_numbers(limit, key, f'limit of {where}', '0', 1, math.inf) for key in ENDS)
         lower, upper = (float(x[0]) if abs(x[0]) <= LARGEST else None for x in ends)
     follows, mimic = None, element.find('mimic')
-    if mimic is not None and kind in MOVING:
+    if mimic is not None and kind in MOVING_TYPES:
         of = f'mimic of {where}'
         ratio, offset = (
             float(_numbers(mimic, key, of, default, 1)[0])

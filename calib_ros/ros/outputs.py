@@ -22,7 +22,7 @@ from calib_ros.files.vendors import vendor_files
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import parse_chain, read_text
+from calib_ros.kinematics.chain_file import chain_text, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
 from calib_ros.ros import to_ros
@@ -238,7 +238,7 @@ def _calibration_text(path: Path) -> str:
     if not path.is_file():
         raise InputError(f'there is no file {path}')
     try:
-        text = read_text(path)
+        text = chain_text(path)
         parse_chain(text)
     except Exception as err:  # its text may quote the file
         if isinstance(err.__cause__, OSError):

@@ -23,7 +23,7 @@ from std_msgs.msg import String
 
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.chain_file import URDF_SUFFIXES, load_chain, read_text
+from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros.arguments import PARAMETERS, Parameter
 from calib_ros.sampling.slices import SILENCE
@@ -109,7 +109,7 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
             )
         text = message.data
     elif Path(name).suffix in URDF_SUFFIXES:
-        text = read_text(Path(name))
+        text = chain_text(Path(name))
     elif any(links.values()):
         raise ConfigError('base_link and tip_link apply only to a URDF')
     else:

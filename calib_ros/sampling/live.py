@@ -42,7 +42,7 @@ from calib_ros.estimation.sizes import solved
 from calib_ros.estimation.start import start_frames
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
-from calib_ros.kinematics.parameter import ANGLES, DELAY, IN_A_FRAME, Parameter
+from calib_ros.kinematics.parameter import DELAY, DH_ANGLES, IN_A_FRAME, Parameter
 from calib_ros.kinematics.se3 import ROUNDS, FloatArray
 from calib_ros.sampling.dataset import collect
 from calib_ros.sampling.sample import Frames, Sample
@@ -176,7 +176,7 @@ class LiveEstimate:
         except (CalibrationError, np.linalg.LinAlgError):
             return False
         wide: dict[str, float] = {
-            name: 1.0 if name.kind == DELAY else WIDE[name.kind in ANGLES]
+            name: 1.0 if name.kind == DELAY else WIDE[name.kind in DH_ANGLES]
             for name in map(Parameter, self._names)
             if not model.owns_frame(name)
         }

@@ -211,11 +211,11 @@ def calibration(path):
 
 @target('.urdf')
 def urdf(path):
-    from calib_ros.kinematics.chain_file import read_text, read_urdf
+    from calib_ros.kinematics.chain_file import chain_text, read_urdf
     from calib_ros.kinematics.urdf import corrected_urdf
 
     found = read_urdf(path)
-    corrected_urdf(read_text(path), found.with_offsets({f'{found.joint_names[0]}.theta': 1e-3}))
+    corrected_urdf(chain_text(path), found.with_offsets({f'{found.joint_names[0]}.theta': 1e-3}))
 
 
 def _replayed(path):
