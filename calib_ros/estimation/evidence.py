@@ -40,7 +40,7 @@ Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
 """A weight, with mean (P,) and covariance (P, P) of the offsets."""
 
 
-def group_of(chain: Chain, name: str) -> str | None:
+def size_group(chain: Chain, name: str) -> str | None:
     """Return the group of parameters with errors of one size; None for frames."""
     return None if chain.owns_frame(name) else _group(name)
 
@@ -155,10 +155,10 @@ def posterior_of(
     if problem.sigma_scale:
         known['scale'] = problem.sigma_scale
     columns = [*every, *['scale'] * bool(lengths)]
-    groups = [None if n in known else n if n == 'scale' else group_of(chain, n) for n in columns]
+    groups = [None if n in known else n if n == 'scale' else size_group(chain, n) for n in columns]
     given = np.array([known.get(n, np.inf) for n in columns]) ** -2
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
-    considered = {group_of(chain, name) for name in more} - {*groups[: len(names)]}
+    considered = {size_group(chain, name) for name in more} - {*groups[: len(names)]}
     size, slope = evidence.most_probable(considered)
     rival = None
     if judging and lengths and scale < PRINTED and 'scale' not in known:

@@ -28,7 +28,7 @@ from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.values import require
 
-SIGMAS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
+NOISE_FIELDS = ('sigma_position', 'sigma_orientation', 'sigma_pixel', 'sigma_touch')
 TOOL = 1.0  # largest length [m] of a target on a flange, assumed
 
 
@@ -255,7 +255,7 @@ class Problem(Shown):
     @property
     def sigmas(self) -> dict[str, float]:
         """Return the sigmas of the measurements [m, rad, px, m] by name."""
-        return {name: getattr(self, name) for name in SIGMAS}
+        return {name: getattr(self, name) for name in NOISE_FIELDS}
 
     @cached_property
     def prior_sigmas(self) -> Mapping[str, float]:

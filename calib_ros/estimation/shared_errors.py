@@ -39,7 +39,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, cos_sin
 from calib_ros.values import LARGEST
 
-LENGTHS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
+DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
 """Decay lengths of shared errors: stops, and rad (m) of all joints together."""
 NEARBY = SEVERAL
 """Neighbours in joint space tested per configuration; benchmarks/drift.py --quick does not tell
@@ -113,7 +113,7 @@ class Stops:
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     """Return which neighbours share errors, and the resulting noise."""
-    kinds = tuple(LENGTHS)
+    kinds = tuple(DECAYS)
     few, share = gathered(fit.chain, names, system, MOST_STOPS)
     correlations = dict.fromkeys(kinds, 0.0)
     if len(few) < TELLING:
@@ -132,7 +132,7 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     if not alike:
         return Shared(**correlations, found=(), middles={})
     kernels = {
-        part: [(kind, length) for kind in kinds if kind in found for length in LENGTHS[kind]]
+        part: [(kind, length) for kind in kinds if kind in found for length in DECAYS[kind]]
         for part, found in alike.items()
     }
     sizes = forms.sizes(kernels)

@@ -30,7 +30,7 @@ from scipy import linalg
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Columns, Explanation, Information
 from calib_ros.errors import InputError
-from calib_ros.estimation.evidence import group_of
+from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.levels import CONFIDENT, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
@@ -218,7 +218,7 @@ def _in_names(
     change = _change(chain, names, own)
     whole = change @ square @ change.T
     unknown = np.abs(change).max(axis=1) < HALF_THE_DIGITS
-    sizes = [TYPICAL[group_of(chain, name) or 'length'] for name in names]
+    sizes = [TYPICAL[size_group(chain, name) or 'length'] for name in names]
     return np.asarray(whole + np.diag(unknown * np.square(sizes)))
 
 

@@ -19,7 +19,7 @@ from scipy import linalg
 from calib_ros.decision.comparison import COUNTS, Verdict, log_gain
 from calib_ros.decision.drift import Columns, Shifts, chance
 from calib_ros.decision.result import Identification
-from calib_ros.estimation.evidence import group_of
+from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.identifiability import independent
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
@@ -261,7 +261,7 @@ class LinearModel:
         if name not in self._sigmas:
             size = self._problem.prior_sigmas.get(name, 0.0)
             if name not in self._names:
-                group = str(group_of(self._chain, name))
+                group = str(size_group(self._chain, name))
                 size = max(effects.expected(name), self._sizes.get(group, 0.0))
             self._sigmas[name] = size
         return self._sigmas[name]

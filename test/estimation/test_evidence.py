@@ -11,7 +11,7 @@ from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.estimation import evidence
 from calib_ros.estimation.considered import considered
-from calib_ros.estimation.evidence import Posterior, _device, group_of
+from calib_ros.estimation.evidence import Posterior, _device, size_group
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.sizes import SPREAD, TYPICAL, Evidence
 from calib_ros.kinematics import effects, se3
@@ -202,7 +202,7 @@ def test_errors_are_of_one_size_by_group():
         ('wrist_1_joint.coupling_elbow_joint', 'coupling'),
         ('elbow_joint.gravity_wrist_1_joint', 'gravity'),
     ):
-        assert group_of(UR10E, name) == group
+        assert size_group(UR10E, name) == group
 
 
 def test_what_another_device_adds_is_what_marginalising_leaves(rng):
