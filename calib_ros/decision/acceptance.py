@@ -230,7 +230,7 @@ def _caused(validation: Comparison) -> bool:
     return bool(along < -chance)
 
 
-def remarks(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
+def oddities(problem: Problem, step: Step | None, coarse: Mapping[str, float]) -> tuple[str, ...]:
     """Return what is suspicious about a result but no reason to refuse it.
 
     `coarse` holds the steps [rad or m] of rounded joint values.

@@ -169,7 +169,7 @@ def root_of(square: FloatArray) -> FloatArray:
 
 
 def explanations(
-    information: Information, columns: Columns, freedom: float
+    information: Information, columns: Effects, freedom: float
 ) -> tuple[Explanation, ...]:
     """Return the possible explanations of a change, best first.
 
@@ -188,14 +188,14 @@ def explanations(
 
 
 def reasons_of(
-    information: Information, columns: Columns, freedom: float
+    information: Information, columns: Effects, freedom: float
 ) -> tuple[Explanation, ...]:
     """Return the likely explanations; none if the change may be chance."""
     found = explanations(information, columns, freedom)
-    return likely(found) if any(each.chance <= FALSE for each in found) else ()
+    return likeliest(found) if any(each.chance <= FALSE for each in found) else ()
 
 
-def likely(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
+def likeliest(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
     """Return the best explanation and those indistinguishable from it."""
     return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or tuple(found[:1])
 
@@ -204,7 +204,7 @@ def _sizes(names: Sequence[Parameter]) -> FloatArray:
     return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES[n.unit] for n in names])
 
 
-class Columns:
+class Effects:
     """Effects of an arm's changes on the P parameters `names` with information.
 
     Changes of others show in these if they are gauge freedoms beside them, otherwise not at all.
@@ -292,7 +292,7 @@ def shown(
     return [name for name, size in zip(names, sizes, strict=True) if size > HALF_THE_DIGITS]
 
 
-def predicted(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
+def mean_square_change(chain: Chain, names: Sequence[Parameter]) -> FloatArray:
     """Return V (P, P) [m^2], where d^T V d is the mean squared position change by d.
 
     Over the joint range, in the best frames.

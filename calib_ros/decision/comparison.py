@@ -38,7 +38,7 @@ class ErrorFigures:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class GroupVerdict:
     """Held-out RMS with and without a group of effects or a harmonic."""
 
     what: str

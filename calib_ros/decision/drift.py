@@ -33,7 +33,7 @@ SHIFTS = 2 * SOME_POSES
 """Shifts tried at most, forwards and backwards; the first is zero (benchmarks/drift.py)."""
 
 
-Columns: TypeAlias = tuple[FloatArray, FloatArray]
+ShiftProducts: TypeAlias = tuple[FloatArray, FloatArray]
 """X^T X (P, P) of detrended columns X, and X^T r (P, S) by shift."""
 
 
@@ -62,7 +62,7 @@ class Shifts:
         self._shifted = np.concatenate(windows, axis=1)
         self._energy = (self._shifted**2).sum(axis=1)
 
-    def columns(self, columns: Iterable[Sequence[FloatArray]]) -> Columns:
+    def columns(self, columns: Iterable[Sequence[FloatArray]]) -> ShiftProducts:
         """Return the products of weighted columns, (P, c, N) for each set, in one or more lots."""
         rows = []
         for lot in columns:
@@ -80,7 +80,7 @@ class Shifts:
 
     def shares(
         self,
-        columns: Columns,
+        columns: ShiftProducts,
         inverse: FloatArray,
         known: Sequence[int],
         groups: Sequence[Sequence[int]],

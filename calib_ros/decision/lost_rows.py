@@ -33,7 +33,7 @@ Framed = Callable[[Observations], Chain | None]
 
 
 @dataclass(frozen=True)
-class Loss:
+class RowLoss:
     """Joint values that are `after` rows below their measurement from `row` (from 0) on.
 
     Before it, they are `before` rows below. `error` [m] is the typical one once corrected.
@@ -56,7 +56,7 @@ class Loss:
         )
 
 
-def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> Loss | None:
+def row_loss(seen: Observations, framed: Framed, errors: Errors, largest: float) -> RowLoss | None:
     """Return the loss that explains nearly all pairs (N), if one does.
 
     `framed` returns the chain with frames fitted to some pairs, `errors` (N,) [m] those of pairs;
@@ -65,7 +65,7 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
     count = len(seen)
     if not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
-    best: Loss | None = None
+    best: RowLoss | None = None
     good = EXPLAINED_ROWS * count
     for chain in _frames(seen, framed):
         tables = {s: _shifted(chain, seen, s, errors) for s in SLIPS}
@@ -77,7 +77,7 @@ def lost(seen: Observations, framed: Framed, errors: Errors, largest: float) -> 
             fitting = int(np.count_nonzero(pieced <= largest))
             if fitting >= good and _apart(tables[before], tables[after], row, largest):
                 good = fitting + 1
-                best = Loss(row, before, after, float(np.median(pieced[np.isfinite(pieced)])))
+                best = RowLoss(row, before, after, float(np.median(pieced[np.isfinite(pieced)])))
     return best
 
 

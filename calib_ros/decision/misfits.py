@@ -68,11 +68,11 @@ def lacking(fitted: Fitted) -> float:
     added = tuple(n for n in effects.members(problem.chain, 'coupling') if n not in known)
     if not added or fitted.noise.position < SUSPICIOUS:  # nothing is left to explain
         return 0.0
-    share = explained(problem, chain.with_effects([*known, *added]), fitted.names, added)
+    share = explained_share(problem, chain.with_effects([*known, *added]), fitted.names, added)
     return share if share >= EXPLAINED else 0.0
 
 
-def explained(
+def explained_share(
     problem: Problem, chain: Chain, fitted: Sequence[str], added: Sequence[str]
 ) -> float:
     """Return the share of the residual squares that added parameters explain, linearly."""

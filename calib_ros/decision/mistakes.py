@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros.decision.comparison import residuals
-from calib_ros.decision.lost_rows import lost
+from calib_ros.decision.lost_rows import row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
@@ -74,7 +74,7 @@ class Explained:
         return str(self.reason)
 
 
-def remarked(problem: Problem, result: Identification) -> Identification:
+def with_mistake(problem: Problem, result: Identification) -> Identification:
     """Return the result with the mistake that explains its errors, if any.
 
     It becomes the first refusal; but another arm, and orientations that do not fit, only give a
@@ -229,7 +229,7 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
     def errors(arm: Chain, each: Observations) -> FloatArray:
         return misses(arm, each, flange(arm, each))
 
-    found = lost(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
+    found = row_loss(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
     if found is None:
         return None
     remedy = 'is a row missing or duplicated in one of two tables? Correct it'

@@ -32,7 +32,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.decision.acceptance import out_of_scale
-from calib_ros.decision.misfits import explained
+from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.region import SHELL
@@ -192,7 +192,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
     delays = [Parameter(name, DELAY) for name in sorted(bases)]
-    share = explained(late, chain, result.names, delays)
+    share = explained_share(late, chain, result.names, delays)
     if share < EXPLAINED:
         return result
     text = (
@@ -267,7 +267,7 @@ def _lens(problem: Problem, result: Identification) -> tuple[str, bool]:
         freedom = IN_A_FRAME * count - len(result.names)
         if frame.lens is None or not frame.lens.fixed or freedom <= len(names):
             continue
-        left = 1.0 - explained(problem, result.chain, result.names, names)
+        left = 1.0 - explained_share(problem, result.chain, result.names, names)
         rest = freedom - len(names)
         if chance_of((1.0 - left) / max(left, EXACT) * rest, len(names), rest) > 1.0 - SURE:
             continue

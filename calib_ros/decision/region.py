@@ -132,7 +132,7 @@ def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> Flo
     return matrix
 
 
-def unpacked(rows: Sequence[str], size: int) -> FloatArray:
+def unpacked_matrix(rows: Sequence[str], size: int) -> FloatArray:
     """Return the matrix (P, P) from the rows of `packed`."""
     root = parse_rows(rows, size, triangular=True)
     return np.asarray(root @ root.T)
@@ -165,7 +165,7 @@ def region_of_record(record: Mapping[str, Any], chain: Chain, where: str) -> Reg
         region = Region(
             chain,
             names,
-            unpacked(document['root'], len(names)),
+            unpacked_matrix(document['root'], len(names)),
             parse_rows(document.get('device', [''] * len(names)), len(names)),
             np.inf if limit is None else float(limit),
             float(document['share']),

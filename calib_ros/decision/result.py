@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from calib_ros.decision.comparison import Comparison, Verdict
+from calib_ros.decision.comparison import Comparison, GroupVerdict
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Reason
 from calib_ros.decision.region import Region
@@ -69,7 +69,7 @@ class Identification(Shown):
     """Where the calibration may be used; None if nowhere."""
     weak: tuple[str, ...] = ()
     """Parameters that the poses hardly determine, held near nominal by a prior."""
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[GroupVerdict, ...] = ()
     """Effects tried if the model was chosen."""
     step: Step | None = None
     """What moved during the measurement (`steps.py`)."""

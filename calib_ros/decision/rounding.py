@@ -31,7 +31,7 @@ STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 
 """Steps [rad or m] that values are rounded to; finer ones do no harm, wider ones are intended."""
 
 
-def rounded(problem: Problem) -> dict[str, float]:
+def rounded_joints(problem: Problem) -> dict[str, float]:
     """Return the joints whose values are multiples of a step [rad or m], with the step."""
     joints = np.concatenate([each.joints for each in problem.sets])
     steps = {name: _step(q) for name, q in zip(problem.chain.joint_names, joints.T, strict=True)}

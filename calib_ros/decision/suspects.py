@@ -21,10 +21,10 @@ from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.se3 import FloatArray
 
 Sets: TypeAlias = tuple[Observations, ...]
-Change: TypeAlias = Callable[[Observations], Observations]
+DataChange: TypeAlias = Callable[[Observations], Observations]
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
-ANGLES = (
+MIXED_UP_UNITS = (
     ('degrees', 'radians', 'deg', np.radians(1.0)),
     ('radians', 'degrees', 'rad', np.degrees(1.0)),
 )
@@ -47,7 +47,7 @@ class Suspect:
 
     what: str
     remedy: str
-    changes: tuple[Change, ...] = ()
+    changes: tuple[DataChange, ...] = ()
     rank: int = 1
     chain: Chain | None = None
     rows: int = 0
@@ -99,7 +99,7 @@ def _measured(found: Iterator[Suspect]) -> Iterator[Suspect]:
 
 def _of_places(chain: Chain) -> Iterator[Suspect]:
     """Yield mistakes of joint values and the arm."""
-    for one, other, unit, size in ANGLES:
+    for one, other, unit, size in MIXED_UP_UNITS:
         what = f'the joint values are in {one}, not {other}'
         change = _of_kind(chain, 'revolute', size)
         yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
@@ -162,7 +162,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     Only if all poses have an orientation, a camera on the flange may have measured them.
     """
     back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
-    ways: list[tuple[str, str, tuple[Change, ...], str]] = [
+    ways: list[tuple[str, str, tuple[DataChange, ...], str]] = [
         (
             'the quaternions are w x y z, not x y z w',
             '--quaternion wxyz',
@@ -284,7 +284,7 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
     turning = [k for k, joint in enumerate(chain.joints) if joint.type == 'revolute']
     for k in turning if len(turning) > 1 else ():
         name, column = chain.joint_names[k], f'q{k + 1}'
-        for one, others, _, size in ANGLES:
+        for one, others, _, size in MIXED_UP_UNITS:
             what = f'{name} is in {one}, the other joints in {others}'
             factor = np.ones(len(chain.joints))
             factor[k] = size
@@ -371,24 +371,24 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
             yield Suspect(what, remedy, rank=2, chain=arm, published=published)
 
 
-def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> Change:
+def _joints(matrix: FloatArray, shift: FloatArray | float = 0.0) -> DataChange:
     return lambda each: replace(each, joints=each.joints @ matrix.T + shift)
 
 
-def _of_kind(chain: Chain, kind: str, size: float) -> Change:
+def _of_kind(chain: Chain, kind: str, size: float) -> DataChange:
     return _joints(np.diag([size if joint.type == kind else 1.0 for joint in chain.joints]))
 
 
-def _lengths(chain: Chain, size: float) -> tuple[Change, Change]:
+def _lengths(chain: Chain, size: float) -> tuple[DataChange, DataChange]:
     """Return what `--length` changes: positions and the values of prismatic joints."""
     return _scaled(size), _of_kind(chain, 'prismatic', size)
 
 
-def _scaled(size: float) -> Change:
+def _scaled(size: float) -> DataChange:
     return lambda each: replace(each, positions=size * each.positions)
 
 
-def _with(turn: Turn) -> Change:
+def _with(turn: Turn) -> DataChange:
     return lambda each: replace(each, rotations=turn(each.rotations))
 
 

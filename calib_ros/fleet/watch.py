@@ -35,11 +35,11 @@ import numpy as np
 from scipy import special
 
 from calib_ros.decision.changes import (
-    Columns,
+    Effects,
     Explanation,
     Information,
     explanations,
-    likely,
+    likeliest,
     reason_in_words,
 )
 from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
@@ -177,9 +177,9 @@ def _cause(
     one, two = np.split(tests.chances[lag, k], [len(tests.joints)])
     if two.min(initial=1.0) < level * (one.min() if one.min() < level else 1.0):
         return lag, (), tests.groups[len(one) + int(two.argmin())]
-    columns = Columns(row.corrected(), tests.names)
+    columns = Effects(row.corrected(), tests.names)
     information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
-    return lag, likely(explanations(information, columns, float(tests.freedom[k]))), ()
+    return lag, likeliest(explanations(information, columns, float(tests.freedom[k]))), ()
 
 
 class _Tests(NamedTuple):

@@ -28,7 +28,7 @@ import numpy as np
 from scipy import linalg
 
 from calib_ros.decision import changes
-from calib_ros.decision.changes import Columns, Explanation, Information
+from calib_ros.decision.changes import Effects, Explanation, Information
 from calib_ros.errors import InputError
 from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.identifiability import structurally_independent
@@ -134,7 +134,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
         raise InputError('neither calibration fitted a parameter of the arm')
     square, lacking = _squares((first, second), names)
     freedom = min(first.freedom, second.freedom)
-    columns = Columns(chain, names)
+    columns = Effects(chain, names)
     left_over = _information(names, change, square)
     chance = _chance(left_over, freedom)
     beyond = _chance(_information(names, change, lacking), freedom)
@@ -142,7 +142,7 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
         changed.append(reasons)
         left_over = left_over.marginalised(columns.spread(reasons))
-    predicted = changes.predicted(chain, names)
+    predicted = changes.mean_square_change(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')
     squares = np.einsum('np,pq,nq->n', draws, predicted, draws, optimize=True)

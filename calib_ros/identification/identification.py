@@ -18,13 +18,13 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.decision import mistakes, plausibility
-from calib_ros.decision.acceptance import refusals, remarks
-from calib_ros.decision.comparison import Verdict, compare
+from calib_ros.decision.acceptance import oddities, refusals
+from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.decision.drift import chance_of_gain
 from calib_ros.decision.misfits import arms_own, lacking, outliers_of
 from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
-from calib_ros.decision.rounding import may_be_rounding, rounded, rounding_errors
+from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
 from calib_ros.decision.steps import find_step
 from calib_ros.decision.validation import validate
 from calib_ros.errors import InputError
@@ -85,7 +85,7 @@ def _identified(
     explained = simpler.validation.judged if simpler and simpler.validation else None
     progress(2 / 3)
     validation, validated_by = validate(fitted, before.chain, explained)
-    coarse = rounded(problem)
+    coarse = rounded_joints(problem)
     share = lacking(fitted)
     size, doubts = _size(fitted, share), rounding_errors(problem, coarse)
     more = considered(chain, names, problem.fixed)
@@ -119,7 +119,7 @@ def _identified(
         region=region,
         weak=_weak(problem, parameters),
         step=step,
-        remarks=remarks(problem, step, coarse),
+        remarks=oddities(problem, step, coarse),
         coupled=share > 0.0,
         images=sum(distinct(s.images) for s in problem.sets if s.pixels is not None),
     )
@@ -127,7 +127,7 @@ def _identified(
     rounding = may_be_rounding(fitted, before.chain, coarse)
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
     result = replace(result, refusals=refused)
-    named = mistakes.remarked(problem, result)
+    named = mistakes.with_mistake(problem, result)
     return plausibility.remarked(problem, named, another=named is result)
 
 
@@ -240,13 +240,13 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
 
 def _chosen(
     problem: Problem, geometric: Identification, progress: Notify
-) -> tuple[tuple[str, ...], tuple[Verdict, ...]]:
+) -> tuple[tuple[str, ...], tuple[GroupVerdict, ...]]:
     progress('effects')
     model = LinearModel(problem, geometric)
     groups = model.useful({name: effects.members(problem.chain, name) for name in effects.GROUPS})
     groups = {group: names for group, names in groups.items() if names}
     chosen: list[str] = []
-    verdicts: dict[str, Verdict] = {}
+    verdicts: dict[str, GroupVerdict] = {}
     while True:
         _choose_groups(model, groups, chosen, verdicts, progress)
         if not _choose_harmonics(model, chosen, verdicts, progress):
@@ -257,7 +257,7 @@ def _choose_groups(
     model: LinearModel,
     groups: Mapping[str, Sequence[str]],
     chosen: list[str],
-    verdicts: dict[str, Verdict],
+    verdicts: dict[str, GroupVerdict],
     progress: Notify,
 ) -> None:
     """Choose the best group as long as one pays; then what is left together, where that pays.
@@ -293,11 +293,11 @@ def _choose_groups(
 
 
 def _choose_harmonics(
-    model: LinearModel, chosen: list[str], verdicts: dict[str, Verdict], progress: Notify
+    model: LinearModel, chosen: list[str], verdicts: dict[str, GroupVerdict], progress: Notify
 ) -> bool:
     """Choose the strongest harmonics, or all, as long as they pay; tell whether any did."""
 
-    def added(verdict: Verdict, names: Sequence[str]) -> bool:
+    def added(verdict: GroupVerdict, names: Sequence[str]) -> bool:
         verdicts[verdict.what] = verdict
         if verdict.pays:
             chosen.extend(name for name in names if name not in chosen)

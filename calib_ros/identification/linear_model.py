@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 from scipy import linalg
 
-from calib_ros.decision.comparison import COUNTS, Verdict, log_gain
-from calib_ros.decision.drift import Columns, Shifts, chance
+from calib_ros.decision.comparison import COUNTS, GroupVerdict, log_gain
+from calib_ros.decision.drift import ShiftProducts, Shifts, chance
 from calib_ros.decision.result import Identification
 from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.identifiability import independent
@@ -95,7 +95,7 @@ class LinearModel:
         self._errors: dict[tuple[int, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
         self._sigmas: dict[str, float] = {}
-        self._seen: Columns | None = None
+        self._seen: ShiftProducts | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
         """Return the effects of each group that are independent of the geometric model."""
@@ -114,7 +114,7 @@ class LinearModel:
             found[group] = [name for name in seen if name not in known]
         return found
 
-    def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> Verdict:
+    def judge(self, chosen: Sequence[str], added: Sequence[str], what: str) -> GroupVerdict:
         """Compare held-out errors with and without `added` effects."""
         new = [name for name in added if name not in chosen]
         found, pays = [], True
@@ -126,9 +126,9 @@ class LinearModel:
             found += [1e3 * float(np.sqrt((e**2).sum(axis=1).mean())) for e in (before, after)]
         if pays and self._shifts is not None:
             pays = chance(self._shares(chosen, [new])[0]) < 1.0 - CERTAIN
-        return Verdict(what, found[0], found[1], bool(pays))
+        return GroupVerdict(what, found[0], found[1], bool(pays))
 
-    def quieten(self, verdict: Verdict) -> None:
+    def quieten(self, verdict: GroupVerdict) -> None:
         """Take what is left with chosen effects for the noise that priors are weighed against."""
         self._noise *= verdict.rms_mm_after / max(verdict.rms_mm_before, 1e-300)
         prior = self._system.prior

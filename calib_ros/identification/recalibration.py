@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from calib_ros.decision import changes, mistakes
-from calib_ros.decision.changes import SCALE_OF_DEVICE, Columns, Explanation, Information, root_of
+from calib_ros.decision.changes import SCALE_OF_DEVICE, Effects, Explanation, Information, root_of
 from calib_ros.decision.comparison import Comparison, residuals
 from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
@@ -141,13 +141,13 @@ def _recalibrated(
         arm = replace(arm, chain=minimise(arm.chain, seen, system).chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
-    columns = Columns(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
+    columns = Effects(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
     earlier, before = arm.changed(np.zeros(len(arm.names)), arm.square), arm.square
     found = arm.solved(system)
     while len(changed) < SEVERAL and (reasons := arm.reasons(found.information, columns)):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
-            columns = Columns(nominal, arm.names, movable)  # as much is usual
+            columns = Effects(nominal, arm.names, movable)  # as much is usual
             continue
         changed.append(reasons)
         arm = replace(arm, square=arm.square + columns.spread(reasons))
@@ -172,7 +172,7 @@ def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, 
 
     Over the joint range; `before` (P, P) are expected squares of the parameters' errors.
     """
-    positions = changes.predicted(arm.chain, arm.names)
+    positions = changes.mean_square_change(arm.chain, arm.names)
     squares = before, found.covariance, np.outer(found.change, found.change)
     first, second, moved = (float(np.sqrt(np.sum(positions * each))) for each in squares)
     return first, second, moved
@@ -261,7 +261,7 @@ class _Arm:
         """Return the covariance (P, P) of arm and device."""
         return self.square + self.device
 
-    def reasons(self, information: Information, columns: Columns) -> tuple[Explanation, ...]:
+    def reasons(self, information: Information, columns: Effects) -> tuple[Explanation, ...]:
         """Return what has changed; of possible device errors only another scale."""
         freedom = self.previous.freedom
         found = changes.reasons_of(information.marginalised(self.square), columns, freedom)

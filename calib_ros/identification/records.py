@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.decision.region import damaged, parse_rows, unpacked
+from calib_ros.decision.region import damaged, parse_rows, unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled
 from calib_ros.estimation.noise import Noise
@@ -211,7 +211,7 @@ class Record:
             return (), None, math.inf, lacking
         try:
             names = tuple(known['names'])
-            square = unpacked(known['root'], len(names))
+            square = unpacked_matrix(known['root'], len(names))
             freedom = math.inf if known['freedom'] is None else float(known['freedom'])
             ours = set(names) <= set(chain.parameter_names) and len(set(names)) == len(names)
             if 'unmodelled' in known:

@@ -9,7 +9,7 @@ import pytest
 from fits import SIGMAS, UR10E, measured_arm
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.acceptance import refusals, remarks
+from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
@@ -144,7 +144,7 @@ def test_a_gross_error_that_the_correction_makes_larger_by_chance_spoils_nothing
 )
 def test_a_chain_that_lists_the_wrong_axes_as_parallel_is_named(parallel, words):
     *_, seen = measured_arm(3, 30)
-    said = [*remarks(Problem(replace(UR10E, parallel=parallel), seen), None, {})]
+    said = [*oddities(Problem(replace(UR10E, parallel=parallel), seen), None, {})]
     assert bool(said) == bool(words)
     assert all(any(each in text for text in said) for each in words)
 

@@ -9,7 +9,7 @@ import pytest
 from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 
 from calib_ros.apply.simulation import measure, random_frame
-from calib_ros.decision.rounding import rounded, rounding_errors
+from calib_ros.decision.rounding import rounded_joints, rounding_errors
 from calib_ros.estimation.configurations import configurations
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
@@ -133,7 +133,7 @@ def test_what_rounding_gives_to_the_zero_of_a_joint(rng):
     q = UR10E.random_joints(40, rng)
     q[:, 1], q[:, 2] = np.round(q[:, 1], 3), np.repeat([0.0, 1e-3, 5e-3], [20, 10, 10])
     problem = Problem(UR10E, measure(UR10E, q, rng))
-    steps = rounded(problem)
+    steps = rounded_joints(problem)
     assert steps == {'shoulder_lift_joint': 1e-3, 'elbow_joint': 1e-3}
     one = 1e-3 / np.sqrt(12.0)
     assert rounding_errors(problem, steps) == pytest.approx(

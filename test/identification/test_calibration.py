@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.region import unpacked
+from calib_ros.decision.region import unpacked_matrix
 from calib_ros.errors import ConfigError
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.calibration import Calibration, load_calibration, parse_calibration
@@ -264,6 +264,6 @@ def test_a_large_error_of_the_nominal_chain_itself_was_judged_when_it_was_identi
 
 @pytest.mark.parametrize('rows', [['1', '2', '3 4 5'], ['1', '2 3', '4 5'], ['1', '2 3']])
 def test_rows_of_another_length_are_no_matrix(rows):
-    assert unpacked(['1', '2 3', '4 5 6'], 3).shape == (3, 3)
+    assert unpacked_matrix(['1', '2 3', '4 5 6'], 3).shape == (3, 3)
     with pytest.raises(ValueError, match=r'rows|zip|broadcast'):
-        unpacked(rows, 3)
+        unpacked_matrix(rows, 3)

@@ -13,7 +13,7 @@ from robots import DATA, needs_data
 from calib_ros import Calibration, Observations, Problem, difference, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import (
-    Columns,
+    Effects,
     Information,
     gauged,
     reason_in_words,
@@ -146,7 +146,7 @@ def test_reasons_of_one_effect_are_told_together():
     names = (Parameter('elbow_joint.theta'), Parameter('wrist_1_joint.theta'))
     matrix = np.full((2, 2), 1e10)
     information = Information(names, matrix, matrix @ (1e-3, 0.0))
-    told = reason_in_words(reasons_of(information, Columns(UR, names), 100.0))
+    told = reason_in_words(reasons_of(information, Effects(UR, names), 100.0))
     alike = [f'{name} by +1.000 ± 0.020 mrad (95 %)' for name in names]
     assert told == f'changed: {", indistinguishable from ".join(alike)}'
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fits import UR10E, measured_arm
 
-from calib_ros.decision.comparison import Verdict, log_gain
+from calib_ros.decision.comparison import GroupVerdict, log_gain
 from calib_ros.decision.drift import Shifts
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.problem import Learned, Problem
@@ -114,7 +114,7 @@ def test_what_is_left_with_chosen_effects_is_the_noise_from_then_on(model):
     """Priors of the arm and of effects are weighed against it."""
     told, sets, linear = model
     linear._left_out(0, FIRST)
-    linear.quieten(Verdict('', 1.0, 0.25, True))
+    linear.quieten(GroupVerdict('', 1.0, 0.25, True))
     sizes = {'elbow_joint.a': 3e-5, **dict.fromkeys(FIRST, 5e-4)}
     expected = left_out(told, sets, 0, [*NAMES, *FIRST], sizes, NOISE / 4.0)
     np.testing.assert_allclose(linear._left_out(0, FIRST), expected, rtol=0, atol=1e-9)

@@ -8,7 +8,7 @@ import pytest
 from fits import NOISE, SIGMAS, UR10E, rms
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.comparison import Verdict
+from calib_ros.decision.comparison import GroupVerdict
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
@@ -224,11 +224,11 @@ class Told:
         what = 'all' if what == EVERY else what
         self.tried.append((tuple(chosen), what))
         if names == self.harmonics:
-            return Verdict(what, 1.0, 0.5, self._all)
+            return GroupVerdict(what, 1.0, 0.5, self._all)
         gain = self._gains.get(what, 0.0)
         if self._hidden and self._hidden <= {*chosen, *names} and self._hidden & {*names}:
             gain = 0.75
-        return Verdict(what, 1.0, 1.0 - gain, gain > 0.0)
+        return GroupVerdict(what, 1.0, 1.0 - gain, gain > 0.0)
 
     def quieten(self, verdict):
         self.noise *= verdict.rms_mm_after
@@ -354,7 +354,7 @@ class Result:
 def test_a_richer_model_is_used_unless_it_is_worse(before, richer, reason, monkeypatch, rng):
     """And its work is told in shares: by the entries of all columns that are made."""
     problem = Problem(UR10E, measure(UR10E, UR10E.random_joints(3, rng), rng, *NOISE))
-    shares, verdicts = [], (Verdict('ratio', 1.0, 0.5, True),)
+    shares, verdicts = [], (GroupVerdict('ratio', 1.0, 0.5, True),)
 
     def identified(given, simpler=None, progress=None):
         assert (simpler is before) == bool(given.effects)

@@ -12,7 +12,7 @@ from plotly import graph_objects
 
 from calib_ros import Observations, Settings, identify, load_chain
 from calib_ros.apply.simulation import Camera, before_camera, photograph
-from calib_ros.decision.comparison import Verdict, compare
+from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.report.figures import against_noise, coverage, cumulated, drives, forest
@@ -96,9 +96,9 @@ def test_what_joints_do_beyond_the_model_is_told_in_all(solved, shown, across):
 
 def test_effects_are_compared_by_changes_in_their_order():
     verdicts = (
-        Verdict('ratio', 0.3, 0.3003, pays=False),
-        Verdict('eccentricity', 0.4, 0.3, pays=True),
-        Verdict('gravity', 0.5, 0.4, pays=True),
+        GroupVerdict('ratio', 0.3, 0.3003, pays=False),
+        GroupVerdict('eccentricity', 0.4, 0.3, pays=True),
+        GroupVerdict('gravity', 0.5, 0.4, pays=True),
     )
     problem = problem_of()
     page = page_of(report_of(problem, replace(identify(problem), verdicts=verdicts)))
