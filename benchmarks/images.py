@@ -25,7 +25,7 @@ from calib_ros.files.cameras import decoded
 from calib_ros.files.detector import Detector
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.pictures import Flaw
 
 LENS = Lens(1350.0, 1350.0, 800.0, 600.0)
 SIZE = (1600, 1200)
@@ -85,7 +85,7 @@ def judged(look, pictures):
     taken = (time.process_time() - begin) / len(pictures)
     away = [np.zeros((0, 2))]
     for found, (_, exact) in zip(seen, pictures, strict=True):
-        if not isinstance(found, Refusal) and found[0] is not None:
+        if not isinstance(found, Flaw) and found[0] is not None:
             away.append(np.reshape(found[1], (-1, 2)) - exact[np.ravel(found[0])])
     off = np.concatenate(away)
     off -= np.round(2.0 * np.median(off, axis=0)) / 2.0  # half a pixel before OpenCV 5

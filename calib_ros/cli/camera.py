@@ -16,7 +16,7 @@ from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
 from calib_ros.files.cameras import SUFFIXES, files_of, image_of, read_image
 from calib_ros.files.detector import Image, black_of, detect
-from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.pictures import Flaw
 from calib_ros.texts import dump_yaml
 
 
@@ -52,7 +52,7 @@ def _images(options: argparse.Namespace, screen: Screen) -> int:
     return 0
 
 
-def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image | Refusal]]:
+def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Image | Flaw]]:
     if not options.images.exists():
         raise InputError(f'there is nothing at {options.images}')
     folder = options.images.is_dir()

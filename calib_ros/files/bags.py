@@ -20,7 +20,7 @@ from calib_ros.sampling.account import ALLOW, Account, allowing, too_much_lost
 from calib_ros.sampling.batches import Deserialise, Stream, batches, feed, links_of
 from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose
+from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose_topics
 
 if TYPE_CHECKING:
     from rosbags.interfaces import MessageDefinition
@@ -164,7 +164,7 @@ def _chosen(
 ) -> tuple[dict[str, Stream], Deserialise]:
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
     recorded = Recorded(available, _decodable(messages_on), _deserialiser(defined))
-    streams = choose(recorded, session.settings)
+    streams = choose_topics(recorded, session.settings)
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
             raise InputError(

@@ -19,7 +19,7 @@ from calib_ros.files.boards import lens_of, read_board
 from calib_ros.files.detector import Detector, Image, opencv
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.sample import View
 from calib_ros.sampling.sources import Source, parse_sources
 
@@ -39,7 +39,7 @@ class BoardCamera:
         self._board = read_board(given_path(source.board))
         self._detector = Detector(self._board)
         reason = 'no CameraInfo of it has come'
-        self._lens: Lens | Refusal = Refusal('before any CameraInfo', reason)
+        self._lens: Lens | Flaw = Flaw('before any CameraInfo', reason)
         self._size = (0, 0)
 
     def learn(self, info: Any) -> None:
@@ -48,22 +48,22 @@ class BoardCamera:
         try:
             self._lens = replace(lens_in(info), fixed=self._source.lens == 'given')
         except CalibrationError as err:
-            self._lens = Refusal('whose CameraInfo cannot be used', str(err))
+            self._lens = Flaw('whose CameraInfo cannot be used', str(err))
 
-    def look(self, message: Any) -> View | Refusal:
+    def look(self, message: Any) -> View | Flaw:
         """Return the corners in an Image or CompressedImage, or why it is not used."""
         lens = self._lens
-        if isinstance(lens, Refusal):
+        if isinstance(lens, Flaw):
             return lens
         image = image_of(message)
-        if isinstance(image, Refusal):
+        if isinstance(image, Flaw):
             return image
         if image.size and all(self._size) and image.shape != self._size:
             sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, self._size))
             reason = f'it and its CameraInfo are of {sizes} px: set both alike'
-            return Refusal('of another size than its CameraInfo', reason)
+            return Flaw('of another size than its CameraInfo', reason)
         found = self._detector.of(image)
-        if isinstance(found, Refusal):
+        if isinstance(found, Flaw):
             return found
         number, pixels = found
         return View(self._board.corners[number], np.round(pixels, 4), lens)  # as in a table
@@ -92,7 +92,7 @@ def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
     return {source.topic: BoardCamera(source) for source in sources}
 
 
-def image_of(message: Any) -> Image | Refusal:
+def image_of(message: Any) -> Image | Flaw:
     """Return a sensor_msgs/Image or CompressedImage in grey, or why it cannot be decoded."""
     data = np.frombuffer(message.data, dtype=np.uint8)
     if hasattr(message, 'format'):
@@ -100,7 +100,7 @@ def image_of(message: Any) -> Image | Refusal:
     try:
         return grey(data, message.height, message.width, message.step, message.encoding)
     except CalibrationError as err:
-        return Refusal('that cannot be decoded', str(err))
+        return Flaw('that cannot be decoded', str(err))
 
 
 def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: str) -> Image:
@@ -127,16 +127,16 @@ def files_of(folder: Path) -> list[Path]:
     return sorted(paths, key=lambda path: (len(path.name), path.name))
 
 
-def read_image(path: Path) -> Image | Refusal:
+def read_image(path: Path) -> Image | Flaw:
     """Return an image in grey, empty if it is none, or why it cannot be read."""
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # reading a pipe may never end
-            return Refusal('that cannot be read', 'it is not a file')
+            return Flaw('that cannot be read', 'it is not a file')
         if path.stat().st_size > LARGEST_IMAGE:
-            return Refusal('that cannot be read', f'it has more than {LARGEST_IMAGE / 1e6:.0f} MB')
+            return Flaw('that cannot be read', f'it has more than {LARGEST_IMAGE / 1e6:.0f} MB')
         return decoded(np.frombuffer(path.read_bytes(), dtype=np.uint8))
     except OSError as err:
-        return Refusal('that cannot be read', f'it cannot be read: {err.strerror}')
+        return Flaw('that cannot be read', f'it cannot be read: {err.strerror}')
 
 
 def decoded(data: NDArray[np.uint8]) -> Image:

@@ -19,7 +19,7 @@ from calib_ros.errors import ConfigError, InputError, UnknownNameError
 from calib_ros.files.boards import Board, Detections
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
-from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.pictures import Flaw
 from calib_ros.settings import EXCEPTION
 
 Image = NDArray[np.uint8]  # grey
@@ -115,28 +115,28 @@ class Detector:
             self._parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._corners = self._charuco() if board.type == 'charuco' else _of_markers
 
-    def of(self, image: Image) -> Corners | Refusal:
+    def of(self, image: Image) -> Corners | Flaw:
         """Return numbers (K,) and pixels (K, 2) of the corners, or why the image is not used."""
         if not image.size:
-            return Refusal('that cannot be decoded', 'OpenCV cannot read this image')
+            return Flaw('that cannot be decoded', 'OpenCV cannot read this image')
         width = _edge_width(self._cv2, image)
         if width > 8.0:
-            return Refusal('blurred', f'it is blurred: its sharpest edges are {width:.0f} px wide')
+            return Flaw('blurred', f'it is blurred: its sharpest edges are {width:.0f} px wide')
         corners, ids = self._sought(image)
         found = self._judged(image, corners, ids)
-        if not isinstance(found, Refusal):
+        if not isinstance(found, Flaw):
             return found
         coarse = image if len(ids) else self._halved(image, _halvings(image))
         corners, ids = self._markers(coarse, self._dictionary)
         if not len(ids):
             reason = f'it shows no marker of {self._board.dictionary}{self._others(coarse)}'
-            return Refusal('without the board', reason)
+            return Flaw('without the board', reason)
         own = ids < self._count
         if (~own).sum() > len(ids) // 2:
             reason = (
                 f'it shows another board: marker {int(ids[~own][0])}, and this board has 0 to '
             )
-            return Refusal('of another board', f'{reason}{self._count - 1}')
+            return Flaw('of another board', f'{reason}{self._count - 1}')
         return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:
@@ -181,7 +181,7 @@ class Detector:
         first = np.maximum(box.min(axis=0) - margin, 0).astype(np.intp)
         return others[inside], first, np.minimum(box.max(axis=0) + margin, size).astype(np.intp)
 
-    def _judged(self, image: Image, corners: FloatArray, ids: Index) -> Corners | Refusal:
+    def _judged(self, image: Image, corners: FloatArray, ids: Index) -> Corners | Flaw:
         number, pixels = self._corners(image, corners, ids)
         few = len(number) < self._fewest
         if few:  # markers may still tell that it is another board
@@ -192,14 +192,14 @@ class Detector:
         apart = np.inf if placed is None else np.linalg.norm(placed - seen, axis=1).max(initial=0)
         # lens and board may bend it by half a refinement window, or 10 %
         if apart > max(0.5 * WIDEST, EXCEPTION * self._spacing(points, seen)):
-            return Refusal(
+            return Flaw(
                 'whose corners do not fit the board',
                 f'its {"markers" if few else "corners"} do not fit the board ({apart:.0f} px '
                 'off): are type, columns, rows, square, marker and legacy those of this board, '
                 'and is it flat?',
             )
         if few:
-            return Refusal(
+            return Flaw(
                 'with too little of the board',
                 f'it shows {len(number)} of the {len(self._board.corners)} corners, fewer than '
                 f'{self._fewest}, and {len(ids)} markers: is only part of the board visible, or '
@@ -310,7 +310,7 @@ class Detector:
 
 
 def detect(
-    images: Iterable[tuple[str, Image | Refusal]],
+    images: Iterable[tuple[str, Image | Flaw]],
     board: Board,
     fewest: int = FEWEST,
     report: Callable[[str], None] = lambda line: None,
@@ -328,11 +328,11 @@ def detect(
         report(f'{name}: not used, {reason}')
 
     for name, picture in images:
-        if isinstance(picture, Refusal):
+        if isinstance(picture, Flaw):
             refuse(name, picture.reason)
             continue
         found = detector.of(picture)
-        if isinstance(found, Refusal):
+        if isinstance(found, Flaw):
             refuse(name, found.reason)
             continue
         report(f'{name}: {len(found[0])} corners')

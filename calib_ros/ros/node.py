@@ -46,7 +46,7 @@ from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
 from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
 from calib_ros.ros.to_ros import LATCHED
-from calib_ros.sampling.batches import Stream, feed, measured
+from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.dataset import check_settings
 from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sample import Sample, socket_place
@@ -198,7 +198,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
             Stream(topic, JOINT_STATE) for topic in settings.joint_topics or ('joint_states',)
         ]
         sources = parse_sources(settings.sources) or STANDARD
-        return streams + measured(
+        return streams + source_streams(
             sources, {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
         )
 

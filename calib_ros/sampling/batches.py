@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from calib_ros.kinematics.se3 import FloatArray, Index
-from calib_ros.sampling.cdr import alike, head
+from calib_ros.sampling.cdr import alike, read_header
 from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
@@ -47,7 +47,7 @@ OF_CAMERAS = (*PICTURES, CAMERA_INFO)
 Deserialise: TypeAlias = Callable[[Any, str], Any]  # converts bytes and a type to a message
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and their messages, serialised or not, in order of arrival."""
-Row: TypeAlias = tuple[int, int, FloatArray]  # place, stamp [ns] and numbers of one message
+MessageRow: TypeAlias = tuple[int, int, FloatArray]  # place, stamp [ns] and numbers of one message
 Decoded: TypeAlias = (
     'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
 )
@@ -73,7 +73,7 @@ class Stream:
         return self.links is not None and self.topic != self.links.topic
 
 
-def measured(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream]:
+def source_streams(sources: Sequence[Source], types: Mapping[str, str]) -> list[Stream]:
     """Return the streams of sources; `types` (by topic) apply where they name none."""
     streams = []
     linked: dict[tuple[str, str], list[Source]] = {}
@@ -203,7 +203,7 @@ class DecodedBatch:
                 pictures.cameras[source.topic].learn(message())
                 return
             serialised = isinstance(data, bytes)
-            stamp_ns, frame_id = head(data) if serialised else head_of(message())
+            stamp_ns, frame_id = read_header(data) if serialised else head_of(message())
         except Exception as err:  # damaged bytes fail in many ways
             self.problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
             return
@@ -213,7 +213,7 @@ class DecodedBatch:
         self._add(source, stream.type, np.array([place]), found)
 
     def _decode(self, places: Sequence[int]) -> Iterator[Decoded]:
-        alike: dict[tuple[Stream, tuple[str, ...], int], list[Row]] = {}
+        alike: dict[tuple[Stream, tuple[str, ...], int], list[MessageRow]] = {}
         for place in places:
             stream, data = self._batch[place]
             try:

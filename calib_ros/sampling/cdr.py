@@ -49,7 +49,7 @@ class Item(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class MessageLayout:
     """Offsets in messages of one kind."""
 
     items: tuple[Item, ...]
@@ -72,7 +72,7 @@ class Layout:
 class Alike:
     """Messages of one layout: their indices in a batch, and their bytes (N, ...)."""
 
-    layout: Layout
+    layout: MessageLayout
     which: Index
     rows: NDArray[np.uint8]
 
@@ -90,7 +90,7 @@ class Alike:
         return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
 
 
-def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> list[Alike]:
+def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]) -> list[Alike]:
     """Return messages of one type and length grouped by layout, without those that have none.
 
     Layouts `known` by message length are reused, and new ones added, up to MOST_NAMES.
@@ -125,7 +125,7 @@ def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[Layout]]) -> 
     return found
 
 
-def _layout(kind: str, blob: bytes) -> Layout:
+def _layout(kind: str, blob: bytes) -> MessageLayout:
     """Return the layout of a message, or raise struct.error."""
     texts, between, numbers, count = _FORMS[kind]
     read = _Reader(blob)
@@ -149,7 +149,7 @@ def _layout(kind: str, blob: bytes) -> Layout:
     for part in read.named:
         mask[part] = 255
     text = np.frombuffer(blob, dtype=np.uint8)[: len(mask)]
-    return Layout(tuple(items), read.named[0].start, text, mask, read.named[-1])
+    return MessageLayout(tuple(items), read.named[0].start, text, mask, read.named[-1])
 
 
 class _Reader:
@@ -179,7 +179,7 @@ class _Reader:
         return self._blob[begin : begin + max(length - 1, 0)].decode()
 
 
-def head(blob: bytes) -> tuple[int, str]:
+def read_header(blob: bytes) -> tuple[int, str]:
     """Return stamp [ns] and frame of a serialised message that begins with a header."""
     read = _Reader(blob)
     return read.stamp(), read.string()

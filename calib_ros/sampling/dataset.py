@@ -55,7 +55,7 @@ def collect(
     return tuple(sets[0]), tuple(sets[1])
 
 
-def lenses(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
+def lenses_by_frame(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
     """Return the lens at each camera frame, which must not change."""
     found: dict[str, Lens] = {}
     for sample in samples:
@@ -176,5 +176,5 @@ def dataset_of(
     frames = Frames()
     fitted, held_out = collect(samples, sigmas, frames, posed, observed)
     pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
-    cameras = {} if posed else lenses(samples, frames)
+    cameras = {} if posed else lenses_by_frame(samples, frames)
     return Dataset(fitted, held_out, pairs, world_frame, cameras, frames.owners)

@@ -22,8 +22,8 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.collector import Collector
-from calib_ros.sampling.hints import Hint, ambiguous, disagreement, moved, stuck
-from calib_ros.sampling.sampler import POSITION, QUAT
+from calib_ros.sampling.hints import Hint, ambiguous, clocks_moved, disagreement, stuck
+from calib_ros.sampling.sampler import POSITION_SLICE, QUAT_SLICE
 from calib_ros.sampling.slices import JOINTS, Piece, Series, Slice, Stamps, StreamKey
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import NAMED
@@ -277,7 +277,7 @@ class Clocks:
 
     def _moves_much(self, rows: Rows) -> bool:
         """Tell whether a target moves by more than errors are."""
-        places = rows.values[:, POSITION]
+        places = rows.values[:, POSITION_SLICE]
         far = np.linalg.norm(places - np.median(places, axis=0), axis=1)
         return bool(np.median(far) > self.settings.largest_error)
 
@@ -304,9 +304,9 @@ class Clocks:
         """
         found = []
         for stamps, rows in streams:
-            oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT]).any()
-            turns = se3.from_quat(rows[:, QUAT]) if oriented else None
-            positions, max_gap = rows[:, POSITION], self.settings.max_gap
+            oriented = len(rows) > 0 and not np.isnan(rows[:, QUAT_SLICE]).any()
+            turns = se3.from_quat(rows[:, QUAT_SLICE]) if oriented else None
+            positions, max_gap = rows[:, POSITION_SLICE], self.settings.max_gap
             delay = find_delay(self._chain, *joints, stamps, positions, turns, max_gap)
             found += [] if delay is None else [delay]
         return max(found, key=lambda delay: (not delay.rivals, delay.correlation), default=None)
@@ -316,7 +316,7 @@ class Clocks:
         found = []
         delay, known = self.delay, self.settings.delay
         if self._moves:
-            found.append(moved(self._moves))
+            found.append(clocks_moved(self._moves))
         elif delay is not None and not self._continuous and self._spoils(delay.seconds):
             found.append(disagreement(delay.seconds, known))  # in motion it is fitted
         unclear = self._found if self._continuous else self._unclear

@@ -165,7 +165,7 @@ def ambiguous(delays: Sequence[float]) -> Hint:
     )
 
 
-def moved(steps: Collection[tuple[float, int]]) -> Hint:
+def clocks_moved(steps: Collection[tuple[float, int]]) -> Hint:
     """Report shifts of the clocks [s], and after how many samples."""
     words = ', '.join(f'by {seconds:+.3f} s after about {count}' for seconds, count in steps)
     return Hint(

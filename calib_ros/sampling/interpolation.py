@@ -11,8 +11,6 @@ from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.slices import Stamps
 
-MOVED = STILL  # change of a value [rad or m] that counts as a move
-
 
 def interpolated(
     rows: Rows, stamps: Stamps, first: Index, last: Index, revolute: Flags, straight: bool
@@ -85,7 +83,7 @@ def last_moves(
     """
     path = continuous(values, revolute)
     now = path[first] + unwrapped(now - path[first], revolute)
-    last = _last_outside(path, first, now - MOVED, now + MOVED)
+    last = _last_outside(path, first, now - STILL, now + STILL)
     signs = np.sign(now - np.take_along_axis(path, last, axis=0))
     return np.asarray(np.where(last >= 0, signs, earlier))
 

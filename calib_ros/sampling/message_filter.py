@@ -12,12 +12,12 @@ import numpy as np
 
 from calib_ros.kinematics.se3 import Index
 from calib_ros.sampling.messages import JOINT_STATE, Readings, usable
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Columns, Piece, StreamKey
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, JointIndices, Piece, StreamKey
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
 from calib_ros.values import MOST_NAMES
 
-Layout: TypeAlias = tuple[Columns, Index]
+JointLayout: TypeAlias = tuple[JointIndices, Index]
 OTHERS = 'none of the joints in the message'
 NOWHERE = -1  # column of a joint that needs no name
 
@@ -31,12 +31,12 @@ class JointNames:
 
     def __init__(self, names: Sequence[str], held: Mapping[int, float] | None = None) -> None:
         self._names, self.held = names, held or {}
-        self._layouts: dict[tuple[str, ...], Layout] = {}
+        self._layouts: dict[tuple[str, ...], JointLayout] = {}
         self.foreign: tuple[str, ...] = ()
         """Names received if some of the chain's joints are never named."""
         self.never: tuple[str, ...] = ()  # these joints
 
-    def layout(self, key: tuple[str, ...]) -> Layout:
+    def layout(self, key: tuple[str, ...]) -> JointLayout:
         """Return the joints of the chain in messages, and the columns of their values.
 
         Of held joints that are not named the column is NOWHERE.

@@ -30,20 +30,20 @@ MOST_BYTES = 5 * LARGEST_TABLE
 MOST_WAITING = 4  # images that may wait for processing; further ones are dropped
 
 
-class Refusal(NamedTuple):
+class Flaw(NamedTuple):
     """Why an image is not used: its kind, and what was found in it."""
 
     cause: str
     reason: str
 
 
-class Camera(Protocol):
+class BoardFinder(Protocol):
     """A board detector for images."""
 
     def learn(self, info: Any) -> None:
         """Take a CameraInfo."""
 
-    def look(self, message: Any) -> View | Refusal:
+    def look(self, message: Any) -> View | Flaw:
         """Return the corners in an Image or CompressedImage."""
 
 
@@ -52,7 +52,7 @@ class Pictures:
 
     def __init__(self, sigma: Callable[[], float]) -> None:
         self._sigma = sigma
-        self.cameras: Mapping[str, Camera] = {}  # detectors by topic
+        self.cameras: Mapping[str, BoardFinder] = {}  # detectors by topic
         self._pool = ThreadPoolExecutor(1, 'images')
         self._last = 0
         self.patient = False
@@ -62,7 +62,7 @@ class Pictures:
     def clear(self) -> None:
         """Forget all images and counts."""
         self._kept: dict[int, tuple[str, int, Callable[[], Any]]] = {}
-        self._queue: deque[tuple[Sample, Future[Sample | Refusal] | None]] = deque()
+        self._queue: deque[tuple[Sample, Future[Sample | Flaw] | None]] = deque()
         self.dropped: Counter[str] = Counter()  # unused images by cause
         self.refused = ''  # why the last image is not used; empty if it is
         self.reason = ''  # why the last of those dropped is not used
@@ -94,20 +94,20 @@ class Pictures:
         found: list[Sample] = []
         while self._queue:
             sample, looked = self._queue[0]
-            result: Sample | Refusal = sample
+            result: Sample | Flaw = sample
             if looked is not None:
                 if not (wait or looked.done()):
                     break
                 result, self.refused = looked.result(), ''
             self._queue.popleft()
-            if isinstance(result, Refusal):
+            if isinstance(result, Flaw):
                 self.refused = self.reason = result.reason
                 self.dropped[f'measurements: image {result.cause}'] += sample.count
             else:
                 found.append(result)
         return found
 
-    def _begin(self, sample: Sample) -> Future[Sample | Refusal] | None:
+    def _begin(self, sample: Sample) -> Future[Sample | Flaw] | None:
         waiting = [looked for _, looked in self._queue if looked is not None]
         busy = [looked for looked in waiting if not looked.done()]
         if len(busy) >= MOST_WAITING:
@@ -127,22 +127,22 @@ class Pictures:
 
     def _look(
         self, sample: Sample, topic: str, size: int, message: Callable[[], Any]
-    ) -> Sample | Refusal:
+    ) -> Sample | Flaw:
         """Return the sample of an image; runs on the thread."""
         try:
             view = self.cameras[topic].look(message())
-            return view if isinstance(view, Refusal) else self._posed(sample, view)
+            return view if isinstance(view, Flaw) else self._posed(sample, view)
         except Exception as err:  # damaged bytes fail in many ways
-            return Refusal('that cannot be decoded', f'it cannot be decoded: {err!r}')
+            return Flaw('that cannot be decoded', f'it cannot be decoded: {err!r}')
 
-    def _posed(self, sample: Sample, view: View) -> Sample | Refusal:
+    def _posed(self, sample: Sample, view: View) -> Sample | Flaw:
         index = np.zeros(len(view.pixels), dtype=np.intp)
         joints = np.repeat(sample.joints[np.newaxis], len(index), axis=0)
         seen = Observations.from_pixels(joints, view.pixels, view.points, index)
         try:
             found = board_poses(seen, view.lens)
         except InputError as err:
-            return Refusal('that tells no pose of the board', str(err))
+            return Flaw('that tells no pose of the board', str(err))
         pose = se3.transform(found.rotations, found.positions)
         return replace(
             sample,

@@ -21,9 +21,9 @@ from calib_ros.sampling.slices import Stamps, StreamKey
 from calib_ros.sampling.stops import averages, mean_of_each
 from calib_ros.sampling.track import Motion
 
-DISTANCE, POSITION = slice(0, 1), slice(0, 3)
-QUAT, COVARIANCE = slice(3, 7), slice(7, 43)
-ROW_WIDTH = COVARIANCE.stop
+DISTANCE_SLICE, POSITION_SLICE = slice(0, 1), slice(0, 3)
+QUAT_SLICE, COVARIANCE_SLICE = slice(3, 7), slice(7, 43)
+ROW_WIDTH = COVARIANCE_SLICE.stop
 Numbered: TypeAlias = tuple[int, Sample]  # A sample with the number of its round or stop
 VIBRATING = 'measurements: still vibrating, or a spike'
 RESTLESS = 'measurements: a stop with more spread than noise'
@@ -72,11 +72,11 @@ class Sampler:
         if key.images:
             yield from self._of_images(found, motion, begins, approach, delay)
             return
-        turned = ~np.isnan(values[:, QUAT]).any(axis=1)
-        positions = values[:, DISTANCE if key.distance else POSITION]
+        turned = ~np.isnan(values[:, QUAT_SLICE]).any(axis=1)
+        positions = values[:, DISTANCE_SLICE if key.distance else POSITION_SLICE]
         means = averages(positions, begins, _sigmas(values, begins, sigma))
         rotations = np.tile(np.eye(3), (len(values), 1, 1))
-        rotations[turned] = se3.from_quat(values[turned, QUAT])
+        rotations[turned] = se3.from_quat(values[turned, QUAT_SLICE])
         oriented = np.logical_and.reduceat(turned, begins).tolist()
         if motion.velocity is None:  # the chordal mean (Moakher 2002)
             rotations = se3.nearest_rotation(mean_of_each(rotations, begins, means.used))
@@ -177,8 +177,8 @@ class Sampler:
             return
         known[stamp_ns] = joints
         covariance = None
-        if not np.isnan(rows[:, COVARIANCE]).any():
-            covariance = rows[:, COVARIANCE].mean(axis=0).reshape(6, 6)
+        if not np.isnan(rows[:, COVARIANCE_SLICE]).any():
+            covariance = rows[:, COVARIANCE_SLICE].mean(axis=0).reshape(6, 6)
         sample = Sample(
             stamp_ns=stamp_ns,
             joints=joints,
@@ -231,7 +231,7 @@ class Sampler:
 
 def _sigmas(values: FloatArray, begins: Index, sigma: float) -> FloatArray:
     """Return the sigmas (S,) [m] of stops by their covariances, `sigma` if one is missing."""
-    own = values[:, COVARIANCE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
+    own = values[:, COVARIANCE_SLICE].reshape(-1, 6, 6)[:, range(3), range(3)].mean(axis=1)
     variances = np.add.reduceat(own, begins) / np.diff(begins, append=len(values))
     return np.where(np.isnan(variances), sigma, np.sqrt(variances))
 

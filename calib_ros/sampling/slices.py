@@ -44,13 +44,13 @@ class StreamKey(NamedTuple):
         return not (self.distance or self.eye_in_hand or self.images)
 
 
-Columns: TypeAlias = tuple[int, ...]  # indices of the chain's joints that a message names
+JointIndices: TypeAlias = tuple[int, ...]  # indices of the chain's joints that a message names
 
 
 class Piece(NamedTuple):
     """Messages of one stream: places (N,) in order of arrival, stamps (N,), numbers (N, w)."""
 
-    key: Columns | StreamKey
+    key: JointIndices | StreamKey
     places: Index
     stamps: Stamps
     numbers: FloatArray

@@ -21,7 +21,7 @@ from calib_ros.sampling.messages import (
 
 VALIDATION = 'validation_'
 """Prefix of topics whose measurements judge the result and are never fitted."""
-DISTANCE = 'distance'  # default device of distances: their origin is not that of a tracker
+RANGEFINDER = 'distance'  # default device of distances: their origin is not that of a tracker
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ STANDARD = (
     Source('measured_point', 'geometry_msgs/msg/PointStamped'),
     Source('measured_transform', 'geometry_msgs/msg/TransformStamped'),
     Source('measured_odometry', 'nav_msgs/msg/Odometry'),
-    Source('measured_distance', 'sensor_msgs/msg/Range', device=DISTANCE),
+    Source('measured_distance', 'sensor_msgs/msg/Range', device=RANGEFINDER),
     Source('validation_pose', 'geometry_msgs/msg/PoseStamped', validation=True),
     Source('validation_point', 'geometry_msgs/msg/PointStamped', validation=True),
 )
@@ -104,8 +104,8 @@ def parse_source(text: str) -> Source:
     values: dict[str, Any] = {'validation': topic.rpartition('/')[2].startswith(VALIDATION)}
     for pair in pairs:
         key, equals, value = pair.partition('=')
-        if not equals or key not in KEYS:
-            raise UnknownNameError(f'key of source "{text}"', key, KEYS)
+        if not equals or key not in SOURCE_KEYS:
+            raise UnknownNameError(f'key of source "{text}"', key, SOURCE_KEYS)
         if key in ('eye_in_hand', 'validation'):
             if value not in ('true', 'false'):
                 raise ConfigError(f'{key} of source "{text}" must be true or false, not "{value}"')
@@ -120,11 +120,11 @@ def parse_source(text: str) -> Source:
     if 'board' in values:
         values.setdefault('type', PICTURES[topic.endswith('/compressed')])
     if values.get('type', '').endswith('/Range'):
-        values['device'] = values.get('device') or DISTANCE
+        values['device'] = values.get('device') or RANGEFINDER
     return Source(topic, **values)
 
 
-KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
+SOURCE_KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
 
 
 def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from calib_ros.errors import InputError
-from calib_ros.sampling.batches import DecodedBatch, Deserialise, Stream, batches, measured
+from calib_ros.sampling.batches import DecodedBatch, Deserialise, Stream, batches, source_streams
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
     DECODERS,
@@ -41,7 +41,7 @@ class Recorded(NamedTuple):
     deserialise: Deserialise
 
 
-def choose(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
+def choose_topics(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     """Choose topics by type from those available, unless named in the settings.
 
     Raises InputError with the candidates if there is none, or more than one.
@@ -72,7 +72,7 @@ def choose(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     if all(source.validation for source in sources):
         error = _no_topic('pose topic', tuple(DECODERS), available)
         raise InputError('; '.join([str(error), *_others(recorded)]))
-    streams = [Stream(topic, JOINT_STATE) for topic in joints] + measured(sources, available)
+    streams = [Stream(topic, JOINT_STATE) for topic in joints] + source_streams(sources, available)
     chosen = {stream.topic: stream for stream in streams if stream.topic in available}
     still = {topic: stream for topic, stream in chosen.items() if stream.still}
     if still:  # read first: measurements must not wait for it

@@ -23,7 +23,7 @@ from calib_ros.sampling.stops import MOST_SPREAD
 LOOKS_BACK = FEW  # samples in the window that the present one is compared with
 
 
-def standing(
+def standing_intervals(
     stamps: Stamps, values: FloatArray, still: float, window_ns: int, max_gap_ns: int
 ) -> Stamps:
     """Return the intervals (K, 2) in which the joints of one publisher stood."""
@@ -211,7 +211,7 @@ class Track:
         several publishers of a joint, one must show that, and none that was received the contrary.
         """
         stands = {
-            columns: standing(
+            columns: standing_intervals(
                 rows.stamps,
                 continuous(rows.values, self._revolute[list(columns)]),
                 still,

@@ -21,7 +21,7 @@ import numpy as np
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray, Index
-from calib_ros.sampling.cdr import Layout
+from calib_ros.sampling.cdr import MessageLayout
 from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, short_type, usable
 from calib_ros.sampling.sources import Source
@@ -89,7 +89,7 @@ class Links:
         self._known = False  # whether the routes are up to date
         self._wanted: set[Pair] = set()
         self._open = True  # whether a source's frames are not linked yet
-        self.layouts: dict[int, list[Layout]] = {}  # layouts by message length
+        self.layouts: dict[int, list[MessageLayout]] = {}  # layouts by message length
         self._held: deque[tuple[Pair, Readings]] = deque()
         self._let_go: Counter[Pair] = Counter()
 

@@ -23,7 +23,7 @@ from calib_ros.files.detector import Detector, detect
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
-from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.pictures import Flaw
 
 cv2 = pytest.importorskip('cv2')
 from photographs import CHARUCO, rendered
@@ -72,7 +72,7 @@ def test_images_are_refused_with_the_reason():
     ]
     for detector, picture, reason in cases:
         found = detector.of(picture)
-        assert isinstance(found, Refusal), reason
+        assert isinstance(found, Flaw), reason
         assert re.search(reason, found.reason), found
 
 
@@ -128,7 +128,7 @@ def test_what_cannot_be_read_is_not_used(tmp_path):
     gone = ('gone', 'No such file')
     for name, reason in (huge, ('folder', other), ('pipe', other), gone):
         found = read_image(tmp_path / f'{name}.png')
-        assert isinstance(found, Refusal)
+        assert isinstance(found, Flaw)
         assert reason in found.reason
     found, unused = detect([('a', found), ('b', photograph(CHARUCO)[0])], CHARUCO)
     assert (found.names, unused) == (('b',), 1)

@@ -31,9 +31,9 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling import pictures
-from calib_ros.sampling.batches import Stream, feed, measured
+from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
-from calib_ros.sampling.pictures import Refusal
+from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.settings import Settings
@@ -122,7 +122,7 @@ def rooted(given):
 
 
 def streams_of(given):
-    streams = {each.topic: each for each in measured(parse_sources(given), {})}
+    streams = {each.topic: each for each in source_streams(parse_sources(given), {})}
     return {**streams, 'joint_states': Stream('joint_states', JOINT_STATE)}
 
 
@@ -175,7 +175,7 @@ def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
         info = cell.publisher(CameraInfo, 'cam/camera_info')
         info.publish(played.pop('cam/camera_info')[0])
         camera = live.pictures.cameras[TOPICS[Image]]
-        cell.spin_until(lambda: not isinstance(camera._lens, Refusal))
+        cell.spin_until(lambda: not isinstance(camera._lens, Flaw))
         cell.play(played)
         answer = cell.call('identify')
         assert_same(wanted, live.problem().observations)
@@ -214,7 +214,7 @@ class Slow:
 
     def look(self, message):
         assert self.go_on.wait(PATIENCE)
-        return Refusal('blurred', 'it is blurred')
+        return Flaw('blurred', 'it is blurred')
 
 
 def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_nothing(shift, board):
@@ -276,10 +276,10 @@ def test_an_image_that_does_not_fit_its_camera_info_is_refused(shift, board):
     camera.learn(CameraInfo())
     assert 'not calibrated' in camera.look(image).reason
     camera.learn(info)
-    assert not isinstance(camera.look(image), Refusal)
+    assert not isinstance(camera.look(image), Flaw)
     info.width, info.height = 640, 480
     camera.learn(info)
-    assert not isinstance(camera.look(image), Refusal)
+    assert not isinstance(camera.look(image), Flaw)
     info.width, info.height = 1280, 960
     camera.learn(info)
     assert camera.look(image).reason.startswith('it and its CameraInfo are of 640 x 480 and 1280')

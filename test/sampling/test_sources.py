@@ -4,11 +4,11 @@ import pytest
 
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.messages import DECODERS, TRANSFORMS
-from calib_ros.sampling.sources import DISTANCE, STANDARD, Source, parse_source, parse_sources
+from calib_ros.sampling.sources import RANGEFINDER, STANDARD, Source, parse_source, parse_sources
 
 
 def test_keys_in_any_order():
-    assert parse_source('/wire type=Range').device == DISTANCE  # an origin of its own
+    assert parse_source('/wire type=Range').device == RANGEFINDER  # an origin of its own
     assert parse_source('/wire type=Range device=left').device == 'left'
     source = parse_source(
         '/cam  target=board eye_in_hand=true type=PoseStamped device=left validation=true'

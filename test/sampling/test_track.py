@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tracked import BOTH, MAX_GAP, MS, add, at, came, causes, fill, filled, track
 
-from calib_ros.sampling.interpolation import MOVED
+from calib_ros.estimation.configurations import STILL
 from calib_ros.sampling.track import CAUSES
 
 
@@ -229,7 +229,7 @@ def brute_approach(stamps, values, when, before):
     now = np.array([np.interp(when, stamps, column) for column in values.T])
     for j, value in enumerate(now):
         past = values[stamps <= when, j]
-        far = np.flatnonzero(np.abs(value - past) > MOVED)
+        far = np.flatnonzero(np.abs(value - past) > STILL)
         signs.append(np.sign(value - past[far[-1]]) if len(far) else before[j])
     return signs
 

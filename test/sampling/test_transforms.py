@@ -22,7 +22,7 @@ from recorded import (
 
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
-from calib_ros.sampling.batches import Stream, feed, measured
+from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.cdr import alike
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
 from calib_ros.sampling.session import CalibrationSession
@@ -218,7 +218,7 @@ def session_fed(come, little_endian=True, at_once=True):
     """Return a session that has taken joint states and then transforms."""
     settings = Settings(mode='continuous', delay=1e-12, sources=(PLAIN,))
     session = CalibrationSession(ARM, settings)
-    streams = {each.topic: each for each in measured(parse_sources([PLAIN]), {})}
+    streams = {each.topic: each for each in source_streams(parse_sources([PLAIN]), {})}
     streams['/joint_states'] = Stream('/joint_states', JOINT_STATE)
     batch = []
     for each in (*standing([]), *come):
