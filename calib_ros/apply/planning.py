@@ -353,7 +353,7 @@ def accuracy_in_words(plan: Plan) -> list[str]:
     return lines
 
 
-def remarks(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> list[str]:
+def outlook(plan: Plan, candidates: int, wanted_mm: float | None, needed: int | None) -> list[str]:
     """Return the efficiency of a plan, how many poses are needed, and what it leaves open."""
     text = f'{len(plan.joints)} of {candidates} candidates'
     if plan.efficiency is not None:

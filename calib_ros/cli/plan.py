@@ -100,7 +100,7 @@ def _measurement(
     count = options.poses or needed or ENOUGH
     choice |= {'velocities': np.broadcast_to(options.velocity, size), 'chosen': chosen}
     plan = planning.plan(design, candidates, task, count, **choice)
-    remarks = planning.remarks(plan, len(candidates), options.accuracy, needed)
+    remarks = planning.outlook(plan, len(candidates), options.accuracy, needed)
     return plan.joints[plan.visit], remarks, plan
 
 
