@@ -14,7 +14,7 @@ from calib_ros.cli.screen import Screen, Work
 from calib_ros.errors import InputError
 from calib_ros.files.bags import pictures
 from calib_ros.files.boards import Board, read_board
-from calib_ros.files.cameras import SUFFIXES, files_of, image_of, read_image
+from calib_ros.files.cameras import SUFFIXES, image_files, image_of, read_image
 from calib_ros.files.detector import Image, black_of, detect
 from calib_ros.sampling.pictures import Flaw
 from calib_ros.texts import dump_yaml
@@ -58,7 +58,7 @@ def _pictures(options: argparse.Namespace, work: Work) -> Iterator[tuple[str, Im
     folder = options.images.is_dir()
     if not folder:
         refuse_others(options.images, 'images', 'images', 'bag')
-    paths = files_of(options.images) if folder else []
+    paths = image_files(options.images) if folder else []
     if folder and not paths and not (options.images / 'metadata.yaml').exists():
         raise InputError(f'{options.images} has neither images ({", ".join(SUFFIXES)}) nor a bag')
     for k, path in enumerate(paths):

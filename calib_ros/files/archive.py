@@ -29,7 +29,7 @@ from calib_ros.errors import InputError, trouble
 from calib_ros.files.tables import cells, columns, is_whole, read_journal
 from calib_ros.sampling.sample import Sample
 
-CALIBRATION, JOURNAL, SETTINGS = '.yaml', '.csv', '.settings.yaml'
+_CALIBRATION, _JOURNAL, _SETTINGS = '.yaml', '.csv', '.settings.yaml'
 
 
 class Journal:
@@ -148,7 +148,7 @@ class Archive:
                 f'poses cannot be kept in {folder} ({err.strerror}): set data_dir to a writable '
                 'folder'
             ) from err
-        self._path = self._new_path(JOURNAL)
+        self._path = self._new_path(_JOURNAL)
 
     @property
     def trouble(self) -> str:
@@ -183,7 +183,7 @@ class Archive:
         try:
             if self._journal is not None and self._journal.gone:
                 if self._path == self._journal.path:
-                    self._path = self._new_path(JOURNAL)
+                    self._path = self._new_path(_JOURNAL)
                 self._begin(self._journal.content)
             elif self._journal is None and (self._waiting or self._due):
                 self._begin()
@@ -197,7 +197,7 @@ class Archive:
 
     def _begin(self, content: bytes = b'') -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(self._path.with_suffix(SETTINGS), self._configuration(), overwrite=True)
+        write_file(self._path.with_suffix(_SETTINGS), self._configuration(), overwrite=True)
         if content:
             write_file(self._path, content, overwrite=True)
         before, self._journal = self._journal, Journal(self._path, self._joints)
@@ -215,14 +215,14 @@ class Archive:
             )
         old = self.journal
         self.close()
-        self._path = self._new_path(JOURNAL)
+        self._path = self._new_path(_JOURNAL)
         self._due = old is not None
         self.write()
         return old
 
     def resume(self) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
         """Continue the newest journal, if any; return its samples, and warnings."""
-        found = self._files(JOURNAL)
+        found = self._files(_JOURNAL)
         if not found:
             return (), (f'nothing to resume in {self.folder}: a new session begins',)
         self._path = found[-1]
@@ -238,12 +238,12 @@ class Archive:
 
     def newest_calibration(self) -> Path | None:
         """Return the calibration saved last."""
-        return next(reversed(self._files(CALIBRATION)), None)
+        return next(reversed(self._files(_CALIBRATION)), None)
 
     def save(self, text: str, configuration: str, path: Path | None = None) -> Path:
         """Write a calibration with its configuration, if known; return its path."""
-        path = path or self._new_path(CALIBRATION)
-        beside = {path.with_suffix(SETTINGS): configuration} if configuration else {}
+        path = path or self._new_path(_CALIBRATION)
+        beside = {path.with_suffix(_SETTINGS): configuration} if configuration else {}
         path.parent.mkdir(parents=True, exist_ok=True)
         write_together({path: text, **beside})
         return path

@@ -80,7 +80,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
             raise
         return _salvaged(path, found, session, {})
     with closing(reader):
-        available = stored.named((c.topic, c.msgtype) for c in reader.connections)
+        available = stored.topic_types((c.topic, c.msgtype) for c in reader.connections)
         defined = {c.msgtype: c.msgdef for c in reader.connections if c.msgdef.data}
         streams, deserialise = _chosen(session, available, partial(stored.read, reader), defined)
         counts = [c.msgcount for c in reader.connections if c.topic in streams]
@@ -101,7 +101,7 @@ def _replay(path: Path, folder: Path, session: CalibrationSession, progress: Not
 def _opened(path: Path, folder: Path) -> Any:
     library = rosbag2()
     try:
-        stored.check(folder)
+        stored.check_bag(folder)
         reader = library.Reader(folder)
         reader.open()
     except Exception as err:  # a damaged file fails in many ways, in the library and below it

@@ -29,7 +29,7 @@ from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameE
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import Columns, check_quaternions, joints_left_out, read_columns
 from calib_ros.files.layouts import joint_columns
-from calib_ros.files.programs import POSE
+from calib_ros.files.programs import POSE_COLUMNS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.lens import Lens
@@ -39,8 +39,8 @@ from calib_ros.shown import some
 from calib_ros.texts import csv_text, parse_yaml, read_text, to_cell
 from calib_ros.values import parse_like, parse_mapping, parse_number
 
-TYPES = ('charuco', 'markers')
-KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
+BOARD_TYPES = ('charuco', 'markers')
+BOARD_KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
 HEADER = ('image', 'corner', 'u', 'v')
 SIZE = ('width', 'height')  # optional columns: size of the images [px]
 DISTORTION = ('distortion_model', 'distortion_coefficients')
@@ -65,8 +65,8 @@ class Board:
     legacy: bool = False
 
     def __post_init__(self) -> None:
-        if self.type not in TYPES:
-            raise UnknownNameError('type of board', self.type, TYPES)
+        if self.type not in BOARD_TYPES:
+            raise UnknownNameError('type of board', self.type, BOARD_TYPES)
         least = 2 if self.type == 'charuco' else 1
         for name in ('columns', 'rows'):
             count = getattr(self, name)
@@ -123,7 +123,7 @@ def _grid(columns: int, rows: int) -> Index:
 def read_board(path: Path) -> Board:
     """Read a board from YAML."""
     text = read_text(path, what='board ')
-    content = parse_mapping(parse_yaml(text, str(path)), KEYS, str(path), KEYS[:-1])
+    content = parse_mapping(parse_yaml(text, str(path)), BOARD_KEYS, str(path), BOARD_KEYS[:-1])
     usual = {'columns': 0, 'rows': 0, 'square': 0.0, 'marker': 0.0, 'legacy': False}
     parsed: dict[str, Any] = {
         key: parse_like(usual[key], value, f'{path}: {key}') if key in usual else str(value)
@@ -294,7 +294,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
         row = int(np.argmax(np.bincount(image)[image] > 1))
         raise InputError(f'{found.where(row, "image")} {names[image[row]]} appears twice')
     posed = 'q1' not in found.header
-    columns = POSE if posed else joint_columns(joints)
+    columns = POSE_COLUMNS if posed else joint_columns(joints)
     missing = [name for name in columns if name not in found.header]
     if missing:
         raise InputError(

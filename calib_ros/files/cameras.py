@@ -118,7 +118,7 @@ def grey(data: NDArray[np.uint8], height: int, width: int, step: int, encoding: 
     return np.asarray(opencv().cvtColor(np.ascontiguousarray(rows).reshape(shape), code))
 
 
-def files_of(folder: Path) -> list[Path]:
+def image_files(folder: Path) -> list[Path]:
     """Return the images of a folder by name, shorter names first."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES]
     for path in paths:

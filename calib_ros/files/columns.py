@@ -112,8 +112,8 @@ class Columns:
         """Return the code (N,) of each row's name, and the names; empty without the column."""
         if name not in self.header:
             return np.zeros(len(self.lines), dtype=np.intp), ['']
-        numbers, found = numbered(self.texts(name))
-        place, names = numbered([from_cell(each) for each in found])
+        numbers, found = codes_of(self.texts(name))
+        place, names = codes_of([from_cell(each) for each in found])
         return place[numbers], names
 
     def blank(self, name: str) -> Flags:
@@ -139,7 +139,7 @@ class Columns:
         return replace(self, lines=self.lines[rows], values=values, words=words)
 
 
-def of_rows(path: Path, blocks: Iterable[Sequence[Row]], header: Sequence[str] = ()) -> Columns:
+def of_rows(path: Path, blocks: Iterable[Sequence[Cells]], header: Sequence[str] = ()) -> Columns:
     """Return columns of blocks of rows that may end early; further ones are `#1`, `#2` ..."""
     lines: list[int] = []
     columns: list[list[str]] = []  # of each block
@@ -166,7 +166,7 @@ def _refuse_zeros(path: Path, data: bytes, above: int) -> None:
         )
 
 
-def joined(parts: Sequence[Columns]) -> Columns:
+def joined_columns(parts: Sequence[Columns]) -> Columns:
     """Return the rows of successive parts of one file."""
     some = [each for each in parts if len(each.lines)]
     words = {name: BETWEEN.join([each.words[name] for each in some]) for name in parts[0].words}
@@ -196,8 +196,8 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
 
 
 def _below(
-    path: Path, header: Sequence[str], blocks: Iterable[list[Row]], end: int, progress: Notify
-) -> Iterator[list[Row]]:
+    path: Path, header: Sequence[str], blocks: Iterable[list[Cells]], end: int, progress: Notify
+) -> Iterator[list[Cells]]:
     """Yield the rows below a header, up to a last line; refuse more values than names."""
     width, count = len(header), 0
     for block in blocks:
@@ -276,7 +276,7 @@ def _number(text: str) -> float:
     return number if not text or math.isfinite(number) else math.inf
 
 
-def numbered(texts: Sequence[str]) -> Codes:
+def codes_of(texts: Sequence[str]) -> Codes:
     """Return the code of each text, and the different texts."""
     known = {text: number for number, text in enumerate(dict.fromkeys(texts))}
     numbers = np.fromiter(map(known.__getitem__, texts), dtype=np.intp, count=len(texts))
@@ -306,7 +306,7 @@ def lines_in_words(lines: Sequence[int]) -> str:
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
 
 
-def distinct(codes: Index) -> tuple[Index, Index]:
+def distinct_rows(codes: Index) -> tuple[Index, Index]:
     """Return the different rows of (N, C) in order of appearance, and their indices (N,)."""
     if not codes.any():
         return codes[:1], np.zeros(len(codes), dtype=np.intp)

@@ -37,14 +37,14 @@ from calib_ros.files.layouts import (
     finished,
     joint_columns,
 )
-from calib_ros.files.sheets import SIGNS, Sheet, name_and_unit, only, places, read_sheet
+from calib_ros.files.sheets import UNIT_SIGNS, Sheet, name_and_unit, only, places, read_sheet
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
-MEASURED = (*POSITION, 'distance')
+MEASURED_COLUMNS = (*POSITION, 'distance')
 WHAT = {'length': 'lengths', 'angle': 'angles', 'joint-angle': 'joint values'}
 
 
@@ -91,7 +91,7 @@ class Foreign:
         made = Columns(path, lines, table.words(), values, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
-        measured = [made.values[name] for name in MEASURED if name in made.values]
+        measured = [made.values[name] for name in MEASURED_COLUMNS if name in made.values]
         good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
         if not good.all():
             lines = made.lines[~good].tolist()
@@ -256,7 +256,7 @@ class _Table:
         layout, length = self._layout, self._layout.length
         for cells in self._sheet.above:
             if 'Length Units' in cells[:-1]:
-                unit = SIGNS.get(cells[cells.index('Length Units') + 1].lower(), '')
+                unit = UNIT_SIGNS.get(cells[cells.index('Length Units') + 1].lower(), '')
                 if unit in LENGTHS and unit != length:
                     self.notes.append(f'lengths are in {unit}, as its head says')
                     length = unit

@@ -25,7 +25,7 @@ from calib_ros.atomic import write_file
 from calib_ros.errors import CalibrationError, ConfigError, InputError
 from calib_ros.files.rows import Row
 
-MISSING = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
+NEEDS_PYARROW = 'a history needs pyarrow and fsspec: pip install "calib_ros[fleet]"'
 FOLDER, ENDING = 'robot=', '.parquet'
 AWAY = 'move it away, and its work is repeated'
 
@@ -38,7 +38,7 @@ class History:
             import pyarrow  # noqa: F401
             from fsspec.core import url_to_fs
         except ImportError:
-            raise ConfigError(MISSING) from None
+            raise ConfigError(NEEDS_PYARROW) from None
         try:
             self._files, self._root = url_to_fs(str(place))
         except (ImportError, ValueError) as err:

@@ -32,7 +32,7 @@ Channel = TypeVar('Channel')
 Content: TypeAlias = 'bytes | mmap'
 
 
-class Kind(IntEnum):
+class Opcode(IntEnum):
     """Opcodes of records."""
 
     SCHEMA = 0x03
@@ -75,7 +75,7 @@ def is_indexed(file: Path) -> bool:
             kind, length = _HEAD.unpack(content.read(_HEAD.size))
             kinds.add(kind)
             begin += _HEAD.size + length
-    return Kind.CHUNK_INDEX in kinds or {Kind.STATISTICS, Kind.SCHEMA} <= kinds
+    return Opcode.CHUNK_INDEX in kinds or {Opcode.STATISTICS, Opcode.SCHEMA} <= kinds
 
 
 def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[tuple[int, bytes]]:
@@ -84,7 +84,7 @@ def records(content: Content, start: int = 0, nested: bool = False) -> Iterator[
     Raises EOFError at a cut-off record, ValueError for a nested chunk, InputError for too much
     data.
     """
-    room, chunk = Room(len(content)), int(Kind.CHUNK)
+    room, chunk = Room(len(content)), int(Opcode.CHUNK)
     while start < len(content):
         kind, size = _HEAD.unpack_from(content, start)
         start += _HEAD.size
@@ -116,7 +116,7 @@ def logged(
     content = _unpacked(chunk)
     if len(content) != size or checksum not in (0, zlib.crc32(content)):
         raise ValueError('a chunk does not have its size and checksum')
-    found, problem, message = [], None, int(Kind.MESSAGE)
+    found, problem, message = [], None, int(Opcode.MESSAGE)
     try:
         for kind, record in records(content, nested=True):
             if kind == message:
@@ -135,7 +135,7 @@ def string(record: bytes, start: int) -> str:
     return record[start + 4 : start + 4 + size].decode()
 
 
-def unpacked(data: bytes, compression: str, largest: int) -> bytes:
+def decompressed(data: bytes, compression: str, largest: int) -> bytes:
     """Return decompressed data, as much as there is."""
     module: Any = module_of(compression) if compression else None
     found = data
@@ -155,7 +155,7 @@ def _unpacked(chunk: bytes) -> bytes:
     if size > LARGEST_TABLE:
         raise ValueError(f'a chunk has {size} bytes, more than {LARGEST_TABLE}')
     compression = string(chunk, _CHUNK.size)
-    return unpacked(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
+    return decompressed(chunk[_CHUNK.size + 12 + len(compression) :], compression, size)
 
 
 @cache  # searching a missing module takes ten times as long as a message

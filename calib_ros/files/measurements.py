@@ -19,10 +19,10 @@ from calib_ros.files.columns import (
     Codes,
     Columns,
     check_quaternions,
-    distinct,
+    codes_of,
+    distinct_rows,
     lines_in_words,
     named_by_option,
-    numbered,
     refuse_separator,
 )
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
@@ -131,7 +131,7 @@ class Measurements:
         stamps = found.stamps_ns
         if (np.diff(stamps) > 0).all():
             return found
-        _, number = distinct(found.codes)
+        _, number = distinct_rows(found.codes)
         order = np.lexsort((number, stamps))
         again = (np.diff(stamps[order]) == 0) & (np.diff(number[order]) == 0)
         for row in np.sort(order[1:][again])[:1].tolist():
@@ -142,7 +142,7 @@ class Measurements:
 
     def check_frames(self) -> None:
         """Refuse too many frames, and several of a device; rows without one may have any."""
-        kinds, number = distinct(self.codes[:, :3])
+        kinds, number = distinct_rows(self.codes[:, :3])
         most = 100
         for line in self.lines[number == most][:1].tolist():
             raise InputError(
@@ -151,7 +151,7 @@ class Measurements:
             )
         if self.frame_id[1] == ['']:
             return
-        kinds, number = distinct(np.column_stack([self.codes[:, :2], self.frame_id[0]]))
+        kinds, number = distinct_rows(np.column_stack([self.codes[:, :2], self.frame_id[0]]))
         frames: dict[tuple[int, ...], dict[str, int]] = {}
         for k, (*device, frame) in enumerate(kinds.tolist()):
             if self.frame_id[1][frame]:
@@ -276,7 +276,7 @@ def _devices(columns: Columns, kind: Index) -> Codes:
     if not kind.any():
         return columns.labels('device')
     labels = [columns.labels(name) for name in ('device', 'plane', 'location', 'socket')]
-    kinds, number = distinct(np.column_stack([kind, *(codes for codes, _ in labels)]))
+    kinds, number = distinct_rows(np.column_stack([kind, *(codes for codes, _ in labels)]))
     names = []
     for k, (what, *codes) in enumerate(kinds.tolist()):
         pairs = zip(labels, codes, strict=True)
@@ -292,7 +292,7 @@ def _devices(columns: Columns, kind: Index) -> Codes:
         elif what == DISTANCE and 'x' in columns.header:  # not the tracker's origin
             name = name or 'distance'
         names.append(name)
-    found, different = numbered(names)
+    found, different = codes_of(names)
     return found[number], different
 
 

@@ -37,7 +37,7 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
 
-POSE = (*POSITION, *QUATERNION)
+POSE_COLUMNS = (*POSITION, *QUATERNION)
 RATES = ('positions', 'velocities', 'accelerations')
 """Fields of a JointTrajectory point that a correction changes."""
 
@@ -125,8 +125,8 @@ def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], FloatArray,
 
 def read_poses(path: Path) -> FloatArray:
     """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
-    found = read_columns(path, POSE)
-    numbers = found.block(POSE)
+    found = read_columns(path, POSE_COLUMNS)
+    numbers = found.block(POSE_COLUMNS)
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
 

@@ -20,8 +20,8 @@ from typing import Any
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
     DECIMAL_COMMA,
+    Cells,
     Columns,
-    Row,
     csv_blocks,
     lines_in_words,
     of_rows,
@@ -36,11 +36,11 @@ LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
 SHEETS = ('.xlsx', '.xlsm')
 LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
 LONG |= {'micrometer': 'um'}
-SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
-SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
-SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
+UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
+UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
+UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
 """Units by their signs and words in small letters."""
-_ANY = '|'.join(SIGNS)
+_ANY = '|'.join(UNIT_SIGNS)
 UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))', re.I)
 """A name with its unit: X [mm], X (mm), X / mm."""
 
@@ -48,7 +48,7 @@ UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))', re.I)
 def name_and_unit(cell: str) -> tuple[str, str]:
     """Return the name of a column, and its unit if the header says it."""
     match = UNIT.fullmatch(cell)
-    return (match[1], SIGNS[(match[2] or match[3]).lower()]) if match else (cell, '')
+    return (match[1], UNIT_SIGNS[(match[2] or match[3]).lower()]) if match else (cell, '')
 
 
 def places(header: Sequence[str], name: str) -> list[int]:
@@ -85,7 +85,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class _Content:
-    rows: list[Row]  # of a text only the first
+    rows: list[Cells]  # of a text only the first
     notes: list[str]
     text: str = ''
     separator: str = ''
@@ -153,7 +153,7 @@ def _sheet(
     header = _with_units(header, [cells for _, cells in rows[at + 1 : first]])
     above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
     start = rows[first][0]
-    body: Iterable[Sequence[Row]] = [rows[first:]]
+    body: Iterable[Sequence[Cells]] = [rows[first:]]
     if content.text:
         body = _below(path, content.text, start, content.separator)
     if decimal == ',':
@@ -166,7 +166,7 @@ def _sheet(
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:
     """Return the names of columns with their units in the lines below."""
     for cells in below:
-        units = [SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
+        units = [UNIT_SIGNS.get(c.strip('[]() ').lower()) or name_and_unit(c)[1] for c in cells]
         pairs = zip_longest(header, units[: len(header)])
         header = tuple(
             f'{name} [{unit}]' if unit and name and not name_and_unit(name)[1] else name
@@ -175,7 +175,7 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
     return header
 
 
-def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[Row]]:
+def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[Cells]]:
     """Yield the rows of a text from a line on."""
     body = text[_after(text, start - 1) :]
     for block in csv_blocks(path, body.encode(), separator, above=start - 1):
@@ -183,7 +183,7 @@ def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[R
         yield [(line, cells) for line, cells in rows if any(cells)]
 
 
-def _with_points(block: Sequence[Row]) -> list[Row]:
+def _with_points(block: Sequence[Cells]) -> list[Cells]:
     return [(line, [cell.replace(',', '.') for cell in cells]) for line, cells in block]
 
 
@@ -245,10 +245,10 @@ def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
         raise InputError(f'cannot read {path}: {" ".join(str(err).split())}') from err
 
 
-def _rows(path: Path, sheet: Any) -> list[Row]:
+def _rows(path: Path, sheet: Any) -> list[Cells]:
     """Return the rows of a sheet that are not empty, with their numbers."""
     sheet.reset_dimensions()  # stated ones may be too small
-    rows: list[Row] = []
+    rows: list[Cells] = []
     for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
         if len(row) > MOST_ENTRIES:
             raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
@@ -288,9 +288,9 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
     return SEPARATORS[best]
 
 
-def _cells(path: Path, text: str, separator: str) -> list[Row]:
+def _cells(path: Path, text: str, separator: str) -> list[Cells]:
     """Return the cells of all non-empty lines, with line numbers."""
-    found: list[Row] = [
+    found: list[Cells] = [
         (line, [' '.join(cell.split()) for cell in row])
         for block in csv_blocks(path, text.encode(), separator)
         for line, row in block
@@ -302,7 +302,7 @@ def _cells(path: Path, text: str, separator: str) -> list[Row]:
 
 
 def _header(
-    path: Path, rows: Sequence[Row], names: Sequence[str], known: Sequence[str]
+    path: Path, rows: Sequence[Cells], names: Sequence[str], known: Sequence[str]
 ) -> tuple[int, tuple[str, ...]]:
     """Return the row index of the header, and its names; -1 if there is none."""
     wanted = {name for name in names if not name.startswith('#')}
@@ -328,7 +328,7 @@ def _header(
 
 
 def _first(
-    path: Path, rows: Sequence[Row], at: int, used: Sequence[int], decimal: str, notes: list[str]
+    path: Path, rows: Sequence[Cells], at: int, used: Sequence[int], decimal: str, notes: list[str]
 ) -> int:
     limit = HEAD_LINES if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):

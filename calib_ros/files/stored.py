@@ -125,12 +125,12 @@ def _unpack_file(file: Path, target: Path) -> None:
         return
 
 
-def named(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
+def topic_types(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
     """Return the types of topics; a database may hold something other than text."""
     return {name: kind for name, kind in topics if isinstance(name, str) and isinstance(kind, str)}
 
 
-def check(path: Path) -> None:
+def check_bag(path: Path) -> None:
     """Refuse a bag folder or file that the library must not open."""
     metadata = path / 'metadata.yaml'
     if metadata.exists():
@@ -218,7 +218,7 @@ def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
             _check_layout(connection)
             rows = connection.execute('SELECT id, name, type FROM topics')
             topics = {key: (name, kind) for key, name, kind in _growing(rows, 'topics')}
-            found.topics |= named(topics.values())
+            found.topics |= topic_types(topics.values())
             rows = connection.execute('SELECT id, topic_id, data FROM messages ORDER BY id')
             for _, key, data in _growing(rows, 'messages'):
                 yield topics[key][0], data
@@ -241,17 +241,17 @@ def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
             if content[: len(mcap.MAGIC)] != mcap.MAGIC:
                 raise ValueError('no mcap file')
             for kind, record in mcap.records(content, len(mcap.MAGIC)):
-                if kind == mcap.Kind.SCHEMA:
+                if kind == mcap.Opcode.SCHEMA:
                     (key,) = struct.unpack_from('<H', record)
                     schemas[key] = mcap.string(record, 2)
-                elif kind == mcap.Kind.CHANNEL:
+                elif kind == mcap.Opcode.CHANNEL:
                     key, schema = struct.unpack_from('<HH', record)
                     channels[key] = mcap.string(record, 4)
                     found.topics[channels[key]] = schemas[schema]
-                elif kind == mcap.Kind.MESSAGE:
+                elif kind == mcap.Opcode.MESSAGE:
                     (key,) = struct.unpack_from('<H', record)
                     yield channels[key], record[mcap.MESSAGE_HEAD :]
-                elif kind == mcap.Kind.DATA_END:
+                elif kind == mcap.Opcode.DATA_END:
                     return
         found.problem = NOT_CLOSED
     except Exception as err:  # decompressors have their own errors
@@ -287,7 +287,7 @@ def _unpacked(messages: Iterator[tuple[Stream, bytes]]) -> Iterator[tuple[Stream
     for stream, data in messages:
         if isinstance(data, bytes) and data.startswith(mcap.ZSTD):
             try:
-                data = mcap.unpacked(data, 'zstd', largest(stream))
+                data = mcap.decompressed(data, 'zstd', largest(stream))
             except OSError:  # no decompression module
                 raise
             except Exception:  # decompressors have their own errors

@@ -26,8 +26,8 @@ from calib_ros.files.columns import (
     Codes,
     Columns,
     columns_of,
-    distinct,
-    joined,
+    distinct_rows,
+    joined_columns,
     joints_left_out,
     lines_in_words,
 )
@@ -137,7 +137,7 @@ def _table(
     if made.view[1] != ['']:
         found = dataset_of([*_samples(made)], sigmas)
     else:  # arrays, with one example of each kind
-        _, number = distinct(made.codes)
+        _, number = distinct_rows(made.codes)
         examples = [*_samples(made.select(np.unique(number, return_index=True)[1]))]
 
         def observed(members: Sequence[int]) -> Observations:
@@ -205,7 +205,7 @@ def _of_journal(
     except OSError as err:
         raise InputError(unreadable(path, err)) from err
     cut_off = f'{path}: line {lines + 1} was cut off and is ignored'
-    return joined(parts), (cut_off,) if rest else ()
+    return joined_columns(parts), (cut_off,) if rest else ()
 
 
 def _rows(

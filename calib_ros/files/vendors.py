@@ -134,12 +134,12 @@ def vendor_files(
         lost = export.distance(chain, arm, q)
         text = export.head(chain, 'kinematics', lost, table_hash(chain))
         text += _document(vendor, places, origin, checksum)
-        again = forward_of(text, vendor, q)
+        again = forward_of_vendor(text, vendor, q)
         found.append(export.checked(vendor.file, text, again, reference.forward(q), lost))
     return tuple(found)
 
 
-def forward_of(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
+def forward_of_vendor(text: str, vendor: Vendor, q: FloatArray) -> FloatArray:
     """Return the poses (N, 4, 4) of a file's last frame in the frame of its first joint."""
     import yaml
 

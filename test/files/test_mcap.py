@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
-from calib_ros.files.mcap import Kind, Room, logged, module_of, records
+from calib_ros.files.mcap import Opcode, Room, logged, module_of, records
 from calib_ros.texts import LARGEST_TABLE
 
 try:
@@ -32,7 +32,7 @@ def record(kind, content):
 
 
 def message(channel, time, data):
-    return record(Kind.MESSAGE, struct.pack('<HIQQ', channel, 0, time, time) + data)
+    return record(Opcode.MESSAGE, struct.pack('<HIQQ', channel, 0, time, time) + data)
 
 
 def chunk(content, compression='', checked=True, begin=0, end=2**63):
@@ -40,7 +40,7 @@ def chunk(content, compression='', checked=True, begin=0, end=2**63):
     name, body = compression.encode(), COMPRESSORS[compression](content)
     head = struct.pack('<QQQI', begin, end, len(content), zlib.crc32(content) if checked else 0)
     sizes = struct.pack('<I', len(name)) + name + struct.pack('<Q', len(body))
-    return record(Kind.CHUNK, head + sizes + body)
+    return record(Opcode.CHUNK, head + sizes + body)
 
 
 def messages_of(chunk, channels):
@@ -59,7 +59,7 @@ CONTENT = b''.join(message(*each) for each in MESSAGES)
 )
 def test_messages_come_in_the_order_of_their_log_times(compression, checked, given_, limits):
     begin, end = sorted(limits)
-    content = record(Kind.CHANNEL, b'any') + b''.join(message(*each) for each in given_)
+    content = record(Opcode.CHANNEL, b'any') + b''.join(message(*each) for each in given_)
     given_chunk = chunk(content, compression, checked, begin, end)
     found, problem = messages_of(given_chunk, {1: 'a', 3: 'c'})
     assert problem is None
@@ -168,5 +168,5 @@ def test_many_chunks_are_not_more_than_any_recording_holds():
 
 def test_records_of_chunks_come_among_the_others():
     content = CONTENT + chunk(CONTENT, 'lz4') + message(1, 8, b'last')
-    found = [record[22:] for kind, record in records(content) if kind == Kind.MESSAGE]
+    found = [record[22:] for kind, record in records(content) if kind == Opcode.MESSAGE]
     assert found == [*(each[2] for each in MESSAGES * 2), b'last']

@@ -9,7 +9,7 @@ import pytest
 from recorded import STREAMS, record_in_chunks, session_of, storages
 from rosbags.rosbag2 import Reader
 
-from calib_ros.files.mcap import MAGIC, Kind, records
+from calib_ros.files.mcap import MAGIC, Opcode, records
 from calib_ros.files.stored import CHUNK, STORAGE, read
 from calib_ros.sampling.batches import Stream
 from calib_ros.settings import STORAGES
@@ -55,9 +55,9 @@ def test_messages_without_chunks_come_as_they_stand_in_the_file(tmp_path, log_ti
     (file,) = path.glob('*.mcap')
     stream = records(file.read_bytes()[: -len(MAGIC)], len(MAGIC))
     found = [(kind, struct.pack('<BQ', kind, len(each)) + each) for kind, each in stream]
-    end = 1 + [kind for kind, _ in found].index(Kind.DATA_END)
+    end = 1 + [kind for kind, _ in found].index(Opcode.DATA_END)
     flat = MAGIC + b''.join(each for _, each in found[:end])
-    kept = (Kind.SCHEMA, Kind.CHANNEL, Kind.STATISTICS) if summary else ()
+    kept = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS) if summary else ()
     behind = b''.join(each for kind, each in found[end:] if kind in kept)
     footer = struct.pack('<BQQQI', 2, 20, len(flat) if summary else 0, 0, 0)
     file.write_bytes(flat + behind + footer + MAGIC)

@@ -5,7 +5,7 @@ import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files import loading
-from calib_ros.files.columns import distinct, read_columns
+from calib_ros.files.columns import distinct_rows, read_columns
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.settings import Settings
@@ -281,5 +281,5 @@ def test_a_column_of_any_length_is_read_to_the_last_bit(tmp_path):
 @pytest.mark.parametrize('far', [3, 2**40])
 def test_rows_alike_have_one_number(far):
     """Also where their codes do not fit into one integer."""
-    different, number = distinct(np.array([[far, far], [0, 1], [far, far]]))
+    different, number = distinct_rows(np.array([[far, far], [0, 1], [far, far]]))
     assert (different.tolist(), number.tolist()) == ([[far, far], [0, 1]], [0, 1, 0])
