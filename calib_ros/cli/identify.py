@@ -37,10 +37,10 @@ from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import (
     BRING,
     NOT_YET,
+    advice_of,
     doubts,
     identification_report,
-    reasons_of,
-    standing,
+    result_standing,
 )
 from calib_ros.sampling.dataset import with_lenses
 from calib_ros.settings import Settings
@@ -77,7 +77,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
         judged_by = options.largest_loss
         about = inputs.filing_of(options, problem.chain, problem.all_sets, unread, judged_by)
         history.file(row_of(found.result, about, found.loaded.warnings))
-    shown = () if found.result.accepted and not options.json else words.remarks(found.result)
+    shown = () if found.result.accepted and not options.json else words.other_remarks(found.result)
     for warning in (*found.loaded.warnings, *shown):
         screen.warn(warning)
     if options.json:
@@ -263,8 +263,8 @@ def show(found: Identified, screen: Screen) -> None:
     result = found.result
     if found.loaded.read:
         screen.say(found.loaded.read)
-    reasons = reasons_of(result)
-    verdict = standing(result, reasons, found.wanted)
+    reasons = advice_of(result)
+    verdict = result_standing(result, reasons, found.wanted)
     screen.title(verdict.heading, STATES.get(verdict.state))
     screen.table(_rows(result))
     _explain(result, reasons, screen)
@@ -293,7 +293,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
 def _rows(result: Identification) -> dict[str, str]:
     judged, effects = result.validation or result.fitted, len(result.chain.effects)
     before, after = figures = judged.figures
-    fitted, measured = f'{result.rank} parameters fitted', words.measured(result)
+    fitted, measured = f'{result.rank} parameters fitted', words.fitted_data(result)
     if effects:
         fitted += f', {of_them(effects, "effect")}'
     if result.outliers:

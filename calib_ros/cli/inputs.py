@@ -128,7 +128,7 @@ def page_of(
     `pdf` adds report.pdf.
     """
     made: list[tuple[str, str | bytes | None, str]]
-    made = [(name, page.render(report), page.MISSING)]
+    made = [(name, page.render(report), page.NEEDS_JINJA)]
     made += [('report.pdf', page.on_paper(report), page.MISSING_PDF)] if pdf else []
     for _, content, missing in made:
         if content is None:

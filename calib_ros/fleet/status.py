@@ -23,7 +23,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, page_path, results, too_late, verifications
 from calib_ros.fleet.tasks import PLOTLY
 from calib_ros.fleet.watch import Change, Watched, watch
-from calib_ros.report.page import MISSING, State, filled, plotly_script
+from calib_ros.report.page import NEEDS_JINJA, State, filled, plotly_script
 from calib_ros.shown import some
 
 STATES: Mapping[str, tuple[State, str]] = {
@@ -228,7 +228,7 @@ def write_report(out: Path, found: Sequence[RobotStatus], done: Run) -> str:
     """Write the page and the script shared with robots' pages; return what is missing."""
     script, page = plotly_script(), page_of(out, found, done)
     if script is None or page is None:
-        return MISSING
+        return NEEDS_JINJA
     out.mkdir(parents=True, exist_ok=True)
     if not (out / PLOTLY).exists() or (out / PLOTLY).stat().st_size != len(script.encode()):
         write_file(out / PLOTLY, script, overwrite=True)

@@ -96,7 +96,7 @@ COARSE = (
     'and device sit firmly, the arm stood still, and the clocks agree.'
 )
 """First check if the measurements are far too coarse."""
-FEW = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
+FEW_POSES = 'Only {} different poses were measured: too few to be sure of anything about the arm.'
 LEFT = (
     'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
     'sigma_position is {:.2g} mm.'
@@ -124,7 +124,7 @@ class Situation:
             return replace(one, steps=(COARSE.format(self.left), *steps))
         if self.poses < ENOUGH:
             more = rules()[Rule.CONFIGURATIONS].steps
-            return replace(one, meaning=FEW.format(self.poses), steps=more)
+            return replace(one, meaning=FEW_POSES.format(self.poses), steps=more)
         if self.sigma is None:
             return one
         left = LEFT.format(1e3 * self.left * self.sigma, 1e3 * self.sigma)

@@ -16,7 +16,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.report import figures, sections
-from calib_ros.report.page import Origin, Report, Section, Verdict, section
+from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import numbers, unit_of
 from calib_ros.shown import rounded
 
@@ -43,7 +43,7 @@ def workspace_report(
     return Report(
         kind='Errors over the workspace',
         robot=arm.chain.name,
-        verdict=Verdict('info', 'What the calibration changes, and where', tuple(text)),
+        verdict=Headline('info', 'What the calibration changes, and where', tuple(text)),
         accuracy=Section(
             'accuracy',
             'Position errors [mm]',
@@ -132,7 +132,7 @@ def plan_report(
         _listed(chain, joints),
     ]
     what = 'Test poses' if found is None else 'Poses to measure'
-    verdict = Verdict('info', what, (f'{len(joints)} poses.',))
+    verdict = Headline('info', what, (f'{len(joints)} poses.',))
     steps: tuple[str, ...] = (
         'If you correct programs, not the controller, correct these poses: calib_ros compensate.',
         'Visit P1 to P5 in turn, 30 times, and measure each time.',

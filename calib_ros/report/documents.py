@@ -53,7 +53,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
         'parameters': {p.name: parameter(p) for p in result.parameters},
         'fitted': comparison(result.fitted),
         'validation': None if judged is None else by | comparison(judged),
-        'before_is': words.BEFORE,
+        'before_is': words.BEFORE_IS,
         'noise_in_sigma': asdict(result.noise),
         'chance_of_gain': result.chance,
         'outliers': [asdict(outlier) for outlier in result.outliers],

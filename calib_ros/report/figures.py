@@ -149,7 +149,7 @@ def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
     return {'data': [mesh], 'layout': layout}
 
 
-def coverage(
+def histogram(
     chain: Chain, joints: FloatArray, parts: int = 36
 ) -> tuple[Figure, tuple[tuple[str, ...], ...]]:
     """Return how often joint values (N, n) fall in each part of a joint's range, and a table."""

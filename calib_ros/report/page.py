@@ -26,7 +26,7 @@ MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'
 VALUE = r"""(?:auto|none|[cm]m|deg|rad|[xyzw]{3,4})\b|"[^"]*"|'[^']*'|[^\s()]*[\dA-Z*=_][^\s()]*"""
 TYPED = re.compile(rf'((?<![\w-])--[a-z][\w-]*(?: (?:{VALUE})(?<![.,;:]))?|calib_ros [a-z\d]+)')
 """An option, with a value that is no plain word, or a command."""
-MISSING = (
+NEEDS_JINJA = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
 )
@@ -50,7 +50,7 @@ COUNTED = {
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Headline:
     """What a reader sees first: state, words, and the `gain` from before to after."""
 
     state: State
@@ -101,7 +101,7 @@ class Report:
 
     kind: str
     robot: str
-    verdict: Verdict
+    verdict: Headline
     advice: tuple[Advice, ...] = ()
     accuracy: Section | None = None
     picture: Section | None = None
@@ -178,7 +178,7 @@ def filled(template: str, **values: Any) -> str | None:
     )
     values |= {'marks': MARKS, 'css': _template('report.css'), 'js': _template('report.js')}
     safe = environment.filters['safe']
-    environment.filters['typed'] = lambda text: safe(typed(text))
+    environment.filters['typed'] = lambda text: safe(with_code(text))
     page: str = environment.get_template(template).render(**values)
     return page
 
@@ -187,7 +187,7 @@ def _template(name: str) -> str:
     return (resources.files('calib_ros.report') / 'templates' / name).read_text(encoding='utf-8')
 
 
-def typed(text: str) -> str:
+def with_code(text: str) -> str:
     """Return a text as HTML, with commands and options as code that does not break at hyphens."""
     parts = enumerate(map(html.escape, TYPED.split(str(_shown(text)))))
     return ''.join(f'<code>{part}</code>' if k % 2 else part for k, part in parts)

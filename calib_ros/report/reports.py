@@ -24,7 +24,7 @@ from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
 from calib_ros.report.advice import GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Situation, advice
 from calib_ros.report.explorer import explorer
-from calib_ros.report.page import Origin, Report, Section, Verdict, section
+from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.settings import Settings
 from calib_ros.shown import some
@@ -50,24 +50,24 @@ def identification_report(
 ) -> Report:
     """Return the report of an identification; `tolerance` is the wanted RMS error [m]."""
     judged = result.validation or result.fitted
-    reasons = reasons_of(result)
+    reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
     gain = sections.gain(judged) if result.accepted else ''
-    corrected, notes = 'none: not accepted', words.remarks(result)
+    corrected, notes = 'none: not accepted', words.other_remarks(result)
     if result.accepted:
         corrected = table_hash(result.chain)
         notes = [*filter(None, (words.drift_in_words(result.noise),))]
     return Report(
         kind='Kinematic calibration',
         robot=result.chain.name,
-        verdict=replace(standing(result, reasons, tolerance), text=tuple(text), gain=gain),
+        verdict=replace(result_standing(result, reasons, tolerance), text=tuple(text), gain=gain),
         advice=reasons,
         accuracy=sections.accuracy_section(
             'Accuracy before and after' if result.accepted else 'Accuracy of the correction tried',
             judged,
             poses.things,
             '' if result.validation else UNPROVEN,
-            f'"Before" is {words.BEFORE}, so the gain comes from the arm alone.',
+            f'"Before" is {words.BEFORE_IS}, so the gain comes from the arm alone.',
             'RMS (root mean square) is the typical error over poses like these.',
             *(f'Note: {note}.' for note in filter(None, (words.in_part(result),))),
             with_outliers=judged.figures_of_all[1] if judged.outliers else None,
@@ -92,19 +92,19 @@ def identification_report(
     )
 
 
-def standing(
+def result_standing(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
-) -> Verdict:
+) -> Headline:
     """Return the verdict as a reader sees it first: an arm without visible errors is not bad."""
     if result.accepted:
         within = _within(result.validation or result.fitted, tolerance)
         open_yet = 'not' in within or bool(result.remarks)
         whole = result.region is None or result.region.whole
         heading = f'Accepted{"" if whole else " near the measured poses"}{within}'
-        return Verdict('open' if open_yet else 'good', heading)
+        return Headline('open' if open_yet else 'good', heading)
     if reasons[0].heading == GOOD_ARM.heading:
-        return Verdict('info', 'Not accepted, nothing to correct: the robot stays as it was')
-    return Verdict('bad', 'Not accepted: the robot stays as it was')
+        return Headline('info', 'Not accepted, nothing to correct: the robot stays as it was')
+    return Headline('bad', 'Not accepted: the robot stays as it was')
 
 
 def _text(
@@ -140,7 +140,7 @@ def _within(judged: Comparison, tolerance: float | None) -> str:
     return f', but {"" if lower > tolerance else "perhaps "}not {wanted}'
 
 
-def reasons_of(result: Identification) -> tuple[Advice, ...]:
+def advice_of(result: Identification) -> tuple[Advice, ...]:
     """Return why a result was refused, in plain words, and what to do.
 
     What the fit left, by its ratio to the stated noise, is that noise in the same figure. A fit of

@@ -131,7 +131,7 @@ def distribution(poses: Poses) -> Section:
 
 def coverage(chain: Chain, joints: FloatArray, title: str) -> Section:
     """Return how far joint values (N, n) reach in the range of each joint."""
-    figure, rows = figures.coverage(chain, joints)
+    figure, rows = figures.histogram(chain, joints)
     return section(
         'coverage',
         title,

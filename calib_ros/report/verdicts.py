@@ -18,7 +18,7 @@ from calib_ros.kinematics.se3 import norms
 from calib_ros.report import sections
 from calib_ros.report.advice import SPREAD_OUT
 from calib_ros.report.explorer import explorer
-from calib_ros.report.page import Origin, Report, Section, Verdict, section
+from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
@@ -33,13 +33,13 @@ COMPUTED = (
     'joint values.'
 )
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
-STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
+STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     'PASS': (
-        Verdict('good', 'PASS: the arm is within the tolerance'),
+        Headline('good', 'PASS: the arm is within the tolerance'),
         ('Keep this page with the calibration. Verify again after a collision or repair.',),
     ),
     'FAIL': (
-        Verdict('bad', 'FAIL: the arm exceeds the tolerance'),
+        Headline('bad', 'FAIL: the arm exceeds the tolerance'),
         (
             SOMETHING_MOVED,
             'Check that the correction is active in the controller (--commanded shows it).',
@@ -47,33 +47,33 @@ STANDINGS: dict[str, tuple[Verdict, tuple[str, ...]]] = {
         ),
     ),
     'UNDECIDED': (
-        Verdict('open', 'UNDECIDED: too few measurements to tell'),
+        Headline('open', 'UNDECIDED: too few measurements to tell'),
         (f'Measure more poses, {SPREAD_OUT}, and verify again with all of them.',),
     ),
     'does not hold': (
-        Verdict('bad', 'The calibration no longer holds'),
+        Headline('bad', 'The calibration no longer holds'),
         (
             SOMETHING_MOVED,
             'Calibrate again with new poses, or update it with --previous and a few.',
         ),
     ),
     'holds': (
-        Verdict('good', f'The calibration holds: at most {ALIKE:g} times the expected error'),
+        Headline('good', f'The calibration holds: at most {ALIKE:g} times the expected error'),
         (TOLERANCE,),
     ),
-    'no verdict': (Verdict('info', 'No verdict without a tolerance'), (TOLERANCE,)),
+    'no verdict': (Headline('info', 'No verdict without a tolerance'), (TOLERANCE,)),
 }
 REUSED = (
-    Verdict('open', 'No verdict: the calibration was computed from these measurements'),
+    Headline('open', 'No verdict: the calibration was computed from these measurements'),
     (f'Measure new poses, {SPREAD_OUT}, and verify with those alone.',),
 )
 MISTAKEN = (
-    Verdict('open', 'No verdict: the measurements do not fit the arm'),
+    Headline('open', 'No verdict: the measurements do not fit the arm'),
     ('Check what is named in the robot and in the data, correct it, and verify again.',),
 )
 
 
-def standing(found: Verification) -> tuple[Verdict, tuple[str, ...]]:
+def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     """Return the verdict as a reader sees it first, and what to do next."""
     if found.mistake:
         return MISTAKEN
@@ -103,7 +103,7 @@ def each_in_words(found: Verification) -> list[str]:
     return lines if found.each else []
 
 
-def limits(found: Verification) -> list[str]:
+def caveats(found: Verification) -> list[str]:
     """Return what the verdict leaves open, or why there is none."""
     lines = [warning] if (warning := reused_in_words(found.reused)) else []
     if found.mistake:
@@ -125,7 +125,7 @@ def limits(found: Verification) -> list[str]:
 
 def remarks(found: Verification) -> list[str]:
     """Return remarks on the figures, and what to do."""
-    return [*limits(found), *hints(found)]
+    return [*caveats(found), *hints(found)]
 
 
 def hints(found: Verification) -> list[str]:
@@ -203,7 +203,7 @@ def verification_report(
             f'{what}: {size} mm. If the whole interval is within it: '
             f'{good}; beyond it: {bad}; else UNDECIDED.'
         )
-    text += (f'{each[0].upper()}{each[1:]}.' for each in limits(found))
+    text += (f'{each[0].upper()}{each[1:]}.' for each in caveats(found))
     state, steps = standing(found)
     gain = sections.gain(found.comparison, intervals=False)
     title = 'Accuracy before and after the correction'

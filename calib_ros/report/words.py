@@ -44,7 +44,7 @@ def summary(
     do first about a refusal.
     """
     figures = (result.validation or result.fitted).figures
-    text = f'{measured(result)}, {change(figures)} ('
+    text = f'{fitted_data(result)}, {change(figures)} ('
     if likely := between(result.validation, 1):
         text += f'95 %: {likely} mm; '
     text += f'by {result.validated_by})'
@@ -59,7 +59,7 @@ def summary(
     if result.unidentifiable:
         text += f'; not identifiable, kept nominal: {", ".join(result.unidentifiable)}'
     text = '; '.join((text, *notes(result)))
-    if more := (*warnings, *remarks(result)):
+    if more := (*warnings, *other_remarks(result)):
         text += f'; note: {"; ".join(more)}'
     if result.accepted:
         return f'accepted: {text}'
@@ -91,7 +91,7 @@ def limits_mm(judged: Comparison | None, when: int) -> list[float] | None:
     return limits if np.isfinite(limits).all() else None
 
 
-def measured(result: Identification) -> str:
+def fitted_data(result: Identification) -> str:
     """Return what was fitted: poses, images with corners, or both."""
     seen = ~np.isnan(result.fitted.after.pixels[:, 0])
     corners, poses = int(seen.sum()), int((~seen).sum())
@@ -100,7 +100,7 @@ def measured(result: Identification) -> str:
     return ' and '.join(parts)
 
 
-def remarks(result: Identification) -> list[str]:
+def other_remarks(result: Identification) -> list[str]:
     """Return the remarks that do not repeat a refusal."""
     return [each for each in result.remarks if each not in map(str, result.refusals)]
 
@@ -153,7 +153,7 @@ def weakly_determined(result: Identification) -> tuple[str, ...]:
     )
 
 
-def checked(
+def still_holds(
     previous: Calibration, found: Recalibration, sets: Sequence[Observations] = ()
 ) -> tuple[bool, str]:
     """Return whether a calibration holds at the last stops, those of sets, and why."""
@@ -172,7 +172,7 @@ def checked(
         )
     limit = previous.limit(sets)
     if limit is not None and _least_and_most(found.comparison, 0)[0] > limit:
-        return False, LOST.format(text, 1e3 * limit)
+        return False, NO_LONGER_HOLDS.format(text, 1e3 * limit)
     return True, f'the calibration in use agrees with the measurements: {text}'
 
 
@@ -195,7 +195,7 @@ def verdict(
         return 'no verdict', f'{text}; judge with calib_ros verify --tolerance'
     least, most = _least_and_most(found, 1)
     if least > limit:
-        return 'does not hold', LOST.format(text, 1e3 * limit)
+        return 'does not hold', NO_LONGER_HOLDS.format(text, 1e3 * limit)
     text += f'; the limit is {1e3 * limit:.3f} mm'
     if warning := reused_in_words(reused):
         text = f'RMS {now.rms_mm:.3f} mm on {now.count} poses measured since'
@@ -218,11 +218,11 @@ def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
     return rms, np.inf if np.isfinite(found.after.position).any() else rms
 
 
-LOST = (
+NO_LONGER_HOLDS = (
     'the calibration no longer holds: {}; the limit is {:.3f} mm. Was the tracker, target or '
     'robot moved?'
 )
-BEFORE = 'the nominal chain with its base and tool frames fitted to the same measurements'
+BEFORE_IS = 'the nominal chain with its base and tool frames fitted to the same measurements'
 
 
 def sigma_over_range(result: Identification) -> dict[str, float]:

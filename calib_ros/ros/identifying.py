@@ -41,7 +41,7 @@ from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.progress import Progress
 from calib_ros.report import words
-from calib_ros.report.reports import reasons_of
+from calib_ros.report.reports import advice_of
 from calib_ros.ros import to_ros
 from calib_ros.ros.boundary import Answer
 from calib_ros.ros.inputs import Inputs
@@ -165,12 +165,12 @@ class Identifying:
         self._advice = next(iter(loaded.warnings), '')  # if poses are too few
         with self.progress.running():
             result = loaded.identified(settings.model, self.progress)
-        steps = (step for reason in reasons_of(result) for step in reason.steps)
+        steps = (step for reason in advice_of(result) for step in reason.steps)
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)
         self.last = words.summary(result, numbers, loaded.warnings, first)
         telling = next((each.short for each in result.refusals if each.rule in TELLING), '')
-        hint = next(iter((*loaded.warnings, *words.remarks(result))), '')
+        hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         self._advice = telling or first or hint
         self.observability = words.observability_in_words(result)
         self._residuals.publish(

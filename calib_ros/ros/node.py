@@ -307,7 +307,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         calibration, problem = found
         years = years_since(calibration.record)
         updated = recalibrate(calibration, problem, years)
-        return words.checked(calibration, updated, problem.all_sets)
+        return words.still_holds(calibration, updated, problem.all_sets)
 
     def _on_clear(self, request: Any) -> Answer:
         count = len(self.session.samples)

@@ -19,7 +19,7 @@ from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics import se3
 from calib_ros.report.documents import as_document
-from calib_ros.report.words import remarks
+from calib_ros.report.words import other_remarks
 
 COUNT, AT = 60, 26
 DESIGNS = ('random', 'path', 'sweep')
@@ -145,7 +145,7 @@ def test_a_step_beside_the_fit_is_told_and_harms_nothing():
     assert result.step.unused
     assert result.remarks == (str(result.step),)
     assert 'measurements from there on carry no weight' in result.remarks[0]
-    assert result.remarks[0] in remarks(result)
+    assert result.remarks[0] in other_remarks(result)
     assert as_document(result, {})['remarks'] == list(result.remarks)
 
 

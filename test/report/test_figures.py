@@ -15,7 +15,7 @@ from calib_ros.apply.simulation import Camera, before_camera, photograph
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
-from calib_ros.report.figures import against_noise, coverage, cumulated, drives, forest
+from calib_ros.report.figures import against_noise, cumulated, drives, forest, histogram
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import poses_to_verify
 
@@ -120,12 +120,12 @@ def test_joints_without_limits_are_not_given_any(rng):
     free = replace(UR10E.joints[0], lower=None, upper=None)
     chain = replace(UR10E, joints=(free, *UR10E.joints[1:]))
     joints = chain.random_joints(50, rng)
-    figure, rows = coverage(chain, joints)
+    figure, rows = histogram(chain, joints)
     assert figure['data'][0]['x'] == pytest.approx(100.0 * np.arange(1, 72, 2) / 72, rel=1e-3)
     assert [row[1] for row in rows[:2]] == ['-180 to 180 ° (no limits)', '-360 to 360 °']
     joints[:, 0] += 2.0  # a turn from where it was measured, not what is between both ranges
     low = np.degrees(joints[:, 0].min())
-    assert coverage(chain, joints)[1][0][1] == f'{low:.0f} to {low + 360.0:.0f} ° (no limits)'
+    assert histogram(chain, joints)[1][0][1] == f'{low:.0f} to {low + 360.0:.0f} ° (no limits)'
 
 
 @pytest.mark.parametrize('count', [1, 5, 30, 3001])

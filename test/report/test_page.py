@@ -24,7 +24,7 @@ from calib_ros.report import advice, page
 from calib_ros.report.applied import workspace_report
 from calib_ros.report.documents import as_document
 from calib_ros.report.explorer import BANDS, SINGLE, WORST, explorer
-from calib_ros.report.page import Origin, Verdict, markdown, render
+from calib_ros.report.page import Headline, Origin, markdown, render
 from calib_ros.report.plots import drawing
 from calib_ros.report.poses import JUDGED, poses_of, poses_to_verify
 from calib_ros.report.reports import identification_report
@@ -177,7 +177,7 @@ def test_a_page_names_what_was_read_and_the_command_that_made_it(solved):
     )
     report = replace(report_of(problem, result), origin=origin)
     told = advice.advice([Reason(Rule.GAIN, 'h')])
-    refused = replace(report, verdict=Verdict('bad', 'no'), steps=('again',), advice=told)
+    refused = replace(report, verdict=Headline('bad', 'no'), steps=('again',), advice=told)
     lines = markdown(refused, {}).splitlines()
     assert lines.index('again') > max(lines.index(f'- {step}') for step in told[0].steps)
     assert report.of == 'cell'
@@ -240,7 +240,7 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
     ],
 )
 def test_options_are_code_with_their_values(text, code):
-    assert f'<code>{code}</code>' in page.typed(text)
+    assert f'<code>{code}</code>' in page.with_code(text)
 
 
 def test_no_pose_is_called_judged_where_none_was_left_out():

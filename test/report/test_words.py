@@ -22,7 +22,7 @@ from calib_ros.report import words
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
 from calib_ros.report.verdicts import standing, verification_report
-from calib_ros.report.words import between, checked, verdict
+from calib_ros.report.words import between, still_holds, verdict
 from calib_ros.shown import rounded
 
 
@@ -45,7 +45,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
     assert told[0] == says
     assert '; the limit is 0.150 mm' in told[1]
     assert told[1].startswith('too few poses to tell') == (says == 'UNDECIDED')
-    same = checked(previous, updates[0])
+    same = still_holds(previous, updates[0])
     assert same[0] == (says != 'does not hold')
     for text in (told[1], same[1]):
         assert ('no longer holds: RMS 0.300 mm' in text) == (says == 'does not hold')
