@@ -26,7 +26,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.tasks import Outcome, Task, sources, work
 from calib_ros.progress import Notify, quiet
 
-MISSING = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
+NEEDS_DASK = 'a fleet needs dask.distributed: pip install "calib_ros[fleet]"'
 ANSWER_S = 60.0  # time [s] for a scheduler and its first worker to answer; a convention
 DASK = {
     'distributed.worker.profile.enabled': False,
@@ -210,7 +210,7 @@ def _client(cluster: Cluster) -> Iterator[Any]:
         import dask
         from distributed import Client, LocalCluster
     except ImportError:
-        raise ConfigError(MISSING) from None
+        raise ConfigError(NEEDS_DASK) from None
     logging.getLogger('distributed.client').setLevel(logging.CRITICAL)  # LostError says it
     with ExitStack() as stack:
         where: Any = cluster.address

@@ -226,7 +226,7 @@ def metrics(found: Sequence[RobotStatus], done: Run, ended: float) -> str:
 
 def write_report(out: Path, found: Sequence[RobotStatus], done: Run) -> str:
     """Write the page and the script shared with robots' pages; return what is missing."""
-    script, page = plotly_script(), page_of(out, found, done)
+    script, page = plotly_script(), fleet_page(out, found, done)
     if script is None or page is None:
         return NEEDS_JINJA
     out.mkdir(parents=True, exist_ok=True)
@@ -236,7 +236,7 @@ def write_report(out: Path, found: Sequence[RobotStatus], done: Run) -> str:
     return ''
 
 
-def page_of(out: Path, found: Sequence[RobotStatus], done: Run) -> str | None:
+def fleet_page(out: Path, found: Sequence[RobotStatus], done: Run) -> str | None:
     """Return the page, or None without jinja2."""
     shown = found[:MOST_ENTRIES]  # the worst
     return filled(

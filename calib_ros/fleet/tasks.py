@@ -37,7 +37,7 @@ SUMS = ('ETag', 'etag', 'CRC')  # names of checksums in file systems
 PLOTLY = 'plotly.min.js'  # the script shared by all pages of a report
 
 
-class Source(NamedTuple):
+class SourceFile(NamedTuple):
     """A bag or table, a session, and a fingerprint of its content, if any."""
 
     url: str
@@ -59,7 +59,7 @@ class Task:
     """
 
     robot: Robot
-    source: Source
+    source: SourceFile
     known: Mapping[str, str] = field(default_factory=dict)
     page: bool = False
 
@@ -74,7 +74,7 @@ class Outcome(NamedTuple):
     seconds: float = 0.0
 
 
-def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
+def sources(robot: Robot) -> tuple[tuple[SourceFile, ...], dict[str, str]]:
     """Return the sources of a robot, and errors by pattern."""
     found, wrong = [], {}
     for each in robot.measured:
@@ -95,7 +95,7 @@ def sources(robot: Robot) -> tuple[tuple[Source, ...], dict[str, str]]:
             fingerprint, modified = _state(files, path, info)
             url = path if is_local(files) else files.unstrip_protocol(path)
             url += each.files[each.files.find('::') :] if '::' in each.files else ''
-            found.append(Source(url, each.session, fingerprint, modified))
+            found.append(SourceFile(url, each.session, fingerprint, modified))
     return tuple(found), wrong
 
 

@@ -13,7 +13,7 @@ from calib_ros.decision.changes import Explanation
 from calib_ros.files.rows import Row
 from calib_ros.fleet.plant import Pattern, Robot
 from calib_ros.fleet.run import Run
-from calib_ros.fleet.status import STATES, RobotStatus, counts, page_of
+from calib_ros.fleet.status import STATES, RobotStatus, counts, fleet_page
 from calib_ros.fleet.watch import Change, Night, Watched
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.parameter import Parameter
@@ -70,7 +70,7 @@ def test_states_from_the_worst_to_the_best():
 def test_the_page_tells_all_that_is_to_be_said_of_a_robot():
     refused = {'verdict': 'refused', 'reasons': ('the arm is another one',)}
     fleet = [status('2', {'x.csv': 'damaged'}, **refused)]
-    page = page_of(Path('report'), fleet, Run())
+    page = fleet_page(Path('report'), fleet, Run())
     assert 'refused, beyond tolerance, unreadable</span>' in page
     for action in fleet[0].actions:
         assert f'<li>{action}</li>' in page
@@ -81,6 +81,6 @@ def test_a_night_that_does_not_determine_a_joint_leaves_a_gap_in_its_chart():
     each = status('1')
     few = Watched((*each.watched.nights[:2], Night(each.watched.nights[2].row, {'a': 0.5})))
     told = replace(each, watched=few, remarks=('a <remark>',))
-    page = page_of(Path('report'), [told], Run())
+    page = fleet_page(Path('report'), [told], Run())
     assert '"joints": {"\\u003cb\\u003e": [6.0, 6.0, null], "a": [0.5, 0.5, 0.5]}' in page
     assert '<li>a &lt;remark&gt;</li>' in page

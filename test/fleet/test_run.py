@@ -16,7 +16,7 @@ from calib_ros.fleet import run as running
 from calib_ros.fleet.plant import Pattern, read_plant
 from calib_ros.fleet.run import Cluster, LostError, Run, results, run, verifications
 from calib_ros.fleet.status import statuses
-from calib_ros.fleet.tasks import Outcome, Source, Task, sources
+from calib_ros.fleet.tasks import Outcome, SourceFile, Task, sources
 from calib_ros.kinematics.chain_file import chain_document, load_chain
 
 CHAIN = json.dumps(chain_document(load_chain('ur10e')))
@@ -299,7 +299,7 @@ def test_a_history_that_cannot_be_read_ends_the_run(plant, tmp_path, monkeypatch
 
 
 def test_the_task_that_ends_a_worker_is_found(plant, cluster):
-    tasks = [Task(plant[0], Source(str(number))) for number in range(200)]
+    tasks = [Task(plant[0], SourceFile(str(number))) for number in range(200)]
     with running._client(cluster) as client:
         done = {task.source.url: found for task, found in running._done(client, tasks, echoed)}
     assert len(done) == 200
@@ -308,7 +308,7 @@ def test_the_task_that_ends_a_worker_is_found(plant, cluster):
 
 
 def test_a_scheduler_that_dies_is_told_of(plant):
-    tasks = [Task(plant[0], Source(str(number))) for number in range(50)]
+    tasks = [Task(plant[0], SourceFile(str(number))) for number in range(50)]
     local = LocalCluster(1, threads_per_worker=1, processes=False, dashboard_address=':0')
     with local, running._client(Cluster(local.scheduler_address)) as client:
         found = running._done(client, tasks, echoed)
