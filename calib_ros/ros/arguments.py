@@ -30,7 +30,7 @@ NODE = 'calibration_node'
 
 
 @dataclass(frozen=True)
-class Parameter:
+class NodeParameter:
     """A parameter: default, description, whether it can change, smallest value."""
 
     name: str
@@ -69,12 +69,12 @@ target_frame 'target'  frame name of the target on /tf_static
 """Name, `*` if it can change, default, description; numbers are not negative."""
 
 
-def _written(line: str) -> Parameter:
+def _written(line: str) -> NodeParameter:
     head, text = line.split('  ', 1)
     name, default = head.split(' ')
     value = literal_eval(default)
     lower = 0.0 if isinstance(value, float) else None
-    return Parameter(name.rstrip('*'), value, text, not name.endswith('*'), lower)
+    return NodeParameter(name.rstrip('*'), value, text, not name.endswith('*'), lower)
 
 
 PARAMETERS = {
@@ -82,10 +82,10 @@ PARAMETERS = {
     for each in (
         *map(_written, BESIDE_SETTINGS.strip().splitlines()),
         *(
-            Parameter(each.name, each.default, fixed=each.name in STARTUP, **each.metadata)
+            NodeParameter(each.name, each.default, fixed=each.name in STARTUP, **each.metadata)
             for each in fields(Settings)
         ),
-        Parameter('use_sim_time', False, 'use the time of /clock', False),
+        NodeParameter('use_sim_time', False, 'use the time of /clock', False),
     )
 }
 """All parameters of the node by name, in order of declaration."""
@@ -179,7 +179,7 @@ def typed(command: Sequence[str]) -> list[str]:
     return words
 
 
-def refuse_ignored(command: Sequence[str], node: str) -> None:
+def refuse_ignored_files(command: Sequence[str], node: str) -> None:
     """Refuse parameter files with no key for a node, by its full name: ROS ignores them."""
     import yaml
 
@@ -236,7 +236,7 @@ def rviz_config(text: str, namespace: str, fixed_frame: str = '') -> str:
     return edited
 
 
-def _described(parameter: Parameter) -> str:
+def _described(parameter: NodeParameter) -> str:
     default = parameter.default
     if isinstance(default, bool):
         return f'{parameter.text}; default: {str(default).lower()}'
@@ -245,7 +245,7 @@ def _described(parameter: Parameter) -> str:
     return f'{parameter.text}; default: {default}'
 
 
-def _as_yaml(parameter: Parameter, text: str) -> str:
+def _as_yaml(parameter: NodeParameter, text: str) -> str:
     import yaml
 
     given: object = text

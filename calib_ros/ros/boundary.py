@@ -26,7 +26,7 @@ from rclpy.utilities import remove_ros_args
 from std_srvs.srv import Trigger
 
 from calib_ros.errors import CalibrationError, trouble
-from calib_ros.ros.arguments import NODE, refuse_ignored, typed, usage
+from calib_ros.ros.arguments import NODE, refuse_ignored_files, typed, usage
 
 Answer = tuple[bool, str]
 
@@ -148,7 +148,7 @@ class DeferredTrigger:
             return
 
 
-def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
+def run_node(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
     """Run a node until SIGINT or SIGTERM; return the exit status.
 
     rclpy must not see the signals: its handler invalidates the context while messages are taken.
@@ -174,7 +174,7 @@ def run(make: Callable[[], Any], arguments: Sequence[str] | None) -> int:
     try:
         rclpy.init(args=command, signal_handler_options=SignalHandlerOptions.NO)
         node = make()
-        refuse_ignored(command, node.get_fully_qualified_name())
+        refuse_ignored_files(command, node.get_fully_qualified_name())
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.announce()

@@ -87,7 +87,7 @@ ANSWER_LENGTH = LONGEST // 2
 """Characters of an answer: a few terminal lines; the rest is in a file and the log."""
 KEEP = '; to keep it call ~/save'
 NOT_FILED = '; not filed'
-TELLING = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
+TELLING_RULES = {Rule.MISTAKE, Rule.ENCODER, Rule.DROPPED}
 """Rules whose advice says nothing without the refusal."""
 
 
@@ -169,7 +169,7 @@ class Identifying:
         first = next(steps, '')
         numbers = given.numbers_of(result.outliers)
         self.last = words.summary(result, numbers, loaded.warnings, first)
-        telling = next((each.short for each in result.refusals if each.rule in TELLING), '')
+        telling = next((each.short for each in result.refusals if each.rule in TELLING_RULES), '')
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         self._advice = telling or first or hint
         self.observability = words.observability_in_words(result)

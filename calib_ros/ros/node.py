@@ -39,12 +39,12 @@ from calib_ros.identification.recalibration import recalibrate, years_since
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.report import documents, words
 from calib_ros.ros.advisor import Guide
-from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run
+from calib_ros.ros.boundary import Answer, Boundary, DeferredTrigger, run_node
 from calib_ros.ros.diagnostics import Diagnostics
 from calib_ros.ros.identifying import Filer, Identifying
 from calib_ros.ros.inputs import Inputs, deserialised
 from calib_ros.ros.outputs import FILENAMES, Keeper, Published
-from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown
+from calib_ros.ros.parameters import changed, declare_all, load_robot, refuse_unknown_names
 from calib_ros.ros.to_ros import LATCHED
 from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.dataset import check_settings
@@ -97,7 +97,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         if given.resume:
             self._resume()
         self._inputs = Inputs(self, self._streams())
-        refuse_unknown(self, names)
+        refuse_unknown_names(self, names)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
         self._keeper = Keeper(self, self.session, self._archive, given, urdf)
@@ -380,7 +380,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; return the exit status."""
-    return run(CalibrationNode, arguments)
+    return run_node(CalibrationNode, arguments)
 
 
 if __name__ == '__main__':

@@ -79,7 +79,7 @@ class Broadcast:
         self._publisher.publish(self._type(transforms=transforms))
 
     def _transform(self, parent: str, child: str, matrix: FloatArray) -> TransformStamped:
-        message = TransformStamped(child_frame_id=child, transform=to_ros.transform(matrix))
+        message = TransformStamped(child_frame_id=child, transform=to_ros.transform_of(matrix))
         message.header.frame_id = parent
         message.header.stamp = self._node.get_clock().now().to_msg()
         return message

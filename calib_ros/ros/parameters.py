@@ -25,7 +25,7 @@ from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES, chain_text, load_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.ros.arguments import PARAMETERS, Parameter
+from calib_ros.ros.arguments import PARAMETERS, NodeParameter
 from calib_ros.sampling.slices import SILENCE
 from calib_ros.settings import Settings
 from calib_ros.values import LARGEST_SETTING, parse_like
@@ -66,7 +66,7 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
         if each.name not in OF_ROS
     }
     settings = Settings(**{each.name: own[each.name] for each in fields(Settings)})
-    refuse_unknown(node, [*overrides], QOS)
+    refuse_unknown_names(node, [*overrides], QOS)
     if not own['chain']:
         raise ConfigError(
             'parameter "chain" is not set: give the chain file of the robot, for example '
@@ -117,7 +117,7 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
     return replace(chain_from_urdf(text, **links), base=None, tool=None), text
 
 
-def refuse_unknown(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.') -> None:
+def refuse_unknown_names(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.') -> None:
     """Refuse names of parameters that were set but do not exist; ROS ignores them.
 
     Names that start with `later` are accepted: their parameters may be declared later.
@@ -128,7 +128,7 @@ def refuse_unknown(node: Node, names: Sequence[str], later: str = f'{QOS}/clock.
             raise UnknownNameError('parameter', name, known)
 
 
-def _declare(node: Node, overrides: Mapping[str, Any], each: Parameter) -> Any:
+def _declare(node: Node, overrides: Mapping[str, Any], each: NodeParameter) -> Any:
     descriptor = ParameterDescriptor(description=each.text, read_only=each.fixed)
     if each.lower is not None and isinstance(each.default, int):
         span = IntegerRange(from_value=int(each.lower), to_value=int(LARGEST_SETTING))

@@ -53,11 +53,11 @@ def pose(chain: Chain, joints: Sequence[float], stamp_ns: int, frame_id: str) ->
     message.header.stamp = Time(sec=seconds, nanosec=nanoseconds)
     message.header.frame_id = frame_id
     message.pose.position = Point(**dict(zip('xyz', matrix[:3, 3].tolist(), strict=True)))
-    message.pose.orientation = transform(matrix).rotation
+    message.pose.orientation = transform_of(matrix).rotation
     return message
 
 
-def transform(matrix: FloatArray) -> Transform:
+def transform_of(matrix: FloatArray) -> Transform:
     """Return a matrix (4, 4) as a message."""
     x, y, z, w = to_quat(matrix[:3, :3]).tolist()
     shift = dict(zip('xyz', matrix[:3, 3].tolist(), strict=True))

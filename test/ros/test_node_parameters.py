@@ -17,7 +17,7 @@ from ros_cell import Cell, Child, topics
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import node as node_module
-from calib_ros.ros.arguments import PARAMETERS, launch_arguments, refuse_ignored, typed
+from calib_ros.ros.arguments import PARAMETERS, launch_arguments, refuse_ignored_files, typed
 from calib_ros.settings import STARTUP, Settings
 
 FREE = ('target_filename', 'calibration_filename', 'socket', 'largest_loss', 'marker_scale')
@@ -204,16 +204,16 @@ def test_a_parameter_file_of_other_nodes_is_refused(tmp_path, keys, applies):
     """ROS ignores it: the node would run with its defaults. One of comments only is none."""
     path = tmp_path / 'parameters.yaml'
     path.write_text('# chain: ur10e')
-    refuse_ignored(['node', '--ros-args', '--params-file', str(path)], '/calibration_node')
+    refuse_ignored_files(['node', '--ros-args', '--params-file', str(path)], '/calibration_node')
     path.write_text(yaml.safe_dump({key: {'ros__parameters': {'chain': 'ur10e'}} for key in keys}))
     words = ['--params-file', str(path), '-r', '__ns:=/cell_1']
     assert ('chain' in parameters_of(words)) == applies
     node, command = '/cell_1/calibration_node', ['node', '--ros-args', *words]
     if applies:
-        refuse_ignored(command, node)
+        refuse_ignored_files(command, node)
         return
     with pytest.raises(ConfigError, match=rf'no parameters of {node}, but of /.*: use the key /'):
-        refuse_ignored(command, node)
+        refuse_ignored_files(command, node)
 
 
 @pytest.mark.parametrize(
