@@ -92,7 +92,7 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
     elif Path(options.chain).suffix in URDF_SUFFIXES:
         urdf = chain_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)
-    with common.results(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
+    with common.output_files(options, (*FILES, *VENDOR_FILES, f'*{CORRECTED_URDF}')) as contents:
         contents |= {each.name: each.content for each in found}
     for each in found:
         exact = 'exact' if each.error == 0.0 else f'up to {1e3 * each.error:.3f} mm off'

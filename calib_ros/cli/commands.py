@@ -26,7 +26,7 @@ def _measured(text: str) -> Path:
     return Path('/dev/stdin' if text == '-' else text)
 
 
-TYPES: dict[str, Callable[[str], Any]] = {
+ARGUMENT_TYPES: dict[str, Callable[[str], Any]] = {
     **dict.fromkeys(('N', 'ROWS'), int),
     **dict.fromkeys(('DEG', 'M', 'MM', 'Q', 'SHARE', 'V', 'X', 'X,Y,Z'), float),
     **dict.fromkeys(('BAG', 'FILE', 'FIRST', 'FOLDER', 'IMAGES', 'PLANT'), Path),
@@ -366,7 +366,7 @@ def add_options(parser: argparse.ArgumentParser, written: Sequence[str]) -> None
 def _add_option(group: Group, option: str, text: str) -> None:
     name, _, form = option.partition(' ')
     placeholder, count, default = FORM.findall(form)[0]
-    kind = TYPES.get(placeholder, str)
+    kind = ARGUMENT_TYPES.get(placeholder, str)
     given: dict[str, Any] = {'required': True} if name.endswith('!') else {}
     if not form:
         given['action'] = 'store_true'

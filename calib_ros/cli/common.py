@@ -42,13 +42,13 @@ OF_BAGS = tuple(
     if name not in ('sigma_scale', 'wanted_accuracy')
 )
 """Settings that affect the poses of a bag."""
-LAYOUT = (
+LAYOUT_OPTIONS = (
     *('length', 'angle', 'joint_angle', 'euler', 'quaternion', 'rotation_vector'),
     *('inverse', 'shift', 'separator', 'decimal', 'sheet'),
 )
 """Options of foreign tables."""
 OF_TABLES = (
-    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *LAYOUT),
+    *('session', 'eye_in_hand', 'sigma_touch', 'preset', 'columns', 'joints', *LAYOUT_OPTIONS),
     *('detections', 'board', 'places', 'intrinsics', 'lens'),
 )
 
@@ -140,7 +140,7 @@ def sessions_of(options: argparse.Namespace) -> tuple[str, ...]:
 
 
 @contextmanager
-def results(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Contents]:
+def output_files(options: argparse.Namespace, names: Sequence[str]) -> Iterator[Contents]:
     """Yield the files of --out, to be filled in; they are written at the end, all or none.
 
     Existing files with these names (glob patterns) are refused before any work, or replaced by

@@ -62,7 +62,7 @@ def _bag2csv(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.bag, 'bag2csv', 'bag')
     common.refuse_existing(options, options.csv)
     chain = load_chain(options.chain)
-    session, read = inputs.replayed(options.bag, chain, common.settings_of(options), screen)
+    session, read = inputs.replayed_bag(options.bag, chain, common.settings_of(options), screen)
     screen.say(f'{read}; {session.account()}')
     samples = session.usable
     if not samples:

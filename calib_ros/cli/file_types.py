@@ -19,7 +19,7 @@ BEGINNINGS = (
     (b'&ACCESS', 'native'),
 )
 NATIVE = ('.src', '.mod', '.prg', '.ls', '.tp', '.script', '.urp', '.pgx', '.dtx', '.jbi')
-SUFFIXES = {
+KIND_OF_SUFFIX = {
     **dict.fromkeys(NATIVE, 'native'),
     **dict.fromkeys((*RECORDED, '.bag'), 'bag'),
     **dict.fromkeys(URDF_SUFFIXES, 'urdf'),
@@ -30,7 +30,7 @@ SUFFIXES = {
     **dict.fromkeys(('.xls', '.xlsb', '.ods', '.numbers'), 'workbook'),
 }
 IN_FOLDERS = (('metadata.yaml', 'bag'), ('result.json', 'result'), ('calibration.yaml', 'result'))
-WORDS = {
+FILE_KINDS = {
     'bag': ('a bag', 'use identify or verify, or bag2csv to make a table'),
     'table': ('a table', 'use identify or verify, or csv2bag to make a bag'),
     'program': ('a JointTrajectory', 'use compensate'),
@@ -49,11 +49,11 @@ WORDS = {
 
 
 def _by_suffix(name: str) -> str:
-    return SUFFIXES.get(Path(name).suffix.lower(), '')
+    return KIND_OF_SUFFIX.get(Path(name).suffix.lower(), '')
 
 
 def kind_of(path: Path) -> str:
-    """Return a key of `WORDS`, or empty text if unknown."""
+    """Return a key of `FILE_KINDS`, or empty text if unknown."""
     if path.is_dir():
         names = [each.name for each in path.iterdir()]
         found = [kind for name, kind in IN_FOLDERS if name in names]
@@ -76,7 +76,7 @@ def proposal(path: Path) -> str | None:
     kind = kind_of(path)
     if not kind:
         return None
-    what, where = WORDS[kind]
+    what, where = FILE_KINDS[kind]
     return f'{path} is {what}, not a command: {where} (calib_ros COMMAND --help)'
 
 
@@ -84,7 +84,7 @@ def refuse_others(path: Path, command: str, *wanted: str) -> str:
     """Return which of the wanted kinds a path is: the first of an unknown file, else the last."""
     kind = kind_of(path) or wanted[0 if path.exists() and not path.is_dir() else -1]
     if kind not in wanted:
-        what, where = WORDS[kind]
-        takes = ' or '.join(WORDS[each][0] for each in wanted)
+        what, where = FILE_KINDS[kind]
+        takes = ' or '.join(FILE_KINDS[each][0] for each in wanted)
         raise InputError(f'{path} is {what}, but {command} takes {takes}: {where}')
     return kind

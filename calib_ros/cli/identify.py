@@ -13,7 +13,7 @@ from typing import Any
 
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
-from calib_ros.cli.screen import STATES, Screen
+from calib_ros.cli.screen import GOOD_OR_BAD, Screen
 from calib_ros.decision.changes import reason_in_words
 from calib_ros.decision.comparison import Comparison
 from calib_ros.decision.reasons import Reason, Rule
@@ -68,7 +68,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if update:
         return _recalibrated(options, screen)
     filed = inputs.history_of(options)
-    with common.results(options, (*RESULT_FILES, 'report.pdf')) as contents:
+    with common.output_files(options, (*RESULT_FILES, 'report.pdf')) as contents:
         found = _identified(options, screen)
         if options.out is not None:
             contents |= result_files(found, screen, options.out, options.pdf)
@@ -94,7 +94,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _recalibrated(options: argparse.Namespace, screen: Screen) -> int:
-    with common.results(options, ('calibration.yaml', 'result.json')) as contents:
+    with common.output_files(options, ('calibration.yaml', 'result.json')) as contents:
         loaded, _ = _loaded(options, screen)
         common.at_least(options, growth=0)
         previous = inputs.calibration_of(
@@ -177,9 +177,9 @@ def _loaded(options: argparse.Namespace, screen: Screen) -> tuple[Loaded, Settin
     if options.detections is not None:
         return _detected(options, chain, settings, touched, screen), settings
     if source == 'table':
-        found = inputs.table(options, options.csv, chain, settings, screen, options.eye_in_hand)
+        found = inputs.table_of(options, options.csv, chain, settings, screen, options.eye_in_hand)
         return of_table(found, chain, settings, **touched), settings
-    bag = inputs.replayed(options.measured, chain, settings, screen)
+    bag = inputs.replayed_bag(options.measured, chain, settings, screen)
     return of_bag(*bag, options.largest_loss), settings
 
 
@@ -222,7 +222,7 @@ def _detected(
     held_out: Sequence[Observations] = ()
     by_line = True
     if options.csv is not None:
-        rows = inputs.table(options, options.csv, chain, settings, screen)
+        rows = inputs.table_of(options, options.csv, chain, settings, screen)
         more, held_out, by_line = rows.fitted, rows.held_out, rows.by_line
         warnings = (*warnings, *rows.warnings)
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
@@ -265,7 +265,7 @@ def show(found: Identified, screen: Screen) -> None:
         screen.say(found.loaded.read)
     reasons = advice_of(result)
     verdict = result_standing(result, reasons, found.wanted)
-    screen.title(verdict.heading, STATES.get(verdict.state))
+    screen.title(verdict.heading, GOOD_OR_BAD.get(verdict.state))
     screen.table(_rows(result))
     _explain(result, reasons, screen)
     for line in words.cameras_in_words(result):

@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TypeAlias
 
-from calib_ros.cli.common import LAYOUT, OF_TABLES, Contents, sessions_of, settings_of
+from calib_ros.cli.common import LAYOUT_OPTIONS, OF_TABLES, Contents, sessions_of, settings_of
 from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
@@ -36,7 +36,7 @@ from calib_ros.sampling.dataset import Dataset
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
-WRITTEN = 'give the folder written by identify --out'
+GIVE_FOLDER = 'give the folder written by identify --out'
 
 
 Unread: TypeAlias = dict[Path, list[tuple[str, int, int]]]
@@ -51,7 +51,7 @@ def _files(paths: Iterable[Path]) -> Unread:
 
 def foreign_of(options: argparse.Namespace, chain: Chain | None) -> Foreign | None:
     """Return how to read a table of another system, or None."""
-    given = {name: getattr(options, name) for name in LAYOUT}
+    given = {name: getattr(options, name) for name in LAYOUT_OPTIONS}
     if not (any(given.values()) or options.preset or options.columns or options.joints):
         return None
     given['decimal'] = {'comma': ',', 'point': '.'}.get(given['decimal'], given['decimal'])
@@ -83,9 +83,9 @@ def calibration_of(path: Path, command: str, nominal: Chain | None = None) -> Ca
                 f'the result in {path} was not accepted, so there is no calibration; '
                 f'{path / "report.html"} says why and what to do'
             )
-        raise InputError(f'{path} holds no calibration.yaml: {WRITTEN}')
+        raise InputError(f'{path} holds no calibration.yaml: {GIVE_FOLDER}')
     if not path.exists():
-        raise InputError(f'there is no calibration at {path}: {WRITTEN}')
+        raise InputError(f'there is no calibration at {path}: {GIVE_FOLDER}')
     return load_calibration(path, nominal)
 
 
@@ -136,7 +136,7 @@ def page_of(
     return {each: content for each, content, _ in made if content is not None}
 
 
-def replayed(
+def replayed_bag(
     path: Path, chain: Chain, settings: Settings, screen: Screen
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has replayed a bag."""
@@ -144,7 +144,7 @@ def replayed(
         return loading.replayed(path, chain, settings, work)
 
 
-def table(
+def table_of(
     options: argparse.Namespace,
     path: Path,
     chain: Chain,

@@ -23,7 +23,7 @@ WIDTH = 80  # columns of help and of non-terminals, by convention
 EVERY_S = 2.0
 """Time between two progress lines, doubled each time if they stay, as in a log. A convention."""
 FIRST_S = EVERY_S / 4.0  # time before a bar appears on a terminal
-STATES = {'good': True, 'bad': False}  # of verdicts; others are neither
+GOOD_OR_BAD = {'good': True, 'bad': False}  # of verdicts; others are neither
 STYLES = {True: 'bold green', False: 'bold red', None: 'bold'}
 
 

@@ -38,7 +38,7 @@ def _demo(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'1. simulating an arm with known errors: {options.out / "bag"}')
         truth = _write_simulation(chain, options, bag, screen)
         screen.say('2. reading the recording as if from a real cell')
-        loaded = of_bag(*inputs.replayed(bag, chain, settings, screen))
+        loaded = of_bag(*inputs.replayed_bag(bag, chain, settings, screen))
         screen.say('3. identifying the errors')
         configuration = documents.configuration_yaml(options.chain, settings)
         origin = inputs.origin_of(options, [bag], configuration)

@@ -11,7 +11,7 @@ from dataclasses import replace
 from calib_ros.apply.verification import Verification, verify
 from calib_ros.cli import common, inputs
 from calib_ros.cli.file_types import refuse_others
-from calib_ros.cli.screen import STATES, Screen
+from calib_ros.cli.screen import GOOD_OR_BAD, Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.levels import ALIKE
 from calib_ros.estimation.observations import Observations
@@ -31,12 +31,12 @@ from calib_ros.shown import rounded
 from calib_ros.texts import dump_json
 
 VERIFICATION_FILES = ('report.html', 'report.pdf', 'residuals.csv', 'report.md')
-EARLIER = ('verification.txt',)  # of earlier versions: no verdict stays beside a newer one
+EARLIER_FILES = ('verification.txt',)  # of earlier versions: no verdict stays beside a newer one
 
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     screen.quiet = screen.quiet or options.json
-    with common.results(options, (*VERIFICATION_FILES, *EARLIER)) as contents:
+    with common.output_files(options, (*VERIFICATION_FILES, *EARLIER_FILES)) as contents:
         status = _verified(options, screen, contents)
     if options.out is not None:
         screen.say(common.written(options.out, contents))
@@ -90,7 +90,7 @@ def show(found: Verification, screen: Screen) -> None:
     elif found.limit is not None:
         tolerance += f': {rounded(1e3 * found.limit)} mm, at most {ALIKE:g} x expected error'
     state, steps = standing(found)
-    screen.title(state.heading, STATES.get(state.state))
+    screen.title(state.heading, GOOD_OR_BAD.get(state.state))
     screen.table(
         {
             'measured': f'{after.count:,} times at {found.configurations:,} poses',
@@ -118,9 +118,9 @@ def _sets(
     kind = refuse_others(options.measured, 'verify', 'table', 'bag')
     common.refuse_ignored(options, kind)
     if kind == 'table':
-        found = inputs.table(options, options.measured, nominal, settings, screen)
+        found = inputs.table_of(options, options.measured, nominal, settings, screen)
     else:
-        session, read = inputs.replayed(options.measured, nominal, settings, screen)
+        session, read = inputs.replayed_bag(options.measured, nominal, settings, screen)
         screen.say(f'{read}; {session.account()}')
         if not session.usable:
             raise InputError(f'{options.measured} gives no poses: {session.account()}')

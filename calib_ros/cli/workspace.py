@@ -27,7 +27,7 @@ PLACEMENT_FILES = ('placements.csv', 'placements.png', 'placed_task.csv')
 
 def _run(options: argparse.Namespace, screen: Screen) -> int:
     common.at_least(options, poses=100, cells=1, turns=1, seed=0)
-    with common.results(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
+    with common.output_files(options, WORKSPACE_FILES + PLACEMENT_FILES) as contents:
         contents |= _files(options, screen)
     screen.say(common.written(options.out, contents))
     return 0
