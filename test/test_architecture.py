@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import Counter
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -116,6 +117,25 @@ def test_few_numbers_are_tuned():
         if isinstance(node.value, ast.Constant) and type(node.value.value) in (int, float)
     ]
     assert len(tuned) <= 60, tuned
+
+
+def defined(path):
+    """Return the public names that a module defines at its top level."""
+    found = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else node.targets
+            names = [n for each in targets for n in ast.walk(each) if isinstance(n, ast.Name)]
+            found |= {n.id for n in names if isinstance(n.ctx, ast.Store)}
+    return {name for name in found if not name.startswith('_')}
+
+
+def test_no_name_means_two_things():
+    parallel = {'main', 'show'}  # entry points; what a command prints of its result
+    counts = Counter(name for path in MODULES.values() for name in defined(path))
+    assert {name for name, count in counts.items() if count > 1} == parallel
 
 
 def test_no_two_modules_import_each_other():
