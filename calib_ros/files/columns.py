@@ -26,7 +26,7 @@ from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
 THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
-Row = tuple[int, list[str]]  # line number and cells
+Cells = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
@@ -186,7 +186,7 @@ def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0
     _refuse_zeros(path, data, above)
     as_text(data, str(path), ColumnsError)  # all of it, before any row
     blocks = csv_blocks(path, data, strict=True, above=above)
-    first: list[Row] = next(blocks, [(above, [])])
+    first: list[Cells] = next(blocks, [(above, [])])
     header = [name.strip() for name in first[0][1]]
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
@@ -220,14 +220,14 @@ def _below(
 
 def csv_blocks(
     path: Path, data: bytes, separator: str = ',', strict: bool = False, above: int = 0
-) -> Iterator[list[Row]]:
+) -> Iterator[list[Cells]]:
     """Yield rows that are not blank: the line at which each ends, and its cells.
 
     `above` lines precede the content, which is in UTF-8.
     """
     _refuse_zeros(path, data, above)
     reader = csv.reader(csv_lines(data, str(path)), delimiter=separator, strict=strict)
-    line, block = 0, list[Row]()
+    line, block = 0, list[Cells]()
     try:
         for row in reader:
             line = reader.line_num
