@@ -28,7 +28,7 @@ from calib_ros.report.applied import plan_report
 
 TESTS = 'P1 to P5 of ISO 9283 in a cube of {:.3f} m, in {}; collisions are not checked'
 VISIT = 'visit P1 to P5 in turn, 30 times, and measure each time'
-POSES = 'orientations are measured too (of a reflector alone: --measured position)'
+WITH_TURNS = 'orientations are measured too (of a reflector alone: --measured position)'
 ORIENTED = 'various orientations', 'one orientation'
 
 
@@ -52,7 +52,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
             joints, remarks, plan = _measurement(options, design, visibility, rng, work)
     table = [] if plan is None else planning.accuracy_in_words(plan)
     if plan is not None and options.measured == 'pose':
-        remarks.append(POSES)
+        remarks.append(WITH_TURNS)
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
         remarks.append(f'the tool is unknown: the target is assumed at {place} m from the flange')

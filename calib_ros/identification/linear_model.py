@@ -229,7 +229,8 @@ class LinearModel:
         parts = np.array([each[np.ix_(ends, ends)] for each in self._products[dealing]])
         rest = parts.sum(axis=0)
         rest[: len(extra.T), : len(extra.T)] += extra.T @ extra
-        rest[np.diag_indices(len(rest))] += np.append(0.0 * extra[0], self._priors(chosen) ** 2)
+        priors = np.append(np.zeros(len(extra.T)), self._priors(chosen) ** 2)
+        rest[np.diag_indices(len(rest))] += priors
         # a fold may hold all of a column
         scale = 1.0 / np.sqrt(np.maximum(np.diag(rest)[1:], 1e-300))
         weights = np.zeros((len(parts), len(self._columns)))

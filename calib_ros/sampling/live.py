@@ -90,7 +90,7 @@ class Estimate:
         return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))
 
 
-class Known(NamedTuple):
+class Update(NamedTuple):
     """What an update has found."""
 
     estimate: Estimate | None = None  # None with too few samples
@@ -106,7 +106,7 @@ class LiveEstimate:
 
     def __init__(self, problem_of: Callable[[Sequence[Sample]], Problem]) -> None:
         self._problem_of = problem_of
-        self.known = Known()  # by the last update
+        self.known = Update()  # by the last update
         self.restart()
 
     def restart(self) -> None:
@@ -128,7 +128,7 @@ class LiveEstimate:
         Returns None while there are too few. An update takes at most MOST_AT_ONCE samples.
         """
         estimate = self._updated(samples)
-        self.known = Known(estimate, self.refused, tuple(self.suspicious))
+        self.known = Update(estimate, self.refused, tuple(self.suspicious))
         return estimate
 
     def _updated(self, samples: Sequence[Sample]) -> Estimate | None:
