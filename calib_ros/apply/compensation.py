@@ -212,7 +212,7 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
             i = int(beyond[k].argmax())
             reason = (
                 f'the command {command[k, i]:.6g} of {names[i]} is beyond its limits '
-                f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m, not degrees)'
+                f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m)'
             )
         elif result.limited[k].any():
             held = [name for name, at in zip(names, result.limited[k], strict=True) if at]

@@ -111,8 +111,13 @@ class Step:
         return Reason(Rule.ENCODER if self.kind.startswith('joint') else Rule.MOVED, text, more)
 
 
-def find_step(fitted: Fitted) -> Step | None:
-    """Return the step that explains more than half of the residuals of a fit, if any."""
+def find_step(fitted: Fitted, held: bool = False) -> Step | None:
+    """Return the step that explains more than half of the residuals of a fit, if any.
+
+    None if the arm is `held`, and another load from the first pose on explains them.
+    """
+    if held and _Scan(fitted, loaded=True, gross=True).explained:
+        return None
     scan, found = _searched(fitted, loaded=False)
     if found is None and fitted.noise.position >= SUSPICIOUS:
         scan, found = _searched(fitted, loaded=True)
@@ -206,7 +211,7 @@ class _Scan:
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
         usual = bool(self._left.sum() < SUSPICIOUS**2 * self._equations.sum())
-        self._explained = bool(constant) and usual and fitted.noise.position >= SUSPICIOUS
+        self.explained = bool(constant) and usual and fitted.noise.position >= SUSPICIOUS
 
     def _budget(self, group: _Group) -> tuple[float, float, float]:
         """Return equations, degrees of freedom and remaining squares of a group's sets."""
@@ -217,7 +222,7 @@ class _Scan:
 
     def best(self) -> _Found | None:
         """Return the best step, if it explains most of the squares."""
-        if self._explained:  # by what is wrong from the first pose on
+        if self.explained:  # by what is wrong from the first pose on
             return None
         some = _some_places(self._stops)
         if any(group.held for group in self._groups):

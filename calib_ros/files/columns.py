@@ -63,7 +63,7 @@ class Columns:
             remedy = 'write it without the marks between thousands'
         of_units = row == 0 and text != '' and not re.search('[0-9]', text)
         if of_units:  # perhaps, as other tables have below their header
-            remedy += '; units in a line of their own are read above measurements only'
+            remedy += '; units belong into the header: q1 [deg]'
         return (ColumnsError if of_units else InputError)(
             f'{self.where(row, name)} must be a finite number, not {text!r}: {remedy}'
         )

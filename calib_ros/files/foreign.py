@@ -103,7 +103,9 @@ class Foreign:
 def not_read(path: Path, names: Sequence[str]) -> tuple[str, ...]:
     """Return a warning about columns that are not read, by their names in the file."""
     named = [name for name in names if name and not name.startswith('#')]
-    return (f'{path}: columns not read: {", ".join(some(named))} (--columns)',) * bool(named)
+    return (
+        f'{path}: columns not read: {", ".join(some(named))} (--columns OURS=NAME reads one)',
+    ) * bool(named)
 
 
 def as_csv(columns: Columns) -> str:

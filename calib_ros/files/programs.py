@@ -50,13 +50,19 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
     found = read_columns(path, ())
     names, _, program = _program(found, chain)
     values, _ = joint_values(chain, program)
-    remedy = f': name columns in degrees {names[0]} [deg]'
+
+    def remedy(i: int) -> str:
+        return '' if name_and_unit(names[i])[1] else f'; in degrees the column is {names[i]} [deg]'
+
     check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ', remedy)
     return values
 
 
 def check_limits(
-    values: FloatArray, chain: Chain, where: Callable[[int, int], str], remedy: str = ''
+    values: FloatArray,
+    chain: Chain,
+    where: Callable[[int, int], str],
+    remedy: Callable[[int], str] = lambda i: ', not degrees',
 ) -> None:
     """Refuse joint values (N, n) 1e-3 beyond their limits, or as `check_turns`."""
     check_turns(values, chain, where)
@@ -65,7 +71,7 @@ def check_limits(
     for k, i in np.argwhere(beyond)[:1].tolist():
         raise InputError(
             f'{where(k, i)}{values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
-            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m, not degrees{remedy})'
+            f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m{remedy(i)})'
         )
 
 
@@ -100,17 +106,13 @@ def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], FloatArray,
 
     ways = (names, [*joints], [name.upper() for name in names])
     names = next((each for each in ways if {*needed(each)} <= {*header}), names)
-    columns, units = [], []
-    for joint, name in zip(chain.joints, names, strict=True):
+    columns = []
+    for name in names:
         several = [found.header[k] for k in places(found.header, name)]
         if len(several) > 1:
             raise InputError(f'{found.path} has several columns {", ".join(several)}: keep one')
         columns.append((several or [name])[0])
-        unit = name_and_unit(columns[-1])[1]
-        known = ANGLES if joint.type == 'revolute' else LENGTHS
-        if unit and unit not in known:
-            raise InputError(f'{found.path}: {columns[-1]} must be in {" or ".join(known)}')
-        units.append(known.get(unit, 1.0))
+    units = _units(found, chain, columns)
     how = '; values are in rad or m, or in the unit named there: q1 [deg]'
     how += '; of a Fanuc q3 = J3 + J2' * ('J3' in header)
     with_rows(found, needed(columns), how)
@@ -119,8 +121,26 @@ def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], FloatArray,
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
     given = [k for k, column in enumerate(columns) if column in found.header]
-    values = found.block([columns[k] for k in given]) * np.array(units)[given]
-    return tuple(columns), np.array(units), Program(tuple(joints[k] for k in given), values)
+    values = found.block([columns[k] for k in given]) * units[given]
+    return tuple(columns), units, Program(tuple(joints[k] for k in given), values)
+
+
+def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
+    """Return the units (n) [rad or m] of the joints' columns."""
+    units, seen = [], dict[tuple[str, bool], str]()
+    for joint, column in zip(chain.joints, columns, strict=True):
+        unit = name_and_unit(column)[1]
+        known = ANGLES if joint.type == 'revolute' else LENGTHS
+        if unit and unit not in known:
+            raise InputError(f'{found.path}: {column} must be in {" or ".join(known)}')
+        units.append(known.get(unit, 1.0))
+        if column in found.header:
+            seen[joint.type, bool(unit)] = column
+    for (kind, named), column in seen.items():
+        if not named and (kind, True) in seen:
+            other = seen[kind, True]
+            raise InputError(f'{found.path}: {column} has no unit, {other} has: name it in all')
+    return np.array(units)
 
 
 def read_poses(path: Path) -> FloatArray:

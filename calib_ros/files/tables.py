@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -89,12 +90,13 @@ def read_table(
         read = _of_journal(path, joints, progress)
     if read is None:
         found = columns_of(path, read_bytes(path, LARGEST_TABLE, InputError), progress)
-        cells = {
-            low if (low := name.lower()) in WORDS and low not in found.words else name: text
-            for name, text in found.words.items()
-        }
-        found = replace(found, words=cells)
-        read = found, tuple(_unread(found, joints))
+        lower = Counter(map(str.lower, found.words))
+        meant = {name: name.lower() for name in found.words if lower[name.lower()] == 1}
+        meant = {name: ours for name, ours in meant.items() if ours in WORDS and ours != name}
+        notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
+        words = {meant.get(name, name): text for name, text in found.words.items()}
+        found = replace(found, words=words)
+        read = found, (*notes, *_unread(found, joints))
     found, warnings = read
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
     return _table(rows, sigmas, eye_in_hand, warnings, by_line)

@@ -238,7 +238,7 @@ class Calibration(Shown):
             _, _, fitted = fit(Problem(chain, sets[0], more=tuple(sets[1:]), fixed=arm))
         except InputError:  # too few for frames of their own
             return None
-        found = find_step(fitted)
+        found = find_step(fitted, held=True)
         return found and replace(found, unused='')  # here every measurement counts
 
     def frames_of(self, owners: Mapping[str, records.Owner]) -> dict[str, str]:

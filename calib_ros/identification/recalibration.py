@@ -130,14 +130,16 @@ def _recalibrated(
     system = _system(problem, sets, previous)
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
-    own = [name for frame in new for name in parameters_of(frame)]
-    names = changes.shown(nominal, arm.names, own)
+    free = (frame for frame in new if not arm.chain.frame(frame).fixed)
+    own = [name for frame in free for name in parameters_of(frame)]
+    shown = changes.shown(nominal, arm.names, own)
+    names = [name for name in arm.names if name in own or name in shown]
     if names:
         seen = excited(triangular_factor(arm.chain, own, system), own)
-        free = [k for k, name in enumerate(arm.names) if name in names]
+        which = [k for k, name in enumerate(arm.names) if name in names]
         square = arm.square.copy()
-        square[free], square[:, free] = 0.0, 0.0
-        square[free, free] = 100.0  # m^2, rad^2: anywhere
+        square[which], square[:, which] = 0.0, 0.0
+        square[which, which] = 100.0  # m^2, rad^2: anywhere
         arm = replace(arm, chain=minimise(arm.chain, seen, system).chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]

@@ -58,16 +58,15 @@ def load_chain(name_or_path: str | os.PathLike[str]) -> Chain:
     """
     path = Path(name_or_path)
     if path.suffix in URDF_SUFFIXES:
-        chain = replace(read_urdf(path), base=None, tool=None)
-    else:
-        if not path.suffix and not path.is_file():
-            robots = shipped_robots()
-            if str(name_or_path) not in robots:
-                raise UnknownNameError(
-                    'robot (or path of a chain file or URDF)', str(name_or_path), robots
-                )
-            path = robots[path.name]
-        chain = parse_chain(chain_text(path), str(path))
+        return replace(read_urdf(path), base=None, tool=None)
+    if not path.suffix and not path.is_file():
+        robots = shipped_robots()
+        if str(name_or_path) not in robots:
+            raise UnknownNameError(
+                'robot (or path of a chain file or URDF)', str(name_or_path), robots
+            )
+        path = robots[path.name]
+    chain = parse_chain(chain_text(path), str(path))
     _refuse_degrees(chain, str(path))
     return chain
 
@@ -91,7 +90,9 @@ def read_urdf(
     convention: Convention = 'standard',
 ) -> Chain:
     """Read the chain between two links of a URDF, with its frames (`urdf.chain_from_urdf`)."""
-    return chain_from_urdf(chain_text(path), base_link, tip_link, convention)
+    chain = chain_from_urdf(chain_text(path), base_link, tip_link, convention)
+    _refuse_degrees(chain, str(path))
+    return chain
 
 
 def chain_text(path: Path) -> str:

@@ -263,6 +263,7 @@ WRONG = [
     ('.csv', 'q1,q1,q2,q3,q4,q5,q6\n1,1,2,3,4,5,6\n', 'several columns q1'),
     ('.csv', 'J1,J2,J3,J4,J5,J6\n1,2,3,4,5,6\n', 'J6: name them in the first line; .*q3 = J3'),
     ('.csv', 'q1,q2,q3,q4,q5,q6 [mm]\n1,2,3,4,5,6\n', 'q6 .mm. must be in rad or deg'),
+    ('.csv', 'q1 [deg],q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', r'q1 .deg. has: name it in all'),
     ('.csv', 'q1,q2,q3,q4,q5,q6,q6 [deg]\n1,2,3,4,5,6,6\n', 'columns q6, q6 .deg.: keep one'),
     ('.csv', '# picks\nq1,q2,q3,q4,q5,q6\n1,2,3,4,5,6\n', 'header; remove other lines above'),
     ('.csv', 'q1,q2,q3,q4,q5,q6\n1,2,3,4,5\n', "line 2: q6 must be a finite number, not ''"),

@@ -253,6 +253,14 @@ def test_columns_of_names_are_read_in_any_case(tmp_path, name):
         read_table(path, 2)
 
 
+def test_a_name_in_another_case_is_told_and_two_are_not_read(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text('q1,q2,x,y,z,Target\n0,0,1,2,3,a\n')
+    assert read_table(path, 2).warnings == (f'{path}: the column Target is read as target',)
+    path.write_text('q1,q2,x,y,z,Target,TARGET\n0,0,1,2,3,a,b\n')
+    assert 'columns not read: Target, TARGET (' in read_table(path, 2).warnings[0]
+
+
 def test_one_column_has_a_line_for_each_row(tmp_path):
     """Split at separators it had one more."""
     path = tmp_path / 'axis.csv'

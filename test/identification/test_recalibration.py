@@ -377,3 +377,20 @@ def test_heights_on_a_scara_are_told_from_each_other(seed):
     found = recalibrate(previous, other, 0.1, new=('tool',))
     assert found.accepted
     assert not found.changed
+
+
+def test_another_of_several_targets_may_be_new(earlier):
+    true, second, chain = earlier[0], random_frame(np.random.default_rng(5), 0.2), UR10E
+    chain = chain.with_frame('second', second)
+
+    def seen(frame, count):
+        rng = np.random.default_rng(count)
+        q = UR10E.random_joints(count, rng)
+        return replace(measure(replace(true, tool=frame), q, rng, *NOISE), tool='second')
+
+    first = problem(true, 50, 1).observations
+    previous = Calibration.of(identify(Problem(chain, first, more=(seen(second, 20),), **SIGMAS)))
+    moved = Problem(chain, seen(random_frame(np.random.default_rng(8), 0.2), 12), **SIGMAS)
+    found = recalibrate(previous, moved, 0.1, new=('second',))
+    assert found.accepted
+    assert not found.changed
