@@ -164,6 +164,17 @@ def test_what_moved_while_poses_were_measured_is_named(cell, arm, moved, words, 
     assert 'something moved' not in text
 
 
+def test_another_load_from_the_first_pose_on_is_no_move(cell, arm):
+    """Of few poses it looks like a step here and there."""
+    joints = UR.random_joints(12, np.random.default_rng(7))
+    bent = {'shoulder_lift_joint': 1.5e-3, 'elbow_joint': 8e-4, 'wrist_1_joint': 5e-4}
+    bent = {f'{joint}.gravity_wrist_3_joint': size for joint, size in bent.items()}
+    true = cell[0].with_effects([*bent]).with_offsets(bent)
+    found = verify(arm, [measured(true, joints, 1)], 2e-4)
+    assert found.verdict == 'FAIL'
+    assert found.step is None
+
+
 def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, arm):
     seen = measured(cell[0], UR.random_joints(10, np.random.default_rng(3)), 1)
     late = np.arange(10)[:, np.newaxis] > 3
