@@ -146,9 +146,9 @@ def hints(found: Verification) -> list[str]:
     if found.mistake:
         return lines
     if found.step:
-        side = 'before' if found.odd and found.odd[0] else 'after'
-        within = f'; the poses {side} that are within the limit' * bool(found.odd)
-        lines.append(f'something moved while you measured: {found.step}{within}')
+        lines.append(f'something moved while you measured: {found.step}')
+        if found.odd:
+            lines.append(_apart(found))
     elif found.odd:
         lines.append(_apart(found))
     elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:

@@ -282,7 +282,7 @@ class CalibrationSession:
         updated before, or only by `learning`.
         """
         if learn:
-            self.learning()()
+            self._live.update(self.usable)
         parts = [self.state, work]
         if why := self._filter.refused.get(POSES):
             parts.append(f'measurements are refused, {why}')

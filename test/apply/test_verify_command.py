@@ -159,7 +159,7 @@ def test_what_moved_while_poses_were_measured_is_named(cell, arm, moved, words, 
     assert found.verdict == 'FAIL'
     assert f'something moved while you measured: {words}' in text
     assert ' before line 11 ' in text
-    assert 'the poses before that are within the limit' in text
+    assert 'poses 11 to 24 alone are up to ' in text
     text = in_words(verify(arm, [then], 2e-4))  # before the first pose
     assert 'something moved' not in text
 
