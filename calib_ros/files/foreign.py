@@ -331,10 +331,14 @@ class _Table:
 
 
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
-    """Return a column that names the poses of both, if any, and the row in the log of each."""
+    """Return a column that names the poses of both, if any, and the row in the log of each.
+
+    It may have other capitals in the log.
+    """
+    others = {name.lower(): name for name in log.header}
     for name in table.header:
-        if name in log.header:
-            named, logged = table.cells(name), log.cells(name)
+        if name.lower() in others:
+            named, logged = table.cells(name), log.cells(others[name.lower()])
             rows = {cell: row for row, cell in enumerate(logged)}
             if len(rows) == len(logged) and len({*named}) == len(named) and {*named} <= {*rows}:
                 return name, np.array([rows[cell] for cell in named])

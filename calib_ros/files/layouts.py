@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -201,9 +201,8 @@ def load_layout(name_or_path: str) -> Layout:
         raise ConfigError(f'{path}: {err}') from err
 
 
-def parse_columns(text: str) -> dict[str, str]:
-    """Return the columns of `q1=A1,x={Pos X},...`; `q*=A*` stands for up to 50 joints."""
-    found: dict[str, str] = {}
+def parse_columns(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the columns of `q1=A1,x={Pos X},...`; `q*=A*` stands for up to 50 joints."""
     for part in re.split(r',(?![^{]*\})', text):
         ours, equals, theirs = part.partition('=')
         ours, theirs = ours.strip(), theirs.strip()
@@ -211,10 +210,9 @@ def parse_columns(text: str) -> dict[str, str]:
             raise ConfigError(f'columns are given as OURS=THEIRS,..., not "{part.strip()}"')
         if re.fullmatch(r'[qsva]\*', ours):
             for k in range(1, MOST_NAMES + 1):
-                found[f'{ours[0]}{k}'] = theirs.replace('*', str(k))
+                yield f'{ours[0]}{k}', theirs.replace('*', str(k))
         else:
-            found[ours] = theirs
-    return found
+            yield ours, theirs
 
 
 def _in_their_names(text: str, known: Mapping[str, str]) -> str:
@@ -230,7 +228,8 @@ def _in_their_names(text: str, known: Mapping[str, str]) -> str:
 def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> Layout:
     """Return the layout of a preset, if any, with the given values on top.
 
-    Later `columns` may use our names of earlier ones: `q*=J*`, then `q3=q3+q2`.
+    Later `columns` may use our names of earlier ones: `q*=J*`, then `q3=q3+q2`. Of one text, a
+    name that comes again begins the later ones.
     """
     layout = load_layout(preset) if preset else Layout()
     changes = {name: value for name, value in given.items() if value}
@@ -239,10 +238,12 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
             layout = replace(layout, euler='', quaternion='', rotation_vector=False)
     merged = dict(layout.columns)
     for text in columns:
-        merged |= {
-            ours: theirs if ours in WORDS else _in_their_names(theirs, merged)
-            for ours, theirs in parse_columns(text).items()
-        }
+        known, defined = dict(merged), set[str]()
+        for ours, theirs in parse_columns(text):
+            if ours in defined:
+                known, defined = dict(merged), set()
+            merged[ours] = theirs if ours in WORDS else _in_their_names(theirs, known)
+            defined.add(ours)
     return replace(layout, columns=merged, **changes)
 
 

@@ -20,6 +20,8 @@ def test_later_columns_may_use_our_names_of_earlier_ones():
     columns = layout_of('', given, {}).columns
     assert (columns['q1'], columns['q2']) == ('(J2)', '((J1))-{q1}')
     assert columns['target'] == 'q1'
+    columns = layout_of('', ['q*=J*,q3=q3+q2,q1=q2,q2=q1'], {}).columns
+    assert [columns[f'q{k}'] for k in (1, 2, 3)] == ['(J2)', '(J1)', '(J3)+(J2)']
     coupled = layout_of('fanuc', ['q3=q3-q2'], {}).columns['q3']
     assert coupled == '(J3 + J2)-(J2)'
     with pytest.raises(ConfigError, match=r'OURS=THEIRS,.*, not "x="'):
@@ -189,7 +191,7 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
     """Of a tracker and a controller: other orders, a pose not measured, decimal commas."""
     log = 'Robot 7\n24.11.2026;noon\nPoint;Date;J1 [°];J2 [°]\n'
     log += ''.join(f'P{k};24.11.2026;{10 * k},0;{k},5\n' for k in range(1, 5))
-    points = 'Points\n\nPoint;X [mm];Y [mm];Z [mm]\n'
+    points = 'Points\n\nPOINT;X [mm];Y [mm];Z [mm]\n'
     points += ''.join(f'P{k};{100 * k},5;0,0;1,0\n' for k in (4, 1, 3))
     (tmp_path / 'log.csv').write_text(log)
     (tmp_path / 'points.csv').write_text(points)
@@ -203,7 +205,7 @@ def test_poses_are_matched_by_their_names_below_titles_and_in_the_units_of_the_h
     (found,) = (table := read_table(tmp_path / 'points.csv', 2, foreign=given)).fitted
     np.testing.assert_allclose(np.rad2deg(found.joints), [[40, 4.5], [10, 1.5], [30, 3.5]])
     np.testing.assert_allclose(found.positions[:, 0], [0.4005, 0.1005, 0.3005])
-    assert 'matched by the column "Point"' in ' '.join(table.warnings)
+    assert 'matched by the column "POINT"' in ' '.join(table.warnings)
     separators = [each for each in table.warnings if 'semicolons' in each]
     assert [each.rpartition('/')[2].partition(':')[0] for each in separators] == [
         'points.csv',
