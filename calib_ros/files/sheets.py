@@ -268,8 +268,8 @@ def _cell(value: object) -> str:
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
-    lines = [line for line in text[: _after(text, HEAD_LINES)].split('\n') if line.strip()]
-    lines = lines[-30:]  # mostly below the header
+    head = re.sub('"[^"\n]*"', '0', text[: _after(text, HEAD_LINES)])  # cells in quotes
+    lines = [line for line in head.split('\n') if line.strip()][-30:]  # mostly below the header
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most, cells = 'comma', 0, 1
