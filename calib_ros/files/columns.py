@@ -25,7 +25,9 @@ from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, as_text, csv_lines, from_c
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
-THOUSANDS = re.compile(r"[+-]?[0-9]{1,3}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
+THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
+MISSING = frozenset(('', 'nan', '-nan', 'na', 'n/a', '#n/a', '#nv', 'null', 'none', '-', '--'))
+"""Cells without a value, in small letters."""
 Cells = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
 Codes = tuple[Index, list[str]]
@@ -45,6 +47,7 @@ class Columns:
     words: Mapping[str, str]
     values: Mapping[str, FloatArray] = field(default_factory=dict)
     theirs: tuple[str, ...] = ()  # names in the file, if others
+    decimal: str = '.'  # sign in the numbers of `words`
 
     @property
     def header(self) -> tuple[str, ...]:
@@ -57,11 +60,12 @@ class Columns:
 
     def _no_number(self, row: int, name: str, text: str = '') -> InputError:
         remedy = 'correct that row or leave it out'
-        if DECIMAL_COMMA.fullmatch(text):
-            remedy = 'write a point, or give --decimal comma'
-        elif THOUSANDS.fullmatch(text):
+        if THOUSANDS.fullmatch(text):
             remedy = 'write it without the marks between thousands'
-        of_units = row == 0 and text != '' and not re.search('[0-9]', text)
+        if DECIMAL_COMMA.fullmatch(text):
+            told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(text))
+            remedy = f'write a point, or give --decimal comma{told}'
+        of_units = row == 0 and text.lower() not in MISSING and not re.search('[0-9]', text)
         if of_units:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'
         return (ColumnsError if of_units else InputError)(
@@ -72,7 +76,8 @@ class Columns:
         """Return numbers (N, len(names)), NaN for empty cells; errors name them as `called`."""
         found = np.zeros((len(self.lines), len(names)))
         for k, name in enumerate(names):
-            found[:, k] = self.values[name] if name in self.values else _numbers(self.words[name])
+            given = self.values.get(name)
+            found[:, k] = _numbers(self.words[name], self.decimal) if given is None else given
         for row, k in np.argwhere(np.isinf(found))[:1].tolist():
             raise self._no_number(row, (called or names)[k], self.texts(names[k])[row])
         return found
@@ -87,7 +92,8 @@ class Columns:
             blank = np.isnan(found)
             lacking = blank.any(axis=1) & (needed | ~blank.all(axis=1))
             for row in np.flatnonzero(lacking)[:1].tolist():
-                raise self._no_number(row, names[int(blank[row].argmax())])
+                name = names[int(blank[row].argmax())]
+                raise self._no_number(row, name, self.texts(name)[row])
             highest = np.nanmax(np.abs(found), initial=0.0)
         if highest > largest:
             row, k = np.argwhere(np.abs(found) > largest)[0].tolist()
@@ -120,7 +126,7 @@ class Columns:
         """Return (N,) which cells of a column are empty."""
         if name in self.values:
             return np.isnan(self.values[name])
-        return np.array([not text for text in self.texts(name)], dtype=bool)
+        return np.array([text.lower() in MISSING for text in self.texts(name)], dtype=bool)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -247,11 +253,17 @@ def csv_blocks(
         yield block
 
 
-def _numbers(text: str) -> FloatArray:
+def _numbers(text: str, decimal: str = '.') -> FloatArray:
     """Return the numbers (N,) in joined cells, NaN if blank, infinity if there is none.
 
-    They are read in parts: numpy takes four bytes for a character.
+    They are read in parts: numpy takes four bytes for a character. Points between thousands are
+    no decimals: 1.554 beside decimal commas is no number.
     """
+    if decimal == ',' and '.' in text:
+        cells = text.split(BETWEEN)
+        text = BETWEEN.join([f'{c}?' if '.' in c and THOUSANDS.fullmatch(c) else c for c in cells])
+    if decimal == ',':
+        text = text.replace(',', '.')
     if not text.strip(BETWEEN):
         return np.full(text.count(BETWEEN) + 1, np.nan)
     found, begin = [], 0
@@ -260,20 +272,18 @@ def _numbers(text: str) -> FloatArray:
         part = text[begin : end if end >= 0 else None]
         begin += len(part) + 1
         try:  # a line of numbers, behind one because no line may be empty
-            numbers = np.loadtxt([f'0{BETWEEN}{part}'], delimiter=BETWEEN, comments=None)[1:]
-            found.append(np.where(np.isfinite(numbers), numbers, np.inf))
+            found.append(np.loadtxt([f'0{BETWEEN}{part}'], delimiter=BETWEEN, comments=None)[1:])
         except ValueError:
-            found.append(np.array([_number(cell) for cell in part.split(BETWEEN)]))
+            found.append(np.array([*map(cell_number, part.split(BETWEEN))]))
     return np.concatenate(found)
 
 
-def _number(text: str) -> float:
-    """Return the number in a cell, NaN if blank, infinity if it has none."""
-    try:
-        number = float(text or 'nan')
-    except ValueError:
-        return math.inf
-    return number if not text or math.isfinite(number) else math.inf
+def cell_number(text: str) -> float:
+    """Return the number in a cell (1.5D-3 as Fortran writes), NaN if blank, else infinity."""
+    low = text.lower()
+    with suppress(ValueError):
+        return math.nan if low in MISSING else float(low.replace('d', 'e'))
+    return math.inf
 
 
 def codes_of(texts: Sequence[str]) -> Codes:
@@ -304,22 +314,6 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
 def lines_in_words(lines: Sequence[int]) -> str:
     """Return the numbers of the first lines as text."""
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
-
-
-def distinct_rows(codes: Index) -> tuple[Index, Index]:
-    """Return the different rows of (N, C) in order of appearance, and their indices (N,)."""
-    if not codes.any():
-        return codes[:1], np.zeros(len(codes), dtype=np.intp)
-    sizes = [int(size) + 1 for size in codes.max(axis=0)]
-    if math.prod(sizes) < 2**62:
-        joined = np.ravel_multi_index(tuple(codes.T), sizes)
-        _, first, number = np.unique(joined, return_index=True, return_inverse=True)
-    else:
-        _, first, number = np.unique(codes, axis=0, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    rank = np.empty(len(order), dtype=np.intp)
-    rank[order] = np.arange(len(order))
-    return codes[first[order]], rank[number.reshape(-1)]
 
 
 def with_rows(found: Columns, needed: Sequence[str], how: str = '') -> Columns:

@@ -20,7 +20,6 @@ from calib_ros.files.columns import (
     Columns,
     check_quaternions,
     codes_of,
-    distinct_rows,
     lines_in_words,
     named_by_option,
     refuse_separator,
@@ -269,7 +268,10 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
     lines = columns.lines.astype(np.int64) * 1_000_000_000
     if 'stamp_ns' not in columns.header or columns.blank('stamp_ns').all():
         return lines
-    return columns.integers('stamp_ns', lines)
+    try:
+        return columns.integers('stamp_ns', lines)
+    except InputError as err:
+        raise InputError(f'{err}; if it is in seconds, give --columns time=stamp_ns') from err
 
 
 def _devices(columns: Columns, kind: Index) -> Codes:
@@ -324,3 +326,19 @@ def _covariance(
         raise InputError(f'{columns.path}, line {line}: c11 ... c66: {faults[k]}')
     full[~given | ~full.any(axis=(1, 2))] = np.nan
     return None if np.isnan(full).all() else full
+
+
+def distinct_rows(codes: Index) -> tuple[Index, Index]:
+    """Return the different rows of (N, C) in order of appearance, and their indices (N,)."""
+    if not codes.any():
+        return codes[:1], np.zeros(len(codes), dtype=np.intp)
+    sizes = [int(size) + 1 for size in codes.max(axis=0)]
+    if math.prod(sizes) < 2**62:
+        joined = np.ravel_multi_index(tuple(codes.T), sizes)
+        _, first, number = np.unique(joined, return_index=True, return_inverse=True)
+    else:
+        _, first, number = np.unique(codes, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.intp)
+    rank[order] = np.arange(len(order))
+    return codes[first[order]], rank[number.reshape(-1)]

@@ -8,11 +8,12 @@ Guesses (encoding, separator, decimal sign, header line) are reported.
 from __future__ import annotations
 
 import codecs
+import math
 import re
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,10 @@ from typing import Any
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
     DECIMAL_COMMA,
+    THOUSANDS,
     Cells,
     Columns,
+    cell_number,
     csv_blocks,
     lines_in_words,
     of_rows,
@@ -138,7 +141,11 @@ def _sheet(
     path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
-    commas = any(DECIMAL_COMMA.fullmatch(cell) for _, cells in rows for cell in cells)
+    commas = any(
+        DECIMAL_COMMA.fullmatch(cell) and not THOUSANDS.fullmatch(cell)
+        for _, cells in rows
+        for cell in cells
+    )
     decimal = layout.decimal or (',' if commas and content.separator != ',' else '.')
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
@@ -156,9 +163,8 @@ def _sheet(
     body: Iterable[Sequence[Cells]] = [rows[first:]]
     if content.text:
         body = _below(path, content.text, start, content.separator)
-    if decimal == ',':
-        body = map(_with_points, body)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
+    columns = replace(columns, decimal=decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header, above, columns, tuple(notes))
 
@@ -181,10 +187,6 @@ def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[C
     for block in csv_blocks(path, body.encode(), separator, above=start - 1):
         rows = [(line, [*map(str.strip, cells)]) for line, cells in block]
         yield [(line, cells) for line, cells in rows if any(cells)]
-
-
-def _with_points(block: Sequence[Cells]) -> list[Cells]:
-    return [(line, [cell.replace(',', '.') for cell in cells]) for line, cells in block]
 
 
 def _after(text: str, lines: int) -> int:
@@ -345,8 +347,4 @@ def _first(
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    try:
-        float(cell.replace(',', '.') if decimal == ',' else cell)
-    except ValueError:
-        return False
-    return True
+    return math.isfinite(cell_number(cell.replace(',', '.') if decimal == ',' else cell))

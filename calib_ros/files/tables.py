@@ -27,7 +27,6 @@ from calib_ros.files.columns import (
     Codes,
     Columns,
     columns_of,
-    distinct_rows,
     joined_columns,
     joints_left_out,
     lines_in_words,
@@ -48,6 +47,7 @@ from calib_ros.files.measurements import (
     POSE,
     SOCKET,
     Measurements,
+    distinct_rows,
     measurements,
 )
 from calib_ros.kinematics import se3

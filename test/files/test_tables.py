@@ -5,7 +5,8 @@ import pytest
 
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files import loading
-from calib_ros.files.columns import distinct_rows, read_columns
+from calib_ros.files.columns import read_columns
+from calib_ros.files.measurements import distinct_rows
 from calib_ros.files.tables import read_table
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.settings import Settings
