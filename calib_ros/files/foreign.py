@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,6 +17,7 @@ from calib_ros.files.columns import (
     BETWEEN,
     Columns,
     as_typed,
+    cell_number,
     like_joints,
     lines_in_words,
     named_by_option,
@@ -44,7 +46,7 @@ from calib_ros.shown import some
 from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
 
-MEASURED_COLUMNS = (*POSITION, 'distance')
+MEASURED_COLUMNS = (*POSITION, 'distance', 'socket', 'plane')
 WHAT = {'length': 'lengths', 'angle': 'angles', 'joint-angle': 'joint values'}
 
 
@@ -71,12 +73,18 @@ class Foreign:
             joints = log.values()
             if 'q1' not in joints:
                 joined = 0 if self.chain is None else len(self.chain.joints)
-                like = as_typed(like_joints(log.names, joined).get('q*', 'NAME*'))
+                like = like_joints(log.names, joined) or {'q*': 'NAME*'}
+                given = ','.join(f'{ours}={as_typed(name)}' for ours, name in like.items())
                 raise InputError(
-                    f'{self.log} has no column q1; {log.has}: give --columns "q*={like}" or '
+                    f'{self.log} has no column q1; {log.has}: give --columns "{given}" or '
                     '--joints-preset'
                 )
             matched, partners = _partners(table, log)
+            if not {*MEASURED_COLUMNS} & {*values}:
+                raise InputError(
+                    f'{path} has no column x, y, z; {table.has}. '
+                    f'{named_by_option(table.names, POSITION, 0)}'
+                )
             if len(partners) != len(lines):
                 raise InputError(
                     f'{self.log} has {len(log.lines)} rows, {path} has {len(lines)}: give both a '
@@ -91,13 +99,17 @@ class Foreign:
         made = Columns(path, lines, table.words(), values, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
-        measured = [made.values[name] for name in MEASURED_COLUMNS if name in made.values]
-        good = np.asarray(~np.isnan(np.column_stack(measured or [np.zeros(1)])).all(axis=1))
-        if not good.all():
-            lines = made.lines[~good].tolist()
-            notes.append(f'{path}: nothing measured in {lines_in_words(lines)}: skipped')
-            made = made.select(good)
-        return finished(made, self.layout), tuple(notes)
+        made, skipped = measured(made)
+        return finished(made, self.layout), (*notes, *skipped)
+
+
+def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
+    """Return the rows in which something was measured, and a note about the others."""
+    blank = [made.blank(name) for name in MEASURED_COLUMNS if name in made.header]
+    if not blank or not (empty := np.logical_and.reduce(blank)).any():
+        return made, ()
+    left = lines_in_words(made.lines[empty].tolist())
+    return made.select(~empty), (f'{made.path}: nothing measured in {left}: skipped',)
 
 
 def not_read(path: Path, names: Sequence[str]) -> tuple[str, ...]:
@@ -171,6 +183,8 @@ class _Table:
             bare, _ = name_and_unit(self._sheet.header[column])
             if ours[0] in 'sva' and ours[1:].isdigit() and bare != name:
                 continue  # the axes of KUKA are A1, A2, ...: no accelerations
+            if ours == 'time' and math.isinf(cell_number(self.cells(f'#{column + 1}')[0])):
+                continue  # a date
             kept[ours] = Expression.parse(f'#{column + 1}')
             if name != ours:
                 guessed.append(f'{ours} = {name}')

@@ -253,7 +253,10 @@ def finished(made: Columns, layout: Layout) -> Columns:
     time = values.pop('time', None)
     if time is not None:
         for line in made.lines[~(np.abs(time) <= 9e9)][:1].tolist():
-            raise InputError(f'{path}, line {line}: time [s] must be a number of at most 9e9')
+            raise InputError(
+                f'{path}, line {line}: time [s] must be a number of at most 9e9: if it is in ms, '
+                'give --columns time=NAME/1000'
+            )
         words['stamp_ns'] = BETWEEN.join(str(round(each * 1e9)) for each in time.tolist())
     rotation, axes = _rotations(values, layout, made)
     sigmas = [values.pop(name, None) for name in SIGMAS]

@@ -129,6 +129,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
         text = text.replace('\r\n', '\n').replace('\r', '\n')
     if layout.comment:
         text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
+    text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
     separator = layout.cut or _separator(path, text, notes)
     if separator == ' ':
         text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
@@ -312,20 +313,24 @@ def _header(
     words = [sum(not _is_number(c, ',') for c in cells if c) for _, cells in rows[:HEAD_LINES]]
     likely = words.index(max(words))  # title and data have fewer
     best: tuple[int, set[str]] = (likely, wanted)
+    numbers = [int(name[1:]) - 1 for name in names if name.startswith('#')]
     for k, (_, cells) in enumerate(rows[:HEAD_LINES]):
         bare = {name_and_unit(cell)[0] for cell in cells}
         missing = wanted - bare - set(cells)
         if wanted and not missing:
             return k, tuple(cells)
         if not wanted and len(low & {name.lower() for name in bare}) > 1:
-            return k, tuple(cells)
+            found = [cells[i] for i in numbers if i < len(cells)]
+            of_data = any(_is_number(cell, ',') for cell in found)
+            return (-1, ()) if of_data else (k, tuple(cells))
         if len(missing) < len(best[1]):
             best = (k, missing)
     if not wanted:
         return (-1, ()) if names else (likely, tuple(rows[likely][1]))
-    found = ', '.join(f'"{cell}"' for cell in rows[best[0]][1] if cell)
+    has = ', '.join(f'"{cell}"' for cell in rows[best[0]][1] if cell)
     raise InputError(
-        f'{path} has no column {", ".join(sorted(best[1]))}; line {rows[best[0]][0]} has {found}'
+        f'{path} has no column {", ".join(sorted(best[1]))}; line {rows[best[0]][0]} has {has}: '
+        'name its columns (--columns OURS=NAME or OURS=#NUMBER)'
     )
 
 
@@ -342,7 +347,12 @@ def _first(
             return k
     none = [f'{path} has no rows of numbers in the columns named']
     for line, cells in rows[at + 1 : at + 2]:
-        none += [f'line {line} has "{cells[i]}"' for i in used[:1] if i < len(cells)]
+        none += [
+            f'line {line} has "{cells[i]}": numbers without units are expected there; other '
+            'columns are named by --columns OURS=NAME or OURS=#NUMBER'
+            for i in used[:1]
+            if i < len(cells)
+        ]
     raise InputError('; '.join([*none, *notes]))
 
 

@@ -31,7 +31,7 @@ from calib_ros.files.columns import (
     joints_left_out,
     lines_in_words,
 )
-from calib_ros.files.foreign import Foreign, not_read
+from calib_ros.files.foreign import Foreign, measured, not_read
 from calib_ros.files.layouts import (
     COVARIANCE,
     POSITION,
@@ -96,7 +96,10 @@ def read_table(
         notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
         words = {meant.get(name, name): text for name, text in found.words.items()}
         found = replace(found, words=words)
-        read = found, (*notes, *_unread(found, joints))
+        kept, skipped = measured(found)
+        if skipped:  # of whole rows: others were cut off
+            found.block([name for name in joint_columns(joints) if name in found.header])
+        read = kept, (*notes, *skipped, *_unread(found, joints))
     found, warnings = read
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header
     return _table(rows, sigmas, eye_in_hand, warnings, by_line)

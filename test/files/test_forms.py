@@ -4,15 +4,21 @@
 
 import numpy as np
 import pytest
-from test_foreign import PLAIN, assert_same
+from test_foreign import JOINTS, PLACES, PLAIN, assert_same, text_of
 
-from calib_ros import read_table
+from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import InputError
+from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
+from calib_ros.kinematics.chain import Joint
 
+ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
 FORMS = {
-    'no values': PLAIN + 'NaN,0.3,n/a,#N/A,-\n0,0,nan,null,\n',
+    'no values': PLAIN + '0.2,0.3,n/a,#N/A,-\n0,0,nan,null,\n',
+    'a header of numpy': '# ' + PLAIN,
+    'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
+    'a date': 'Time;' + PLAIN.replace('\n', '\n2026-11-24 10:00:00;', 3).replace(',', ';'),
     'exponents of Fortran': PLAIN.replace('0.25', '2.5D-01'),
     'other separators in quotes': 'note,' + PLAIN.replace('\n', '\n"a; b; c; d; e; f, g",', 3),
 }
@@ -23,6 +29,25 @@ def test_a_table_in_another_form_is_the_same(tmp_path, form):
     path = tmp_path / 'cell.csv'
     path.write_text(FORMS[form])
     assert_same(read_table(path, 2, foreign=Foreign(Layout())), None)
+    assert_same(loading.table(path, ARM, Settings()), None)
+
+
+def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
+    """As ros2 topic echo --csv writes joint states; the first row was lost."""
+    path, log = tmp_path / 'p.csv', tmp_path / 'js.csv'
+    path.write_text(''.join(f'8,0,leica,{x},{y},{z}\n' for x, y, z in PLACES.tolist()))
+    log.write_text(''.join(f'8,0,,a,b,{q1},{q2}\n' for q1, q2 in JOINTS.tolist()))
+    given = Layout(columns={'q1': '#6', 'q2': '#7', 'x': '#4', 'y': '#5', 'z': '#6'})
+    assert_same(read_table(path, 2, foreign=Foreign(given, ARM, log, given)), None)
+    for foreign, said in (
+        (Foreign(Layout(), ARM, log, given), 'p.csv has no column x, y, z; it has 8, 0, leica'),
+        (Foreign(given, ARM, log), 'line 2 has "a": numbers without units are expected'),
+    ):
+        with pytest.raises(InputError, match=said):
+            foreign.convert(path)
+    log.write_text(text_of(JOINTS, names=['actual_q_0', 'actual_q_1']))
+    with pytest.raises(InputError, match='give --columns "q1=actual_q_0,q2=actual_q_1" or'):
+        Foreign(given, ARM, log).convert(path)
 
 
 def test_points_between_thousands_are_no_decimals(tmp_path):
