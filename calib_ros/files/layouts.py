@@ -31,7 +31,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import TWO_TURNS, shared_files
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import MOST_NAMES, parse_mapping
+from calib_ros.values import MOST_NAMES, ROUNDED, parse_mapping
 
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""
@@ -43,10 +43,12 @@ COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
 TURNS = ('rx', 'ry', 'rz')
 """Angles about x, y, z of three different letters, or a rotation vector."""
 IN_TURN = ('r1', 'r2', 'r3')  # Euler angles in the order of the letters
+MATRIX = tuple(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3))
+"""Rotation matrices, row by row."""
 SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 """Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
 WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')  # text columns
-NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *SIGMAS, 'distance', 'time')
+NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time')
 UNREADABLE = (
     '"{}" is not an expression of columns: give names, {{names with blanks}} or column '
     'numbers (#7) with + - * / and brackets'
@@ -202,15 +204,18 @@ def load_layout(name_or_path: str) -> Layout:
 
 
 def parse_columns(text: str) -> Iterator[tuple[str, str]]:
-    """Yield the columns of `q1=A1,x={Pos X},...`; `q*=A*` stands for up to 50 joints."""
+    """Yield the columns of `q1=A1,x={Pos X},...`.
+
+    `q*=A*` stands for up to 50 joints, `r*=t*` for the nine elements of a matrix.
+    """
     for part in re.split(r',(?![^{]*\})', text):
         ours, equals, theirs = part.partition('=')
         ours, theirs = ours.strip(), theirs.strip()
         if not equals or not ours or not theirs:
             raise ConfigError(f'columns are given as OURS=THEIRS,..., not "{part.strip()}"')
-        if re.fullmatch(r'[qsva]\*', ours):
-            for k in range(1, MOST_NAMES + 1):
-                yield f'{ours[0]}{k}', theirs.replace('*', str(k))
+        if re.fullmatch(r'[qsvar]\*', ours):
+            for name in MATRIX if ours == 'r*' else joint_columns(MOST_NAMES, ours[0]):
+                yield name, theirs.replace('*', name[1:])
         else:
             yield ours, theirs
 
@@ -260,7 +265,7 @@ def finished(made: Columns, layout: Layout) -> Columns:
         words['stamp_ns'] = BETWEEN.join(str(round(each * 1e9)) for each in time.tolist())
     rotation, axes = _rotations(values, layout, made)
     sigmas = [values.pop(name, None) for name in SIGMAS]
-    for name in (*TURNS, *IN_TURN):
+    for name in (*TURNS, *IN_TURN, *MATRIX):
         values.pop(name, None)
     covariance = _covariance(sigmas, axes, path)
     if layout.inverse:
@@ -285,6 +290,8 @@ def _rotations(
     """Return rotations (N, 3, 3), and the axes (N, 3, 3) of their sigmas in columns, or None."""
     if set(QUATERNION) & set(values):
         return _from_quaternions(values, layout, made)
+    if set(MATRIX) & set(values) and not (layout.euler or layout.rotation_vector):
+        return _from_matrices(values, made)
     three = [each for each in (TURNS, IN_TURN) if set(each) & set(values)]
     if not three:
         for name in ('euler', 'rotation_vector', 'quaternion'):
@@ -295,13 +302,9 @@ def _rotations(
                 )
         return None, None
     names, called = three[0], ', '.join(three[0])
-    missing = [name for name in names if name not in values]
-    if missing or len(three) > 1:
-        raise ConfigError(
-            f'{made.path}: give rx, ry, rz or r1, r2, r3, all three; missing {missing}'
-        )
-    angles = np.column_stack([values[name] for name in names])
-    _require_whole(angles, made, called)
+    if len(three) > 1:
+        raise ConfigError(f'{made.path}: give rx, ry, rz or r1, r2, r3, not both')
+    angles = _whole(values, names, made, 'Euler angles and rotation vectors have three columns')
     for row in np.flatnonzero(np.abs(angles).max(axis=1) > TWO_TURNS)[:1].tolist():
         raise InputError(
             f'{made.where(row, called)} are angles of up to '
@@ -343,22 +346,34 @@ def _from_euler(
 def _from_quaternions(
     values: dict[str, FloatArray], layout: Layout, made: Columns
 ) -> tuple[FloatArray, FloatArray]:
-    missing = [name for name in QUATERNION if name not in values]
-    if missing:
-        raise ConfigError(
-            f'{made.path}: a quaternion has four columns, missing {", ".join(missing)}'
-        )
-    quat = np.column_stack([values[name] for name in QUATERNION])
+    quat = _whole(values, QUATERNION, made, 'a quaternion has four columns')
     if layout.quaternion == 'wxyz':
         quat = quat[:, [1, 2, 3, 0]]
-    _require_whole(quat, made, 'qx, qy, qz, qw')
     check_quaternions(made, quat)
     return se3.from_quat(quat), np.tile(np.eye(3), (len(quat), 1, 1))
 
 
-def _require_whole(values: FloatArray, made: Columns, names: str) -> None:
-    for row in np.flatnonzero(np.isnan(values).any(axis=1))[:1].tolist():
-        raise InputError(f'{made.where(row, names)} must be numbers, not blank')
+def _from_matrices(values: dict[str, FloatArray], made: Columns) -> tuple[FloatArray, FloatArray]:
+    given = _whole(values, MATRIX, made, 'a rotation matrix has nine columns').reshape(-1, 3, 3)
+    rotations = se3.nearest_rotation(given)
+    for row in np.flatnonzero(np.abs(given - rotations).max(axis=(1, 2)) > ROUNDED)[:1].tolist():
+        raise InputError(
+            f'{made.where(row, "r11 ... r33")} are no rotation: check the order of the columns, '
+            'and that the axes are right-handed'
+        )
+    return rotations, np.tile(np.eye(3), (len(given), 1, 1))
+
+
+def _whole(
+    values: dict[str, FloatArray], names: Sequence[str], made: Columns, what: str
+) -> FloatArray:
+    """Return the values (N, len(names)) of columns that belong together."""
+    if missing := [name for name in names if name not in values]:
+        raise ConfigError(f'{made.path}: {what}, missing {", ".join(missing)}')
+    found = np.column_stack([values[name] for name in names])
+    for row in np.flatnonzero(np.isnan(found).any(axis=1))[:1].tolist():
+        raise InputError(f'{made.where(row, ", ".join(names))} must be numbers, not blank')
+    return found
 
 
 def _covariance(

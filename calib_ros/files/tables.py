@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.errors import InputError, UnknownNameError, unreadable
+from calib_ros.errors import ColumnsError, InputError, UnknownNameError, unreadable
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.columns import (
     Codes,
@@ -34,6 +34,7 @@ from calib_ros.files.columns import (
 from calib_ros.files.foreign import Foreign, measured, not_read
 from calib_ros.files.layouts import (
     COVARIANCE,
+    MATRIX,
     POSITION,
     QUATERNION,
     TURNS,
@@ -99,6 +100,8 @@ def read_table(
         kept, skipped = measured(found)
         if skipped:  # of whole rows: others were cut off
             found.block([name for name in joint_columns(joints) if name in found.header])
+        if {*MATRIX} <= {*found.header}:
+            raise ColumnsError(f'{path} has rotation matrices: calib_ros import makes quaternions')
         read = kept, (*notes, *skipped, *_unread(found, joints))
     found, warnings = read
     rows, by_line = _chosen(found, joints, sessions), 'stamp_ns' not in found.header

@@ -4,13 +4,13 @@
 
 import numpy as np
 import pytest
-from test_foreign import JOINTS, PLACES, PLAIN, assert_same, text_of
+from test_foreign import JOINTS, PLACES, PLAIN, TURNED, assert_same, text_of
 
 from calib_ros import Chain, Settings, read_table
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import Layout
+from calib_ros.files.layouts import MATRIX, Layout, layout_of
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
@@ -80,3 +80,31 @@ def test_stamps_in_seconds_are_told_what_to_give(tmp_path):
     columns = {'time': 'stamp_ns'}
     (found,) = read_table(path, 2, foreign=Foreign(Layout(columns=columns))).fitted
     np.testing.assert_allclose(found.stamps_ns, 1_700_000_000_250_000_000, rtol=1e-15)
+
+
+def test_rotation_matrices(tmp_path):
+    """In nine columns, or in a flattened homogeneous matrix."""
+    path = tmp_path / 'cell.csv'
+    turned = TURNED.as_matrix().reshape(-1, 9)
+    path.write_text(text_of(JOINTS, PLACES, turned, names=[*'abxyz', *MATRIX]))
+    assert_same(loading.table(path, ARM, Settings()))
+    sizes = Layout(columns={f's{each}': '1e-3' for each in ('x', 'y', 'z', 'rx', 'ry', 'rz')})
+    (found,) = loading.table(path, ARM, Settings(), foreign=Foreign(sizes, ARM)).fitted
+    np.testing.assert_allclose(found.covariance, np.tile(1e-6 * np.eye(6), (3, 1, 1)))
+    with pytest.raises(InputError, match='has rotation matrices: calib_ros import'):
+        read_table(path, 2)
+    whole = np.tile(np.eye(4), (3, 1, 1))
+    whole[:, :3, :3], whole[:, :3, 3] = np.round(TURNED.as_matrix(), 4), PLACES
+    names = [f't{i}{j}' for i in range(1, 5) for j in range(1, 5)]
+    path.write_text(text_of(JOINTS, whole.reshape(3, 16), names=['q1', 'q2', *names]))
+    of_four = 'r*=t*,x=t14,y=t24,z=t34'
+    (found,) = read_table(path, 2, foreign=Foreign(layout_of('', [of_four], {}))).fitted
+    np.testing.assert_allclose(found.positions, PLACES)
+    np.testing.assert_allclose(found.rotations, TURNED.as_matrix(), atol=1e-4)
+    for columns, said in (
+        (f'{of_four},r11=t12', r'line 2: r11 \.\.\. r33 are no rotation: check the order'),
+        (f'{of_four},r33=-t33', 'and that the axes are right-handed'),
+        ('x=t14,y=t24,z=t34,r11=t11', 'nine columns, missing r12, r13'),
+    ):
+        with pytest.raises((InputError, ConfigError), match=said):
+            read_table(path, 2, foreign=Foreign(layout_of('', [columns], {})))
