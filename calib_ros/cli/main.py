@@ -163,6 +163,7 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         added.example = _example(command.examples[0])
         added.typed = given
         added.set_defaults(home=command.home, parser=added)
+        added._negative_number_matcher = re.compile(r'-\.?\d')  # -1e-5 too, as in Python 3.14
         add_options(added, command.options)
         add_more = added.add_argument_group('output').add_argument
         text = 'print only warnings, errors and the output asked for'

@@ -39,7 +39,7 @@ def bad_inputs():
         ': every parameter is fixed: nothing is left to identify\n',
     )
     yield 'sigma', (*good, '--sigma-position', '0'), 'sigma_position must be'
-    for wrong in ('0', '-1', 'nan', 'inf'):
+    for wrong in ('0', '-1', '-1e-3', 'nan', 'inf'):
         yield f'tolerance {wrong}', (*good, '--tolerance', wrong), '--tolerance must be positive'
     yield 'folds', (*good, '--folds', '1'), 'folds must be at least 2, not 1'
     yield ('useless option', (*good, '--sources', '/pose'), '--sources does not apply to a table')
