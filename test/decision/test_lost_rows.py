@@ -19,20 +19,22 @@ def seen_of(count, oriented):
 
 
 @pytest.mark.parametrize(
-    ('row', 'lost', 'where'), [(9, 'positions', 'below'), (31, 'joints', 'above')]
+    ('positions', 'joints', 'said'),
+    [
+        ([9], [-1], 'from pose 10 on the joint values stand 1 row below'),
+        ([-2, -1], [21, 22], 'from pose 22 on the joint values stand 2 rows above'),
+        ([31], [0], 'before pose 32 the joint values stand 1 row above'),
+    ],
 )
 @pytest.mark.parametrize('oriented', [True, False])
-def test_a_row_lost_in_one_of_two_tables_is_named(row, lost, where, oriented):
+def test_rows_lost_in_one_of_two_tables_are_named(positions, joints, said, oriented):
     """Joint values and measurements were put side by side, row by row."""
     seen = seen_of(40, oriented)
-    without = np.delete(np.arange(len(seen)), row)
-    measured = seen.select(without if lost == 'positions' else slice(-1))
-    kept = seen.joints[:-1] if lost == 'positions' else seen.joints[without]
+    measured = seen.select(np.delete(np.arange(len(seen)), positions))
+    kept = np.delete(seen.joints, joints, axis=0)
     result = identify(Problem(UR10E, replace(measured, joints=kept)))
     assert not result.accepted
-    assert result.refusals[0].startswith(
-        f'from pose {row + 1} on the joint values stand 1 row {where} their measurement'
-    )
+    assert result.refusals[0].startswith(f'{said} their measurement')
 
 
 @pytest.mark.parametrize('count', [20, 40])

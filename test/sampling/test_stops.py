@@ -105,7 +105,8 @@ def test_an_arrival_is_no_noise(rng, late, sigma_given):
     share = np.clip(1.0 + (np.arange(0.1, 1.2, 0.02) - late) / 1.5, 0.0, 1.0)
     left = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
     found = average(noisy(rng, len(left)) + left[:, np.newaxis] * [0.6, 0.48, 0.64], sigma_given)
-    assert found is None or np.linalg.norm(found[1] - PLACE) < 10.0 * SIGMA
+    assert (found is None) == (late > 0.95)
+    assert found is None or np.linalg.norm(found[1] - PLACE) < 3.0 * SIGMA
 
 
 @pytest.mark.parametrize('count', range(FEW, 8))
