@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -87,13 +87,13 @@ STANDARD = (
 """Default subscriptions of the node."""
 
 
-def parse_source(text: str) -> Source:
+def parse_source(text: str, types: Mapping[str, str] | None = None) -> Source:
     """Parse a source "TOPIC key=value ...".
 
     Keys: type, device, target, eye_in_hand (true or false), validation (true or false), parent and
     child, and of images board, info and lens. Short types such as PoseStamped are accepted; the
-    type defaults to TFMessage for a topic named tf or with parent and child, and to images with a
-    board. Values with blanks need quotes.
+    type defaults to that of the topic in `types`, to TFMessage for a topic named tf or with parent
+    and child, and to images with a board. Values with blanks need quotes.
     """
     try:
         topic, *pairs = shlex.split(text) or ('',)
@@ -115,6 +115,8 @@ def parse_source(text: str) -> Source:
             values[key] = next(full, value)
         else:
             values[key] = frame_name(value) if key in ('parent', 'child') else value
+    if types and types.get(topic) in TYPES:
+        values.setdefault('type', types[topic])
     if values.keys() & {'parent', 'child'} or topic.rpartition('/')[2] == 'tf':
         values.setdefault('type', TRANSFORMS)
     if 'board' in values:
@@ -127,9 +129,11 @@ def parse_source(text: str) -> Source:
 SOURCE_KEYS = tuple(item.name for item in fields(Source) if item.name != 'topic')
 
 
-def parse_sources(texts: Sequence[str]) -> tuple[Source, ...]:
+def parse_sources(
+    texts: Sequence[str], types: Mapping[str, str] | None = None
+) -> tuple[Source, ...]:
     """Parse sources; a topic may be named once, or once for each pair of frames."""
-    sources = tuple(parse_source(text) for text in texts)
+    sources = tuple(parse_source(text, types) for text in texts)
     names = [' '.join((each.topic, each.parent, each.child)).strip() for each in sources]
     for source, name in zip(sources, names, strict=True):
         if names.count(name) > 1:

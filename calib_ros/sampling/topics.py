@@ -48,7 +48,7 @@ def choose_topics(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     """
     available = recorded.available
     own = outputs(available)
-    sources = parse_sources(settings.sources)
+    sources = parse_sources(settings.sources, available)
     for topic in (*settings.joint_topics, *(source.topic for source in sources)):
         if topic in own:
             raise InputError(
@@ -64,7 +64,7 @@ def choose_topics(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     sources = sources or _found(available)
     for source in sources:
         kind = available.get(source.topic, '')
-        if kind not in TYPES or source.type not in ('', kind):
+        if kind not in TYPES or source.type != kind:
             expected = (source.type,) if source.type else tuple(DECODERS)
             raise _no_topic(f'"{source.topic}"', expected, available)
         if source.board and available.get(source.camera_info) != CAMERA_INFO:
@@ -133,7 +133,7 @@ def check_joints(
 def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
     own = outputs(available)
     sources = [
-        parse_source(f'{topic} type={kind}')
+        parse_source(topic, available)
         for topic, kind in available.items()
         if kind in DECODERS and topic not in own
     ]

@@ -7,6 +7,7 @@ import pytest
 from recorded import (
     MS,
     TYPES,
+    distance,
     header,
     joint_state,
     observations_of,
@@ -19,7 +20,8 @@ from recorded import (
     text_message,
 )
 
-from calib_ros.errors import InputError
+from calib_ros.errors import ConfigError, InputError
+from calib_ros.sampling.sources import RANGEFINDER
 
 
 def table():
@@ -82,6 +84,17 @@ def test_a_recording_of_images_names_the_option_for_them(tmp_path):
     path = record(tmp_path / 'bag', [*standing([]), ('/camera/image_raw', image)])
     with pytest.raises(InputError, match=r'no pose topic .*--sources "/camera/image_raw board='):
         session_of(path)
+
+
+def test_a_source_without_a_type_has_that_of_its_topic(tmp_path):
+    pixels = np.zeros(1, np.uint8)
+    image = TYPES['sensor_msgs/msg/Image'](header(5 * MS), 1, 1, 'mono8', 0, 1, pixels)
+    wire = [('/wire', distance((100 * k + 5) * MS, 1.0 + k)) for k in range(1, 9)]
+    path = record(tmp_path / 'bag', [*measured(), *wire, ('/camera/image_raw', image)])
+    with pytest.raises(ConfigError, match='"/camera/image_raw" needs board=FILE'):
+        session_of(path, sources=('/camera/image_raw eye_in_hand=true',))
+    session, _ = session_of(path, sources=('/tracker', '/wire'))
+    assert {sample.device for sample in session.samples} == {'', RANGEFINDER}
 
 
 def test_a_recording_of_tags_without_their_frames_says_where_those_are(tmp_path):
