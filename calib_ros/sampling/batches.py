@@ -186,6 +186,7 @@ class DecodedBatch:
 
     def _add(self, source: Source | None, kind: str, places: Index, found: Readings) -> None:
         if source is not None:  # some joint states may be those of another robot
+            found = found._replace(strings=tuple(map(frame_name, found.strings)))
             good, causes = usable(kind, found)
             self.faults[POSES] += causes
             if not good.all():

@@ -25,6 +25,7 @@ from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter, Part
+from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
@@ -72,7 +73,7 @@ class CalibrationSession:
         self.made = 0  # samples, without restored ones
         self._pipeline = Pipeline(self.chain, settings, self._take)
         self._collector, self._clocks = self._pipeline.collector, self._pipeline.clocks
-        self._frames = FrameNames(settings.frame_id)
+        self._frames = FrameNames(frame_name(settings.frame_id))
         self._names = JointNames(self.joint_names, self.chain.held)
         self._filter = MessageFilter(self._names, self._frames, len(self.chain.joints))
         self.received = self._filter.received  # messages by kind
@@ -88,7 +89,7 @@ class CalibrationSession:
         check_settings(self.chain, settings)
         self.settings = settings
         self._collector.settings = self._clocks.settings = settings
-        self._frames.wanted = settings.frame_id
+        self._frames.wanted = frame_name(settings.frame_id)
         self._relearn()
 
     def _relearn(self) -> None:

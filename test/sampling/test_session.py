@@ -16,6 +16,7 @@ from calib_ros.report.words import verdict
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import Source
+from calib_ros.settings import Settings
 
 LEFT_OUT = 'poses left out, in another frame or of a target measured once'
 
@@ -68,6 +69,15 @@ def test_measurements_with_and_without_a_frame_are_told():
     drive(made, 16, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), ''))])
     with pytest.raises(InputError, match=r'different frames \(one without name, tracker\)'):
         made.problem()
+
+
+def test_a_leading_slash_makes_no_other_frame():
+    """As older programs write it; tf and RViz refuse it."""
+    made = CalibrationSession(UR5E, Settings(frame_id='/tracker'))
+    drive(made, 16, [renamed(tracker(), dict.fromkeys(range(0, 10**4, 2), '/tracker'))])
+    made.finish()
+    assert made.problem().world_frame == 'tracker'
+    assert len(made.samples) == 16
 
 
 @pytest.mark.parametrize('where', [0, 100])
