@@ -286,9 +286,7 @@ def residual_arrays(chain: Chain, observations: Observations) -> Both:
         part = slice(start, start + BLOCK)
         q = np.ascontiguousarray(then.joints[part].T)
         signs = None if then.approach is None else np.ascontiguousarray(then.approach[part].T)
-        axes, origin = chain.trace(
-            chain.effective(q, signs), base=observations.base, tool=observations.tool
-        )
+        axes, origin = chain.trace(q, signs, observations.base, observations.tool)
         if distances is not None:
             length = origin[2] if observations.plane else np.linalg.norm(origin, axis=0)
             position[part, 0] = distances[part] - length
@@ -315,7 +313,7 @@ def seen_residuals(chain: Chain, observations: Observations) -> Both:
     assert then.points is not None
     q = np.ascontiguousarray(then.joints[first].T)
     signs = None if then.approach is None else np.ascontiguousarray(then.approach[first].T)
-    axes, origin = chain.trace(chain.effective(q, signs), base=then.base, tool=then.tool)
+    axes, origin = chain.trace(q, signs, then.base, then.tool)
     pixels, shifts = np.empty((len(then), 2)), np.empty((len(then), 3))
     for start in range(0, len(then), 4 * BLOCK):
         part = slice(start, start + 4 * BLOCK)

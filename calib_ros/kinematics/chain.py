@@ -195,14 +195,17 @@ class Chain(Shown):
         """Return a parameter's value [m or rad]; a frame's rotation as a rotation vector."""
         if name in self._effect_values:
             return self._effect_values[name]
-        owner, kind = self._split(name)
-        if isinstance(owner, Joint):
-            return float(getattr(owner, kind))
+        if name not in self.all_parameters:
+            raise UnknownNameError('parameter', name, self.parameter_names)
+        owner, _, kind = name.partition('.')
+        if owner in self._joints:
+            return float(getattr(self._joints[owner], kind))
+        frame = self.frame(owner)
         if kind == DELAY:
-            return owner.delay or 0.0
+            return frame.delay or 0.0
         if kind in LENS_KINDS:
-            return 0.0 if owner.lens is None else float(getattr(owner.lens, kind))
-        return float(owner.offsets()[FRAME_KINDS.index(kind)])
+            return 0.0 if frame.lens is None else float(getattr(frame.lens, kind))
+        return float(frame.offsets()[FRAME_KINDS.index(kind)])
 
     def offset(self, name: str, nominal: Chain) -> float:
         """Return the offset from a nominal chain, as for `with_offsets`."""
@@ -289,7 +292,7 @@ class Chain(Shown):
         """
         rows = np.ascontiguousarray(self.joint_values(q).T)
         signs = None if approach is None else np.ascontiguousarray(approach.T)
-        axes, origin = self.trace(self.effective(rows, signs), base=base, tool=tool)
+        axes, origin = self.trace(rows, signs, base, tool)
         return se3.transform(axes.transpose(2, 1, 0), origin.T)
 
     def joint_values(self, q: FloatArray) -> FloatArray:
@@ -308,14 +311,18 @@ class Chain(Shown):
         return effects.moved_joints(self, names, effects.basis(self, names, q, approach), q)
 
     def trace(
-        self, q: FloatArray, base: str = 'base', tool: str = 'tool'
+        self,
+        q: FloatArray,
+        approach: FloatArray | None = None,
+        base: str = 'base',
+        tool: str = 'tool',
     ) -> tuple[FloatArray, FloatArray]:
         """Return the target's axes (3, 3, B) and origin (3, B) [m] in the world.
 
-        At effective joint values (n, B); the first index of the axes counts them.
+        As `forward`, at joint values (n, B); the first index of the axes counts them.
         """
         frames = np.empty((len(q) + 1, 4, 3, q.shape[1]))
-        self.walk.frames(q, self.frame(base).matrix, frames)
+        self.walk.frames(self.effective(q, approach), self.frame(base).matrix, frames)
         target = self.at_the_tool(frames[-1], tool)
         return target[:3], target[3]
 
@@ -328,12 +335,6 @@ class Chain(Shown):
         """Draw joint values (count, n) within the range of each joint."""
         lower, upper = np.array([joint.range for joint in self.joints]).T
         return rng.uniform(lower, upper, (count, len(self.joints)))
-
-    def _split(self, name: str) -> tuple[Joint | Frame, str]:
-        if name not in self.all_parameters:
-            raise UnknownNameError('parameter', name, self.parameter_names)
-        owner, _, kind = name.partition('.')
-        return self._joints.get(owner) or self.frame(owner), kind
 
     @cached_property
     def all_parameters(self) -> frozenset[str]:

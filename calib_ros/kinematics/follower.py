@@ -88,7 +88,7 @@ def mobility(chain: Chain) -> tuple[int, int, int]:
 
 def _columns(chain: Chain, q: FloatArray, approach: FloatArray | None = None) -> FloatArray:
     """Return the derivative of the pose by the joints (n, 6, B) at joint values (n, B)."""
-    axes, origin = chain.trace(chain.effective(q, approach))
+    axes, origin = chain.trace(q, approach)
     return Aim(chain).linearise(q, approach, origin, axes, LEVER)[1]
 
 
@@ -145,7 +145,7 @@ class Follower:
 
     def _solve_block(self, q: FloatArray, approach: FloatArray | None, bounded: bool) -> Solution:
         """Solve for commands (n, B); hold joints beyond a limit there and solve the rest again."""
-        axes, origin = self._leader.trace(self._leader.effective(q, approach))
+        axes, origin = self._leader.trace(q, approach)
         never = np.zeros(q.shape, dtype=bool)
         never[list(self._leader.held)] = True
         ways = self._ways(q, approach)
@@ -239,8 +239,7 @@ class Follower:
 
     def _errors(self, task: _Task, x: FloatArray) -> FloatArray:
         """Return position [m], orientation [rad] and reachable position errors (B, 3)."""
-        q = task.q + self._unit * x
-        axes, origin = self._follower.trace(self._follower.effective(q, task.approach))
+        axes, origin = self._follower.trace(task.q + self._unit * x, task.approach)
         away = near = task.origin - origin
         if task.ways is not None:
             near = np.einsum('jkb,kb->jb', task.ways[:3, :3], away)

@@ -159,9 +159,7 @@ def test_the_other_half_of_the_workspace_is_within_the_ellipsoids(group, seed):
     inside = ((np.einsum('nij,nj->ni', axes, error) / squares) ** 2).sum(axis=1) <= 1.0
     assert (inside | ~found.region.covers(other)).mean() >= 0.9
     assert rms(found.chain, true, other) < rms(found.before, true, other)
-    turned = orientation_error(
-        *(each.trace(each.effective(q.T))[0] for each in (found.chain, true))
-    )
+    turned = orientation_error(*(each.trace(q.T)[0] for each in (found.chain, true)))
     known = Calibration.of(found).sigma(q, np.s_[3:])
     assert np.sqrt(np.mean(np.sum(turned**2, axis=0)) / np.mean(known**2)) < 1.25
 
