@@ -343,15 +343,11 @@ def _places(
     text: str, origins: Mapping[str, object], ratios: Mapping[str, object]
 ) -> list[tuple[int, str, str]]:
     """Return the start of each origin, or else of the joint, and mimic tag: byte, tag, joint."""
-    described = [(joint, joint.get('name', '')) for joint in _parsed(text).findall('joint')]
-    places = [(_child_or_self(j, 'origin'), name) for j, name in described if name in origins]
-    places += [(_child_or_self(j, 'mimic'), name) for j, name in described if name in ratios]
+    joints = {joint.get('name', ''): joint for joint in _parsed(text).findall('joint')}
+    wanted = [*((name, 'origin') for name in origins), *((name, 'mimic') for name in ratios)]
+    found = [(joints[name].find(tag), name) for name, tag in wanted]
+    places = [(joints[name] if at is None else at, name) for at, name in found]
     return [(int(at.get(_AT, '')), at.tag, name) for at, name in places]
-
-
-def _child_or_self(element: ET.Element, tag: str) -> ET.Element:
-    found = element.find(tag)
-    return element if found is None else found
 
 
 def _with_origin(tag: str, origin: FloatArray) -> str:

@@ -43,17 +43,9 @@ class Walk:
         cos, sin = np.cos(alpha), np.sin(alpha)
         self.cos, self.sin = np.cos(self.beta), np.sin(self.beta)
         links = np.zeros((len(table), 4, 4))
-        links[:, 0, 0], links[:, 0, 1], links[:, 0, 2] = (
-            self.cos,
-            sin * self.sin,
-            -cos * self.sin,
-        )
-        links[:, 1, 1], links[:, 1, 2] = cos, sin
-        links[:, 2, 0], links[:, 2, 1], links[:, 2, 2] = (
-            self.sin,
-            -sin * self.cos,
-            cos * self.cos,
-        )
+        links[:, 0, :3] = np.transpose([self.cos, sin * self.sin, -cos * self.sin])
+        links[:, 1, 1:3] = np.transpose([cos, sin])
+        links[:, 2, :3] = np.transpose([self.sin, -sin * self.cos, cos * self.cos])
         links[:, 3, 0], links[:, 3, 1], links[:, 3, 3] = a, b, 1.0
         self.beside = links[:, :3, 1]
         if standard:  # d moves along z, first or last
