@@ -9,14 +9,18 @@ from there on, and one of them is zero.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
+from calib_ros.decision.suspects import rows_away
+from calib_ros.decision.trials import in_frames, misses
 from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.problem import Problem
+from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
@@ -28,47 +32,22 @@ FEWEST_ROWS = 3 * IN_A_FRAME
 MOST_SEARCHED = 10 * SOME_POSES  # rows of a table; longer ones are not searched
 EXPLAINED_ROWS = 1.0 - EXCEPTION  # share of the rows that a loss must explain
 
-Errors = Callable[[Chain, Observations], FloatArray]
-Framed = Callable[[Observations], Chain | None]
 
+def row_loss(
+    problem: Problem, nominal: Chain, seen: Observations, largest: float
+) -> tuple[str, float] | None:
+    """Return the loss that explains nearly all pairs (N), if one does, in words.
 
-@dataclass(frozen=True)
-class RowLoss:
-    """Joint values that are `after` rows below their measurement from `row` (from 0) on.
-
-    Before it, they are `before` rows below. `error` [m] is the typical one once corrected.
-    """
-
-    row: int
-    before: int
-    after: int
-    error: float
-
-    @property
-    def what(self) -> str:
-        """Return what happened, in words."""
-        rows, late = (self.after, True) if self.after else (self.before, False)
-        count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
-        where = f'from pose {self.row + 1} on' if late else f'before pose {self.row + 1}'
-        return (
-            f'{where} the joint values stand {count} {"below" if rows > 0 else "above"} their '
-            'measurement'
-        )
-
-
-def row_loss(seen: Observations, framed: Framed, errors: Errors, largest: float) -> RowLoss | None:
-    """Return the loss that explains nearly all pairs (N), if one does.
-
-    `framed` returns the chain with frames fitted to some pairs, `errors` (N,) [m] those of pairs;
-    a faulty arm has errors of up to `largest`.
+    A faulty arm has errors of up to `largest` [m]. Then follows the typical error [m] once
+    corrected.
     """
     count = len(seen)
     if not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
-    best: RowLoss | None = None
+    best: tuple[str, float] | None = None
     good = EXPLAINED_ROWS * count
-    for chain in _frames(seen, framed):
-        tables = {s: _shifted(chain, seen, s, errors) for s in SLIPS}
+    for chain in _frames(problem, nominal, seen):
+        tables = {s: _shifted(chain, seen, s) for s in SLIPS}
         for before, after in product(SLIPS, SLIPS):
             if before == after or (before and after):
                 continue
@@ -77,18 +56,19 @@ def row_loss(seen: Observations, framed: Framed, errors: Errors, largest: float)
             fitting = int(np.count_nonzero(pieced <= largest))
             if fitting >= good and _apart(tables[before], tables[after], row, largest):
                 good = fitting + 1
-                best = RowLoss(row, before, after, float(np.median(pieced[np.isfinite(pieced)])))
+                where = f'from pose {row + 1} on' if after else f'before pose {row + 1}'
+                error = float(np.median(pieced[np.isfinite(pieced)]))
+                best = f'{where} {rows_away(after or before)}', error
     return best
 
 
-def _frames(seen: Observations, framed: Framed) -> Iterator[Chain]:
+def _frames(problem: Problem, chain: Chain, seen: Observations) -> Iterator[Chain]:
     third = len(seen) // 3
     for part, shift in product((slice(third), slice(-third, None)), SLIPS):
         rows = np.arange(len(seen))[part]
         rows = rows[(rows + shift >= 0) & (rows + shift < len(seen))]
-        chain = framed(_paired(seen, rows, shift))
-        if chain is not None:
-            yield chain
+        if found := in_frames(problem, chain, (_paired(seen, rows, shift),)):
+            yield found.chain
 
 
 def _paired(seen: Observations, rows: Index, shift: int) -> Observations:
@@ -96,12 +76,13 @@ def _paired(seen: Observations, rows: Index, shift: int) -> Observations:
     return replace(seen.select(rows), joints=seen.joints[rows + shift])
 
 
-def _shifted(chain: Chain, seen: Observations, shift: int, errors: Errors) -> FloatArray:
+def _shifted(chain: Chain, seen: Observations, shift: int) -> FloatArray:
     """Return the errors (N,) [m] of measurements at joint values `shift` rows below."""
     rows = np.arange(len(seen))
     inside = (rows + shift >= 0) & (rows + shift < len(seen))
     found = np.full(len(seen), np.inf)
-    found[inside] = errors(chain, _paired(seen, rows[inside], shift))
+    pairs = _paired(seen, rows[inside], shift)
+    found[inside] = misses(chain, pairs, flange(chain, pairs))
     return found
 
 

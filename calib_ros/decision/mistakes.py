@@ -28,16 +28,15 @@ from calib_ros.decision.lost_rows import row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
-from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
+from calib_ros.decision.trials import Bare, Trial, in_frames, refined, trial_of
 from calib_ros.estimation.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER, SEVERAL, TRIED
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
-from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import FloatArray, norms
+from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import LEVER
 
 
@@ -100,10 +99,9 @@ def _suspicious(problem: Problem, result: Identification) -> bool:
         error, angle = 1e-3 * each.rms_mm, 1e-3 * (each.rms_mrad or 0.0)
         if error > problem.largest_error or angle > problem.largest_angle:
             return True
-    if judged.share_of_outliers > MOST_OUTLIERS:
-        return True
     limits = problem.largest_length, problem.largest_angle
-    return any(each.beyond(*limits) for each in result.parameters)
+    far = any(each.beyond(*limits) for each in result.parameters)
+    return far or judged.share_of_outliers > MOST_OUTLIERS
 
 
 def explained(problem: Problem, far: bool = False) -> Explained | None:
@@ -128,8 +126,9 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     given = in_frames(problem, chain, sets)
     if given is None or (far and given.error <= _largest(problem)):
         return None
+    missing = None if _of_images(problem) else dead(chain, given.sets)
     found = (
-        _of_a_dead_column(problem, chain, given)
+        (missing and Explained((missing,), given.error, np.nan))  # no change restores it
         or _of_a_lost_row(problem, chain, sets, given)
         or _named(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
@@ -179,14 +178,9 @@ def _of_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
 
 
-def _of_a_dead_column(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
-    """Return a coordinate that was not measured: no change of the input restores it."""
-    found = None if _of_images(problem) else dead(chain, given.sets)
-    return None if found is None else Explained((found,), given.error, np.nan)
-
-
 def _named(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
-    rough, tried, bare = [], [], Bare()
+    rough, tried = [], []
+    bare: Bare = {}
     for each in suspects(chain, given.sets, _of_images(problem)):
         few = given.sets
         if each.rows:
@@ -198,17 +192,17 @@ def _named(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explaine
         polished = refined(problem, found)
         # an arm in mm fits places in mm, and is off by metres
         if polished.error <= _largest(problem):
-            tried.append((polished.share, polished, each))
+            tried.append((polished, each))
     if not tried:
         return None
-    tried.sort(key=lambda one: one[0])
-    least, best, _ = tried[0]
+    tried.sort(key=lambda one: one[0].share)
+    best, least = tried[0][0], tried[0][0].share
     if best.error > NEARER * given.error or least > NEARER * min(given.share, 1.0):
         return None
-    named = [each for share, _, each in tried if share <= ALIKE * least]
+    named = [each for one, each in tried if one.share <= ALIKE * least]
     lowest = min(each.rank for each in named)
     named = [each for each in named if each.rank == lowest]
-    named += [each for share, _, each in tried if ALIKE * least < share <= least / NEARER]
+    named += [each for one, each in tried if ALIKE * least < one.share <= least / NEARER]
     unlike = {(each.what, each.remedy): each for each in named}
     return Explained(tuple(unlike.values())[:SEVERAL], given.error, best.error)
 
@@ -222,20 +216,14 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
     if problem.of_messages or len(sets) > 1 or sets[0].socket or sets[0].pixels is not None:
         return None
 
-    def framed(part: Observations) -> Chain | None:
-        found = in_frames(problem, chain, (part,))
-        return None if found is None else found.chain
-
-    def errors(arm: Chain, each: Observations) -> FloatArray:
-        return misses(arm, each, flange(arm, each))
-
-    found = row_loss(_moved(problem, sets[0], 0), framed, errors, _largest(problem))
+    found = row_loss(problem, chain, _moved(problem, sets[0], 0), _largest(problem))
     if found is None:
         return None
+    what, error = found
     remedy = 'is a row missing or duplicated in one of two tables? Correct it'
     # the typical error tells nothing if most rows are right
-    corrected = found.error if found.error < NEARER * given.error else np.nan
-    return Explained((Suspect(found.what, remedy),), given.error, corrected)
+    corrected = error if error < NEARER * given.error else np.nan
+    return Explained((Suspect(what, remedy),), given.error, corrected)
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:

@@ -75,26 +75,21 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
     Poses `of_images` are those of a board in a camera; joint values come from a table of places.
     """
     if of_images:
-        yield from _measured(_of_boards(chain, sets[0]))
+        yield from (replace(each, part='measured') for each in _of_boards(chain, sets[0]))
         for each in _of_places(chain):
             remedy = each.published if 'chain' in each.published else 'correct it in --places'
             yield replace(each, remedy=remedy)
         return
     if not any(each.socket for each in sets):
         (seen,) = sets
-        yield from _measured(_units(chain))
+        ways = _conventions(chain, seen) if seen.oriented.any() else ()
+        yield from (replace(each, part='measured') for each in (*_units(chain), *ways))
         if seen.oriented.any():
-            yield from _measured(_conventions(chain, seen))
             yield from _misread(chain, seen)
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
         what = 'the axes of the measuring device are left-handed'
         yield Suspect(what, remedy, (_mirrored,), 3, part='handed')
     yield from _of_places(chain)
-
-
-def _measured(found: Iterator[Suspect]) -> Iterator[Suspect]:
-    for each in found:
-        yield replace(each, part='measured')
 
 
 def _of_places(chain: Chain) -> Iterator[Suspect]:
@@ -107,11 +102,14 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
     for rows in (1, -1, 2, -2):
-        where = 'below' if rows > 0 else 'above'
-        count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
-        what = f'the joint values stand {count} {where} their measurement'
-        published = 'check the stamps, and delay'
+        what, published = rows_away(rows), 'check the stamps, and delay'
         yield Suspect(what, f'--shift {rows}', rank=2, rows=rows, published=published)
+
+
+def rows_away(rows: int) -> str:
+    """Return that joint values stand some rows below their measurement, or above it."""
+    count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
+    return f'the joint values stand {count} {"below" if rows > 0 else "above"} their measurement'
 
 
 def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:
@@ -162,50 +160,48 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     Only if all poses have an orientation, a camera on the flange may have measured them.
     """
     back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
-    ways: list[tuple[str, str, tuple[DataChange, ...], str]] = [
-        (
+    ways = [
+        Suspect(
             'the quaternions are w x y z, not x y z w',
             '--quaternion wxyz',
             (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [1, 2, 3, 0]])), *back),
-            '',
         ),
-        (
+        Suspect(
             'the quaternions are x y z w, not w x y z',
             '--quaternion xyzw',
             (_with(lambda turns: se3.from_quat(se3.to_quat(turns)[:, [3, 0, 1, 2]])), *back),
-            '',
         ),
-        (
+        Suspect(
             'the rotations are transposed: they are of the device in the target',
             '--columns qx=-qx,qy=-qy,qz=-qz',
             (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
-            '',
         ),
     ]
     if seen.inverse:
-        ways.append((*NOT_ON_FLANGE, (), _in_sources(False)))
+        ways.append(Suspect(*NOT_ON_FLANGE, published=_in_sources(False)))
     elif seen.oriented.all():
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
-        ways.append((what, remedy, (Observations.inverted,), _in_sources(True)))
+        change = (Observations.inverted,)
+        ways.append(Suspect(what, remedy, change, published=_in_sources(True)))
     in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))
-    for what, remedy, changes, published in ways:
-        for more, option, others in (
-            ('', '', ()),
-            (', and the positions in mm', ' --length mm', in_mm),
-            (', and the joint values in degrees', ' --joint-angle deg', (degrees,)),
+    for way in ways:
+        yield replace(way, changes=(*back, *way.changes))
+        for units, option, others in (
+            ('and the positions in mm', '--length mm', in_mm),
+            ('and the joint values in degrees', '--joint-angle deg', (degrees,)),
             (
-                ', the positions in mm and the joint values in degrees',
-                ' --length mm --joint-angle deg',
+                'the positions in mm and the joint values in degrees',
+                '--length mm --joint-angle deg',
                 (*in_mm, degrees),
             ),
         ):
-            rank = 2 if more else 1
-            found = Suspect(what + more, remedy + option, (*back, *others, *changes), rank)
-            if published:
-                rest = ', correct the rest in the publisher' if more else ''
-                found = replace(found, published=published + rest)
-            yield found
+            published = way.published
+            if published != Suspect.published:
+                published += ', correct the rest in the publisher'
+            what, remedy = f'{way.what}, {units}', f'{way.remedy} {option}'
+            changes = (*back, *others, *way.changes)
+            yield Suspect(what, remedy, changes, 2, published=published)
 
 
 def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib_ros.decision.suspects import Sets
 from calib_ros.estimation.identifiability import excited
@@ -21,8 +21,11 @@ from calib_ros.estimation.start import closed_forms, flange, movable
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import LEVER
+
+Bare: TypeAlias = dict[tuple[int, int, str], tuple[FloatArray, Chain, Observations]]
+"""Poses of bare arms, which most suspects leave unchanged; what is kept keeps its id."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +60,13 @@ def trial_of(chain: Chain, sets: Sets, bare: Bare | None = None) -> Trial | None
 
     `bare` caches the poses of arms tried before.
     """
-    spreads, arms, bare = [], [], bare or Bare()
+    spreads, arms, bare = [], [], {} if bare is None else bare
     for each in sets:
         alone = replace(each, base='base', tool='tool')
-        arm = bare.poses(chain, alone)
+        key = id(each.joints), id(chain.joints), chain.convention
+        if key not in bare:
+            bare[key] = flange(chain, alone), chain, each
+        arm = bare[key][0]
         known = chain.all_frames  # other robots have only a base and a tool
         own = replace(chain, base=known.get(each.base), tool=known.get(each.tool))
         best = _nearest(own, alone, arm, np.ones(len(alone), dtype=bool))
@@ -86,28 +92,12 @@ def in_frames(problem: Problem, chain: Chain, sets: Sets) -> Trial | None:
     return None if given is None else refined(problem, given)
 
 
-def _nearest(
-    chain: Chain, each: Observations, arm: FloatArray, rows: NDArray[np.bool_]
-) -> Trial | None:
+def _nearest(chain: Chain, each: Observations, arm: FloatArray, rows: Flags) -> Trial | None:
     """Return the best closed form of some rows (N,), judged by all of them; None if none is."""
     starts = closed_forms(chain, each.select(rows), arm[rows])
     found = [Trial(start, (each,), (arm,)) for start in starts]
     found = [one for one in found if np.isfinite(one.error)]
     return min(found, key=lambda one: one.error, default=None)
-
-
-class Bare:
-    """Cache of the poses of bare arms, which most suspects leave unchanged."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[int, int, str], tuple[FloatArray, Chain, FloatArray]] = {}
-
-    def poses(self, chain: Chain, each: Observations) -> FloatArray:
-        """Return the poses (N, 4, 4) of the bare arm at the joint values of samples."""
-        key = id(each.joints), id(chain.joints), chain.convention
-        if key not in self._known:  # cached objects keep their ids
-            self._known[key] = flange(chain, each), chain, each.joints
-        return self._known[key][0]
 
 
 def refined(problem: Problem, trial: Trial) -> Trial:
