@@ -69,9 +69,6 @@ class Region(Shown):
 
     def covers(self, joints: FloatArray) -> Flags:
         """Tell (N,) whether the calibration may be used at joint values (N, n)."""
-        joints = self.chain.joint_values(joints)
-        if np.isinf(self.limit):
-            return np.ones(len(joints), dtype=bool)
         return np.asarray(self.known(joints) <= self.limit)
 
     @property
@@ -190,8 +187,10 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
     measured = np.concatenate([each.spread(SOME_POSES // 2).joints for each in sets])
     drawn = posterior.chain.random_joints(SOME_POSES, np.random.default_rng(0))
     judge = _Judge(posterior, *ends, freedom)
-    rows = judge.rows(np.concatenate([drawn, measured]))
-    sizes = _sizes(rows[: len(posterior.names)], posterior.square)
+    rows = judge.model.shifts(np.concatenate([drawn, measured]))
+    known = rows[: len(posterior.names)]
+    squares = np.einsum('pcn,pcn->n', np.tensordot(posterior.square, known, 1), known)
+    sizes = np.sqrt(np.maximum(squares, 0.0))  # of the expected errors
     far, limit = sizes[:SOME_POSES], float(sizes[SOME_POSES:].max())
     order = np.argsort(far)
     own, inside = judge.products(rows[..., SOME_POSES:]), far[order] <= limit
@@ -214,14 +213,8 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
     share = float(np.mean(far <= limit))
     limit = np.inf if share == 1.0 else limit
-    known = posterior.chain, posterior.names, posterior.square, posterior.device
-    return Region(*known, limit, share, *ends, by_scale)
-
-
-def _sizes(rows: FloatArray, square: FloatArray) -> FloatArray:
-    """Return the expected sizes (N,) of rows (P, c, N) times errors of squares (P, P)."""
-    squares = np.einsum('pcn,pcn->n', np.tensordot(square, rows, 1), rows)
-    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
+    arm = posterior.chain, posterior.names, posterior.square, posterior.device
+    return Region(*arm, limit, share, *ends, by_scale)
 
 
 _Doubts: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
@@ -237,19 +230,12 @@ class _Judge:
         frames = [*parameters_of(base), *parameters_of(tool)[:3]]
         self._placed, self._freedom = len(frames), freedom
         every = list(dict.fromkeys([*names, *frames]))
-        self._model = ErrorModel(chain, every, base, tool)
+        self.model = ErrorModel(chain, every, base, tool)  # then further frame parameters
         self._own = [*map(every.index, frames), *self._arm]
         self._offsets = posterior.offsets[self._arm]
 
-    def rows(self, joints: FloatArray) -> FloatArray:
-        """Return the position rows (P + F, 3, N) at joint values (N, n).
-
-        Of the posterior's names, then of further frame parameters.
-        """
-        return self._model.shifts(joints)
-
     def products(self, rows: FloatArray) -> FloatArray:
-        """Return products (K, K) of the columns of frames, then of the arm."""
+        """Return products (K, K) of the columns of frames, then of the arm, from all rows."""
         return gram(rows[self._own])
 
     def of_the_arm(self, doubted: Sequence[Mixed]) -> _Doubts:
