@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from calib_ros.errors import InputError, TooFewObservationsError
 from calib_ros.estimation import identifiability
-from calib_ros.estimation.evidence import Posterior, posterior_of
+from calib_ros.estimation.evidence import posterior_of
 from calib_ros.estimation.fitted import Fitted, Simpler
 from calib_ros.estimation.leastsquares import (
     System,
@@ -109,7 +109,9 @@ def _fit_all(
     if simpler is None and (fitted.noise.consistent or size <= 1.0):
         size = min(size, _likely_noise(fitted))
     posterior = posterior_of(fitted, size, judging=False)
-    if not _priors_matter(problem, names, posterior):
+    held = max((posterior.held(n) for n in names if n not in problem.given), default=0.0)
+    alone = problem.learned is None and not problem.model.effects
+    if alone and held <= 1.0 - CONFIDENT:  # the priors found would not change the fit
         return fitted
     for _ in range(ROUNDS):
         priors = {
@@ -222,15 +224,6 @@ def _guarded(
         return replace(problem, learned=more) if guards else problem
     noise = 1.0 if simpler is None else _noise_for_priors(simpler.noise, None)
     return replace(problem, learned=Learned(guards, noise)) if guards or simpler else problem
-
-
-def _priors_matter(problem: Problem, names: Sequence[str], posterior: Posterior) -> bool:
-    """Tell whether the priors found in the data would change a fit without them."""
-    if problem.learned is not None or problem.model.effects:
-        return True
-    return any(
-        posterior.held(name) > 1.0 - CONFIDENT for name in names if name not in problem.given
-    )
 
 
 def _require_enough(problem: Problem, names: Sequence[str]) -> None:

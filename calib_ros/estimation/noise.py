@@ -98,9 +98,9 @@ def noise_of(
         alone = np.sum(plain @ sum(middles, extra.T @ extra) * plain, axis=1)
         widened = float(np.median(np.sqrt(np.diag(covariance.sum(axis=0)) / alone)))
         noise = replace(noise, widened=widened)
-    size = float(np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain))))
     if estimated.any():
-        noise = replace(noise, size=size)
+        size = np.sqrt(np.median(np.diag(covariance.sum(axis=0)) / np.diag(plain)))
+        noise = replace(noise, size=float(size))
     return noise, Uncertainty(covariance, freedom)
 
 

@@ -30,7 +30,7 @@ def board_poses(observations: Observations, lens: Lens) -> Observations:
     Raises InputError if no image shows enough points, or half of those that do fit no pose of the
     board.
     """
-    usable = _determine_a_pose(observations, observations.images)
+    usable = _determine_a_pose(observations)
     if not usable.any():
         raise InputError(
             'no image shows 4 board points that are not in line: the camera cannot be located'
@@ -130,16 +130,16 @@ def resect(observations: Observations, lens: Lens) -> tuple[FloatArray, FloatArr
     return poses @ se3.invert(board), np.minimum(rms, others)
 
 
-def _determine_a_pose(observations: Observations, index: Index) -> Flags:
+def _determine_a_pose(observations: Observations) -> Flags:
     """Return which images (M,) show enough points, not in line on board or image."""
     assert observations.points is not None
     assert observations.pixels is not None
+    index = observations.images
     usable = np.bincount(index) >= 4
     for places in (observations.points, observations.pixels):
         rest = places - _per_image(places, index)[index]
-        spread = np.linalg.eigvalsh(
-            _per_image(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
-        )
+        squares = _per_image(rest[:, :, np.newaxis] * rest[:, np.newaxis], index)
+        spread = np.linalg.eigvalsh(squares)
         usable &= spread[:, -2] > DEGENERATE**2 * spread[:, -1]
     return np.asarray(usable)
 

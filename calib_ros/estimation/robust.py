@@ -134,9 +134,7 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
         bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
         fit = minimise(fit.chain, names, bounded, iterations=2)
         distances = distances_of(fit.chain, names, system)
-        if all(
-            np.allclose(d, b, rtol=0.1, atol=0.1) for d, b in zip(distances, before, strict=True)
-        ):
+        if np.allclose(*map(np.concatenate, (distances, before)), rtol=0.1, atol=0.1):
             break
     return reweighted(fit.chain, names, system, loss)
 
@@ -169,9 +167,8 @@ def reweighted(
     weights: list[FloatArray] = []
     for _ in range(ROUNDS):
         found = [weights_of(d, loss) for d in distances]
-        settled = bool(weights) and all(
-            np.allclose(f, w, rtol=0, atol=1e-4) for f, w in zip(found, weights, strict=True)
-        )
+        pairs = zip(found, weights, strict=True) if weights else ()
+        settled = bool(weights) and all(np.allclose(*pair, rtol=0, atol=1e-4) for pair in pairs)
         if settled:
             break
         swings = _swing(found, weights, last)
@@ -221,9 +218,7 @@ def distances_of(chain: Chain, names: Sequence[str], system: System) -> tuple[Fl
             length = norms(part) / np.sqrt(share)
             known = ~np.isnan(length)
             if known.any():
-                usual = np.sqrt(
-                    special.chdtri(part.shape[1], 0.5)
-                )  # median length of standard normals
+                usual = np.sqrt(special.chdtri(part.shape[1], 0.5))  # median of standard normals
                 scale = np.median(length[known]) / usual
                 size = np.where(known, length, 0.0) / max(scale, STEP_TOLERANCE)  # else rounding
                 largest = np.maximum(largest, size[row])
@@ -236,8 +231,14 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
 
     Weights of the samples are ignored. A system without spare equations returns `chain`.
     """
-    few = _thinned(system)
-    need = _need(names, few)
+    most = SOME_POSES // min(len(system.sets), 10)  # at least a tenth of them from each set
+    few = system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
+    rows = sum(  # with one sample per configuration
+        samples.rows / samples.count * (samples.observations.configurations.max() + 1)
+        for samples in few.sets
+        if samples.count
+    )
+    need = float(unknown(names, few) / rows)  # parameters without a prior per equation
     if need >= 1.0:
         return chain
     halves = _Halves(few, need)
@@ -276,22 +277,6 @@ def unknown(names: Sequence[str], system: System) -> int:
     """Return the number of parameters without a prior."""
     known = {} if system.prior is None else system.prior.sigmas
     return sum(name not in known for name in names)
-
-
-def _thinned(system: System) -> System:
-    """Return SOME_POSES samples evenly spread, at least a tenth of them from each set."""
-    most = SOME_POSES // min(len(system.sets), 10)
-    return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
-
-
-def _need(names: Sequence[str], system: System) -> float:
-    """Return parameters without a prior per equation, with one sample per configuration."""
-    rows = sum(
-        samples.rows / samples.count * (samples.observations.configurations.max() + 1)
-        for samples in system.sets
-        if samples.count
-    )
-    return float(unknown(names, system) / rows)
 
 
 class _Halves:
