@@ -129,7 +129,7 @@ class Record:
         values = {n: parse_number(x, f'{where}: nominal {n}') for n, x in effects.items()}
         return replace(chain, joints=joints, effects=()).with_effect_values(values)
 
-    def check_table(self, chain: Chain) -> None:
+    def _check_table(self, chain: Chain) -> None:
         """Refuse a table other than the identified one, if that is recorded.
 
         Programs that rewrite a file may sort its effects; the region lists them in their order.
@@ -138,35 +138,22 @@ class Record:
         converted = self._part('nominal').get('convention', chain.convention) != chain.convention
         names = (self.content.get('region') or {}).get('names', ())
         order = {name: k for k, name in enumerate(names)}
-        effects = sorted(chain.effects, key=lambda each: order.get(each[0], -1))
-        if (
-            known is None
-            or converted
-            or known == table_hash(replace(chain, effects=tuple(effects)))
-        ):
-            return
-        raise ConfigError(
-            f'{self.where} does not contain the table and effects identified '
-            '(calibration.table_sha256): it was edited, damaged, or exported without its '
-            'effects; give the file written by calib_ros identify. If the change is intended, '
-            'write your own record: calibration: {source: ...}'
-        )
+        effects = tuple(sorted(chain.effects, key=lambda each: order.get(each[0], -1)))
+        same = known is None or converted or known == table_hash(replace(chain, effects=effects))
+        if not same:
+            raise ConfigError(
+                f'{self.where} does not contain the table and effects identified '
+                '(calibration.table_sha256): it was edited, damaged, or exported without its '
+                'effects; give the file written by calib_ros identify. If the change is intended, '
+                'write your own record: calibration: {source: ...}'
+            )
 
     def check(self, chain: Chain, nominal: Chain, settings: Settings | None = None) -> None:
         """Refuse a calibration of another nominal chain (`parse_calibration`)."""
-        self.check_table(chain)
+        self._check_table(chain)
         comparable = self._part('nominal').get('convention') == nominal.convention
         if comparable:
-            self._check_effects(nominal)
-        for name, row in (self._rows(nominal) if comparable else {}).items():
-            for kind, value in row.items():
-                wanted = nominal.value(f'{name}.{kind}')
-                if not math.isclose(value, wanted, abs_tol=1e-9):  # m, rad: nine digits written
-                    raise ConfigError(
-                        f'{self.where} was identified from another nominal chain, with '
-                        f'{name}.{kind} {value:.9g} and not {wanted:.9g}: give that one, or '
-                        'identify again'
-                    )
+            self._check_nominal(nominal)
         limits = settings or Settings()
         length, angle = limits.largest_length, limits.largest_angle
         if comparable and settings is None:
@@ -178,16 +165,22 @@ class Record:
                 'largest_angle allow'
             )
 
-    def _check_effects(self, nominal: Chain) -> None:
-        """Refuse a nominal chain with effects other than the recorded ones."""
+    def _check_nominal(self, nominal: Chain) -> None:
+        """Refuse a nominal chain with other numbers than the recorded ones."""
         where = f'{self.where}: calibration.nominal.effects'
         known = dictionary(self._part('nominal').get('effects'), where)
-        ours = dict(nominal.effects)
+        ours, numbers = dict(nominal.effects), []
         for name in {**known, **ours}:
-            value, wanted = parse_number(known.get(name, 0.0), where), ours.get(name, 0.0)
-            if not math.isclose(value, wanted, rel_tol=1e-9, abs_tol=1e-15):
+            value = parse_number(known.get(name, 0.0), where)
+            numbers.append((f'effect {name}', value, ours.get(name, 0.0), 1e-15))
+        for joint, row in self._rows(nominal).items():
+            for kind, value in row.items():  # m, rad: nine digits written
+                name = f'{joint}.{kind}'
+                numbers.append((name, value, nominal.value(name), 1e-9))
+        for name, value, wanted, least in numbers:
+            if not math.isclose(value, wanted, abs_tol=least):
                 raise ConfigError(
-                    f'{self.where} was identified from another nominal chain, with effect {name} '
+                    f'{self.where} was identified from another nominal chain, with {name} '
                     f'{value:.9g} and not {wanted:.9g}: give that one, or identify again'
                 )
 
