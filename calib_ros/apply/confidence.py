@@ -75,8 +75,7 @@ def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
 @lru_cache(maxsize=4)  # fitted and judged, before and after: a report asks several times
 def interval_of(which: Comparison, when: int) -> tuple[float, float]:
     """Return the 95 % interval [m] of the RMS before (0) or after (1), without outliers."""
-    residuals = (which.before, which.after)[when]
-    mask = which.deciding & ~np.isnan(residuals.position).any(axis=1)
+    residuals, mask = (which.before, which.after)[when], which.deciding
     return rms_interval(residuals.position[mask], residuals.configurations[mask])
 
 

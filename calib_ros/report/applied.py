@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib_ros.apply.planning import Plan
-from calib_ros.apply.workspace import Placements, Sector, Survey, in_base, regions, spread
+from calib_ros.apply.workspace import Placements, Survey, in_base, regions, spread
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import table_hash
@@ -70,18 +70,17 @@ def _worst(found: Survey) -> Iterator[Section]:
     for title, (label, errors) in zip(titles, found.parts.items(), strict=False):
         sectors = regions(found.positions, errors)
         shown = sectors if len(sectors) <= 6 else (*sectors[:6], sectors[-1])
+        rows = []
+        for each in shown:
+            spans = (f'{low:.2f} to {high:.2f}' for low, high in (each.radius, each.height))
+            rows.append((each.words, str(each.poses), rounded(1e3 * each.rms), *spans))
         yield Section(
             f'regions-{label.split()[0]}',
             title,
             ('The 6 regions with the most, and the one with the least.',),
             head=('region', 'poses', 'RMS [mm]', 'radius [m]', 'height [m]'),
-            rows=tuple(map(_region, shown)),
+            rows=tuple(rows),
         )
-
-
-def _region(found: Sector) -> tuple[str, ...]:
-    spans = (f'{low:.2f} to {high:.2f}' for low, high in (found.radius, found.height))
-    return (found.words, str(found.poses), rounded(1e3 * found.rms), *spans)
 
 
 def placed_in_words(placed: Placements) -> str:

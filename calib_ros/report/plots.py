@@ -194,12 +194,9 @@ def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
 
 def _draw_axes(axes: Axes, x: Mapping[str, Any], y: Mapping[str, Any]) -> None:
     for name, axis in (('x', x), ('y', y)):
-        title = axis.get('title', {}).get('text', '').replace('<br>', '\n')
-        axes.set(**{f'{name}label': title})
+        axes.set(**{f'{name}label': axis.get('title', {}).get('text', '')})
         if 'range' in axis:
             axes.set(**{f'{name}lim': axis['range']})
-        if axis.get('rangemode') == 'tozero':
-            axes.set_xlim(left=0.0)
     if y.get('autorange') == 'reversed':
         axes.invert_yaxis()
 

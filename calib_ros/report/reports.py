@@ -265,7 +265,11 @@ def _unmodelled(result: Identification) -> list[str]:
 
 
 def _effects(result: Identification) -> Section:
-    used = {True: 'yes', False: 'no'}
+    rows = []
+    for each in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before)):
+        percent = round(100.0 * (each.rms_mm_after / each.rms_mm_before - 1.0), 1)
+        change = f'{percent:+.1f} %' if percent else '0.0 %'
+        rows.append((each.what, change, 'yes' if each.pays else 'no'))
     return section(
         'effects',
         'Non-geometric errors',
@@ -274,16 +278,8 @@ def _effects(result: Identification) -> Section:
         f'The comparison uses up to {COMPARED:,} poses. The chosen model is fitted to all poses '
         'and does better; its error is at the top.',
         head=('effect', 'changes the error by', 'used'),
-        rows=tuple(
-            (v.what, _change(v.rms_mm_after / v.rms_mm_before), used[v.pays])
-            for v in sorted(result.verdicts, key=lambda v: (not v.pays, -v.rms_mm_before))
-        ),
+        rows=tuple(rows),
     )
-
-
-def _change(ratio: float) -> str:
-    percent = round(100.0 * (ratio - 1.0), 1)
-    return f'{percent:+.1f} %' if percent else '0.0 %'
 
 
 def _outliers(poses: Poses) -> Section:

@@ -142,15 +142,12 @@ def hints(found: Verification) -> list[str]:
             'is not active, or this is the corrected program: give the program as it was before '
             'calib_ros compensate'
         )
-    rms = 1e-3 * found.comparison.figures[1].rms_mm
+    before, rms = (1e-3 * each.rms_mm for each in found.comparison.figures)
     if found.mistake:
         return lines
-    if found.step:
-        lines.append(f'something moved while you measured: {found.step}')
-        if found.odd:
-            lines.append(_apart(found))
-    elif found.odd:
-        lines.append(_apart(found))
+    if found.step or found.odd:
+        moved = [f'something moved while you measured: {found.step}'] if found.step else []
+        lines += moved + ([_apart(found)] if found.odd else [])
     elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
         lines.append(
             'no arm is so far off: check units and columns of the measurements (--length, '
@@ -163,7 +160,7 @@ def hints(found: Verification) -> list[str]:
             f'{100.0 * found.common:.2g} % of it: was the measuring device moved? If on purpose, '
             'give --new-base, and --new-tool for a new target'
         )
-    elif rms > 1e-3 * found.comparison.figures[0].rms_mm and not found.uncorrected:
+    elif rms > before and not found.uncorrected:
         lines.append('the nominal arm would be nearer: is the calibration that of this robot?')
     return lines
 
@@ -193,12 +190,11 @@ def verification_report(
     if found.fitted:
         text.append('The interval allows for the refitted frames.')
     if found.limit is not None and not found.mistake:
-        names = ('Tolerance (RMS)', f'{1e3 * found.limit:g}', 'PASS', 'FAIL')
+        what, size = 'Tolerance (RMS)', f'{1e3 * found.limit:g}'
+        good, bad = 'PASS', 'FAIL'
         if found.tolerance is None:
-            size = rounded(1e3 * found.limit)
             what = f'Limit, at most {ALIKE:g} times the expected error'
-            names = (what, size, 'it holds', 'it no longer holds')
-        what, size, good, bad = names
+            size, good, bad = rounded(1e3 * found.limit), 'it holds', 'it no longer holds'
         text.append(
             f'{what}: {size} mm. If the whole interval is within it: '
             f'{good}; beyond it: {bad}; else UNDECIDED.'
@@ -206,21 +202,19 @@ def verification_report(
     text += (f'{each[0].upper()}{each[1:]}.' for each in caveats(found))
     state, steps = standing(found)
     gain = sections.gain(found.comparison, intervals=False)
-    title = 'Accuracy before and after the correction'
     different = 'Different poses', f'{found.configurations:,}'
-    accuracy = sections.accuracy_section(
-        title,
-        found.comparison,
-        poses.things,
-        COMPUTED,
-        intervals=False,
-        error=sections.OF_THE_PROGRAM if found.by_program else sections.ERROR,
-    )
     return Report(
         kind='Verification of a calibrated arm',
         robot=chain.name,
         verdict=replace(state, text=tuple(text), gain=gain),
-        accuracy=accuracy,
+        accuracy=sections.accuracy_section(
+            'Accuracy before and after the correction',
+            found.comparison,
+            poses.things,
+            COMPUTED,
+            intervals=False,
+            error=sections.OF_THE_PROGRAM if found.by_program else sections.ERROR,
+        ),
         picture=sections.distribution(poses),
         steps=steps,
         remarks=(*warnings, *hints(found)),

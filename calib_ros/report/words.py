@@ -207,15 +207,9 @@ def verdict(
 
 
 def _least_and_most(found: Comparison, when: int) -> tuple[float, float]:
-    """Return the 95 % interval [m] of the RMS error; the figure alone without positions.
-
-    One pose shows at least its error, and leaves open the largest one.
-    """
+    """Return the 95 % interval [m] of the RMS error; a single pose shows at least its own."""
     least, most = interval_of(found, when)
-    if np.isfinite(most):
-        return least, most
-    rms = 1e-3 * found.figures[when].rms_mm
-    return rms, np.inf if np.isfinite(found.after.position).any() else rms
+    return least if np.isfinite(most) else 1e-3 * found.figures[when].rms_mm, most
 
 
 NO_LONGER_HOLDS = (
