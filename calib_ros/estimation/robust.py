@@ -134,7 +134,8 @@ def robust_fit(chain: Chain, names: Sequence[str], system: System, loss: str) ->
         bounded = system.weighted([1.0 / np.maximum(d, 1.0) for d in distances])
         fit = minimise(fit.chain, names, bounded, iterations=2)
         distances = distances_of(fit.chain, names, system)
-        if np.allclose(*map(np.concatenate, (distances, before)), rtol=0.1, atol=0.1):
+        now, then = map(np.concatenate, (distances, before))
+        if np.allclose(now, then, rtol=0.1, atol=0.1):
             break
     return reweighted(fit.chain, names, system, loss)
 
