@@ -151,34 +151,32 @@ def reweighted(
     """Fit with the weights of a loss, from a start that is good enough to detect gross errors.
 
     Fits are repeated to a `tolerance` until the weights converge: the more often they swing, the
-    smaller their steps, lest they go round for ever. With the distances (N,) of all samples by a
-    `simpler` model, samples that it explains are no gross errors: a richer model has to explain
-    them too.
+    smaller their steps, lest they go round for ever. A sample at the edge may lose weight, come
+    nearer, regain it, and so on. With the distances (N,) of all samples by a `simpler` model,
+    samples that it explains are no gross errors: a richer model has to explain them too.
     """
+    ends = np.cumsum([samples.count for samples in system.sets])[:-1]
 
-    def judged(chain: Chain) -> tuple[FloatArray, ...]:
-        found = distances_of(chain, names, system)
-        if simpler is None:
-            return found
-        return tuple(np.minimum(d, s) for d, s in zip(found, simpler, strict=True))
+    def judged(chain: Chain) -> FloatArray:  # over all sets
+        found = np.concatenate(distances_of(chain, names, system))
+        return found if simpler is None else np.minimum(found, np.concatenate(simpler))
 
     distances = judged(chain)
     settled, swung = False, 0
-    last: list[FloatArray] = []
-    weights: list[FloatArray] = []
+    last: FloatArray | None = None
+    weights: FloatArray | None = None
     for _ in range(ROUNDS):
-        found = [weights_of(d, loss) for d in distances]
-        pairs = zip(found, weights, strict=True) if weights else ()
-        settled = bool(weights) and all(np.allclose(*pair, rtol=0, atol=1e-4) for pair in pairs)
-        if settled:
-            break
-        swings = _swing(found, weights, last)
-        swung += swings
-        share = min(1.0, PATIENCE / (swung + 1.0)) * (0.5 if swings else 1.0)
-        if weights:
-            found = [share * f + (1.0 - share) * w for f, w in zip(found, weights, strict=True)]
+        found = weights_of(distances, loss)
+        if weights is not None:
+            settled = np.allclose(found, weights, rtol=0, atol=1e-4)
+            if settled:
+                break
+            swings = last is not None and float((found - weights) @ (weights - last)) < 0.0
+            swung += swings
+            share = min(1.0, PATIENCE / (swung + 1.0)) * (0.5 if swings else 1.0)
+            found = share * found + (1.0 - share) * weights
         last, weights = weights, found
-        system = system.weighted(weights)
+        system = system.weighted(np.split(weights, ends))
         fit = minimise(chain, names, system, tolerance)
         chain = fit.chain
         distances = judged(chain)
@@ -186,18 +184,7 @@ def reweighted(
             break
     if not (settled and fit.left < STEP_TOLERANCE):
         fit = minimise(chain, names, system)
-    return Robust(fit, system, distances, settled, loss)
-
-
-def _swing(
-    found: Sequence[FloatArray], last: Sequence[FloatArray], before: Sequence[FloatArray]
-) -> bool:
-    """Tell whether weights (N,), set by set, go back; empty lists are not found yet.
-
-    A sample at the edge may lose weight, come nearer, regain it, and so on.
-    """
-    steps = zip(found, last, before, strict=True) if before else ()
-    return sum(float((f - b) @ (b - c)) for f, b, c in steps) < 0.0
+    return Robust(fit, system, tuple(np.split(distances, ends)), settled, loss)
 
 
 def weights_of(distance: FloatArray, loss: str) -> FloatArray:
