@@ -68,23 +68,21 @@ def solve(
         slope = np.einsum('ikb,kb->ib', columns, error)
         return NormalBatch(normal, slope, np.einsum('kb,kb->b', error, error))
 
+    lower, upper = (end[:, np.newaxis] for end in limits(chain))
+    turn = np.array([[2.0 * np.pi * (joint.type == 'revolute')] for joint in chain.joints])
+
     def within(q: FloatArray, step: FloatArray | float) -> FloatArray:
-        return _within(chain, q + step)
+        """Move joint values (n, B) into the limits, by a full turn if possible."""
+        q = q + step
+        q = np.where((q > upper) & (q - turn >= lower), q - turn, q)
+        q = np.where((q < lower) & (q + turn <= upper), q + turn, q)
+        return np.clip(q, lower, upper)
 
     begin = within(np.array(start, dtype=float).T, 0.0)
     q = minimise_batch(linearise, begin, within, enough=SAME**2, rounds=iterations).x
     error, _ = aim.linearise(q, None, positions, axes, lever)
     apart, turned = (np.linalg.norm(part, axis=0) for part in (error[:3], error[3:] / lever))
     return Inverse(q.T, apart, turned, np.linalg.norm(error[part], axis=0) <= SAME)
-
-
-def _within(chain: Chain, q: FloatArray) -> FloatArray:
-    """Move joint values (n, B) into the limits, by a full turn if possible."""
-    lower, upper = (end[:, np.newaxis] for end in limits(chain))
-    turns = np.array([[2.0 * np.pi * (joint.type == 'revolute')] for joint in chain.joints])
-    q = np.where((q > upper) & (q - turns >= lower), q - turns, q)
-    q = np.where((q < lower) & (q + turns <= upper), q + turns, q)
-    return np.clip(q, lower, upper)
 
 
 class Aim:
