@@ -219,14 +219,8 @@ def trimmed_start(chain: Chain, names: Sequence[str], system: System) -> Chain:
 
     Weights of the samples are ignored. A system without spare equations returns `chain`.
     """
-    most = SOME_POSES // min(len(system.sets), 10)  # at least a tenth of them from each set
-    few = system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
-    rows = sum(  # with one sample per configuration
-        samples.rows / samples.count * (samples.observations.configurations.max() + 1)
-        for samples in few.sets
-        if samples.count
-    )
-    need = float(unknown(names, few) / rows)  # parameters without a prior per equation
+    few = _thinned(system)
+    need = _need(names, few)
     if need >= 1.0:
         return chain
     halves = _Halves(few, need)
@@ -265,6 +259,22 @@ def unknown(names: Sequence[str], system: System) -> int:
     """Return the number of parameters without a prior."""
     known = {} if system.prior is None else system.prior.sigmas
     return sum(name not in known for name in names)
+
+
+def _thinned(system: System) -> System:
+    """Return SOME_POSES samples evenly spread, at least a tenth of them from each set."""
+    most = SOME_POSES // min(len(system.sets), 10)
+    return system.select([np.arange(0, s.count, -(-s.count // most)) for s in system.sets])
+
+
+def _need(names: Sequence[str], system: System) -> float:
+    """Return parameters without a prior per equation, with one sample per configuration."""
+    rows = sum(
+        samples.rows / samples.count * (samples.observations.configurations.max() + 1)
+        for samples in system.sets
+        if samples.count
+    )
+    return float(unknown(names, system) / rows)
 
 
 class _Halves:
