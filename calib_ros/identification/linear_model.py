@@ -26,7 +26,6 @@ from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SURE
 from calib_ros.estimation.observations import SOME_POSES, numbered
 from calib_ros.estimation.problem import Learned, Problem
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index
 from calib_ros.progress import Notify, quiet
@@ -55,14 +54,10 @@ class LinearModel:
         self._sizes['drive'] = max(self._sizes.get(k, 0.0) for k in ('drive', 'coupling'))
         problem = replace(problem, learned=Learned(priors, self._noise))
         self._problem = problem
-        judged = np.split(
-            geometric.fitted.judged, np.cumsum([len(each) for each in problem.sets])[:-1]
-        )
-        share = max(1, -(-sum(map(len, problem.sets)) // COMPARED))
-        sets = [
-            each.select(np.flatnonzero(good)[::share])
-            for each, good in zip(problem.sets, judged, strict=True)
-        ]
+        ends = np.cumsum([len(each) for each in problem.sets])
+        share = max(1, -(-int(ends[-1]) // COMPARED))
+        pairs = zip(problem.sets, np.split(geometric.fitted.judged, ends[:-1]), strict=True)
+        sets = [each.select(np.flatnonzero(good)[::share]) for each, good in pairs]
         self._system = problem.system(sets)
         numbers = numbered(sets)
         self._groups = np.concatenate(numbers)
@@ -94,7 +89,6 @@ class LinearModel:
             self._shifts = Shifts(self._system, [each[-1] for each in rows])
         self._errors: dict[tuple[int, ...], FloatArray] = {}
         self._moved: dict[str, int] = {}
-        self._sigmas: dict[str, float] = {}
         self._seen: ShiftProducts | None = None
 
     def useful(self, groups: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
@@ -211,11 +205,8 @@ class LinearModel:
                 products[fold, count:, :count] += cross.T
 
     def _rows(self, names: Sequence[str]) -> list[FloatArray]:
-        return self._system.rows_of(self._with(names), names)
-
-    def _with(self, names: Sequence[str]) -> Chain:
-        known = {*self._names}
-        return self._chain.with_effects([name for name in names if name not in known])
+        added = [name for name in names if name not in self._names]
+        return self._system.rows_of(self._chain.with_effects(added), names)
 
     def _left_out(self, dealing: int, chosen: Sequence[str]) -> FloatArray:
         """Return held-out position errors (N, 3) [m] of every sample, by the other folds."""
@@ -254,18 +245,11 @@ class LinearModel:
 
         Effects have the usual size, or that found in the data if larger.
         """
-        sigmas = np.array([self._sigma(name) for name in names])
-        return np.asarray(np.where(sigmas > 0.0, self._noise / np.where(sigmas, sigmas, 1.0), 0.0))
-
-    def _sigma(self, name: str) -> float:
-        """Return the standard deviation [m or rad] of the prior of a parameter, or 0."""
-        if name not in self._sigmas:
-            size = self._problem.prior_sigmas.get(name, 0.0)
-            if name not in self._names:
-                group = str(size_group(self._chain, name))
-                size = max(effects.expected(name), self._sizes.get(group, 0.0))
-            self._sigmas[name] = size
-        return self._sigmas[name]
+        sigmas = {n: s for n, s in self._problem.prior_sigmas.items() if n in self._names}
+        for name in {*names} - {*self._names}:
+            group = str(size_group(self._chain, name))
+            sigmas[name] = max(effects.expected(name), self._sizes.get(group, 0.0))
+        return np.array([self._noise / sigmas[n] if n in sigmas else 0.0 for n in names])
 
 
 def _cells(folds: Index) -> Iterator[tuple[slice, list[int]]]:
