@@ -10,6 +10,7 @@ poses is the root of the mean of tr J C J^T, with J their position rows.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -27,7 +28,8 @@ from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
 ASSUMED_TOOL = 3 * (LEVER / 3.0,)
-"""Assumed place of an unknown target [m] in the flange frame."""
+"""Assumed place of an unknown target [m] in the flange frame: on its axis, where an identity frame
+puts it, it hides the last joint."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,7 +63,9 @@ class Design(Shown):
         names: tuple[str, ...] = tuple(n for n in problem.free if n in structural or n in priors)
         scales = (1.0, 1.0)
         if result is None:
-            model = _with_assumed_tool(model, kind.tool)
+            if model.all_frames[kind.tool] is None:
+                place = se3.transform(np.eye(3), np.array(ASSUMED_TOOL))
+                model = model.with_frame(kind.tool, Frame(place))
             known = np.diag([1.0 / priors.get(name, np.inf) for name in names])
         else:
             model = result.chain
@@ -127,6 +131,16 @@ class Candidates:
         self.rows = times(rows, self._inverse)
         self.known = information_of(self.design.known @ self._inverse)
 
+    @cached_property
+    def _products(self) -> FloatArray:
+        each = np.swapaxes(self.rows, 1, 2) @ self.rows
+        return np.asarray(each[(slice(None), *np.triu_indices(len(self.factor)))])
+
+    def traces(self, matrix: FloatArray) -> FloatArray:
+        """Return tr A K A^T (N,) of all rows A with a symmetric matrix K (P, P)."""
+        twice = 2.0 * matrix - np.diag(np.diag(matrix))
+        return np.asarray(self._products @ twice[np.triu_indices(len(matrix))])
+
     def of_task(self, task: FloatArray) -> FloatArray:
         """Return V (P, P) [m^2]: tr V C is the mean squared position error at (T, n)."""
         rows = self.design.jacobian(task)[:, :3]
@@ -184,13 +198,3 @@ def _root_of_inverse(covariance: FloatArray) -> FloatArray:
     values, vectors = linalg.eigh(covariance / np.outer(std, std))
     least = len(std) * np.finfo(float).eps * values[-1]  # rounding may give zero and less
     return np.asarray((vectors / np.sqrt(np.maximum(values, least))).T / std)
-
-
-def _with_assumed_tool(chain: Chain, tool: str) -> Chain:
-    """Return the chain with its target off the flange's axis, if unknown.
-
-    On the axis, where an identity frame puts it, its position hides the last joint.
-    """
-    if chain.all_frames[tool] is not None:
-        return chain
-    return chain.with_frame(tool, Frame(se3.transform(np.eye(3), np.array(ASSUMED_TOOL))))

@@ -17,9 +17,9 @@ are undefined while M is singular: exchanges then start from the choice by `d`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy import linalg
@@ -35,8 +35,6 @@ from calib_ros.settings import CRITERIA, Criterion
 from calib_ros.shown import Shown, as_frame
 
 INDICES: tuple[Criterion, ...] = ('o2', 'o3', 'o4', 'o5')
-Traces: TypeAlias = Callable[[FloatArray], FloatArray]
-"""Returns tr A K A^T (N,) of all candidates with a symmetric matrix K (P, P)."""
 
 
 def choose(
@@ -77,13 +75,8 @@ class _Pick:
     """The candidates chosen so far, and their information."""
 
     def __init__(self, space: Candidates, apart: float) -> None:
-        self._joints, self._rows = space.joints, space.rows
-        size = len(space.known)
-        self._upper = np.triu_indices(size)
-        each = np.swapaxes(space.rows, 1, 2) @ space.rows
-        self._each = each[(slice(None), *self._upper)]
-        self._start = space.known + HALF_THE_DIGITS * np.eye(size)  # invertible
-        self._apart = apart
+        self._joints, self._rows, self._apart = space.joints, space.rows, apart
+        self._start = space.known + HALF_THE_DIGITS * np.eye(len(space.known))  # invertible
         self._near: list[Flags] = []
         self._blocked = np.zeros(len(space.rows), dtype=np.intp)
         self.information = self._start
@@ -97,7 +90,7 @@ class _Pick:
                 'apart from each other (--apart): give more candidates (--draw, --candidates), or '
                 'plan fewer poses'
             )
-        most = worth.at_most(self.information, self._traces)[free]
+        most = worth.at_most(self.information)[free]
         few = min(int(np.sqrt(free.size)), free.size - 1)
         likely = free[np.argpartition(-most, few)[: few + 1]]
         least = worth.of(self.information, self._rows[likely]).max()
@@ -139,10 +132,6 @@ class _Pick:
             ordered.append(best)
         return np.array(ordered)
 
-    def _traces(self, matrix: FloatArray) -> FloatArray:
-        twice = 2.0 * matrix - np.diag(np.diag(matrix))
-        return np.asarray(self._each @ twice[self._upper])
-
 
 class _Worth:
     """Worth of candidates by a criterion."""
@@ -152,7 +141,7 @@ class _Worth:
     ) -> None:
         if criterion not in CRITERIA:
             raise UnknownNameError('criterion', criterion, CRITERIA)
-        self._criterion, self._factor, self._wanted = criterion, space.factor, None
+        self._criterion, self._space, self._wanted = criterion, space, None
         if criterion == 'task':
             if task is None:
                 raise ConfigError('the criterion "task" needs the poses of a task')
@@ -162,8 +151,9 @@ class _Worth:
         """Return the worth (N,) of candidates with rows (N, m, P) beside information (P, P)."""
         if self._criterion in INDICES:
             # of M + A^T A, in sigma per metre or radian
-            back = times(rows, self._factor)
-            total = self._factor.T @ information @ self._factor + np.swapaxes(back, 1, 2) @ back
+            factor = self._space.factor
+            back = times(rows, factor)
+            total = factor.T @ information @ factor + np.swapaxes(back, 1, 2) @ back
             singular = np.sqrt(np.maximum(np.linalg.eigvalsh(total), 1e-300))
             return indices_of(singular)[self._criterion]
         root = _root(information)
@@ -175,15 +165,15 @@ class _Worth:
         spread = times(seen, root.T @ self._wanted @ root) @ turned
         return np.asarray(np.trace(np.linalg.solve(whole, spread), axis1=1, axis2=2))
 
-    def at_most(self, information: FloatArray, traces: Traces) -> FloatArray:
+    def at_most(self, information: FloatArray) -> FloatArray:
         """Return upper bounds (N,): ln det(I + S) <= m ln(1 + tr S / m), m <= 6."""
         if self._criterion in INDICES:  # every candidate is judged in full
-            return np.full_like(traces(information), np.inf)
+            return np.full(len(self._space.rows), np.inf)
         root = _root(information)
         inverse = root @ root.T
         if self._wanted is None:
-            return np.asarray(6.0 * np.log1p(traces(inverse) / 6.0))
-        return traces(inverse @ self._wanted @ inverse)  # without (I + A C A^T)^-1
+            return np.asarray(6.0 * np.log1p(self._space.traces(inverse) / 6.0))
+        return self._space.traces(inverse @ self._wanted @ inverse)  # without (I + A C A^T)^-1
 
 
 def _root(information: FloatArray) -> FloatArray:
@@ -208,7 +198,7 @@ def efficiency(
     slope = root @ root.T
     if task is not None:
         slope = slope @ space.of_task(task) @ slope
-    each = np.einsum('nmp,nmp->n', times(space.rows, slope), space.rows)
+    each = space.traces(slope)
     start = float(np.sum(slope * space.known))
     steepest = np.sort(each)[-len(chosen) :]
     return float((start + each[chosen].sum()) / (start + steepest.sum()))
@@ -310,12 +300,13 @@ def fewest(
             f'{1e3 * wanted:g} mm are wanted: give more candidates (--draw, --candidates), a '
             'more accurate device (--sigma-position), or a larger --accuracy'
         )
+    chosen = partial(
+        choose, excited, candidates, criterion=criterion, task=task, apart=apart, progress=progress
+    )
     count = len(excited.names)  # poses determine several parameters each
     while True:
         count = min(count, len(candidates))
-        found = choose(
-            excited, candidates, count, criterion, task, apart, progress, exchanged=False
-        )
+        found = chosen(count, exchanged=False)
         errors = accuracy(excited, candidates[found], task)
         if errors[-1] <= wanted:
             break
@@ -325,9 +316,7 @@ def fewest(
     while reached > 1:  # the first of many are not the best of few
         start = found[:reached] if reached < len(found) else found[: reached - 1]
         for begin in (start, None):  # quick first
-            fewer = choose(
-                excited, candidates, len(start), criterion, task, apart, progress, begin
-            )
+            fewer = chosen(len(start), start=begin)
             errors = accuracy(excited, candidates[fewer], task)
             if errors[-1] <= wanted:
                 break
