@@ -39,6 +39,7 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
     kinds += [['angle', 'orientation error [mrad]']] if poses.oriented else []
     lengths = {when: _values(poses, 'length', when)[poses.judged] for when in WHEN}
     reach = float(np.linalg.norm(poses.position, axis=1).max())
+    usual = 1e-3 * float(np.median(lengths['after'])) if lengths['after'].size else 0.0
     arrays = {
         'joints': shown.joints,
         'position': shown.position,
@@ -59,7 +60,8 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'tools': poses.tools.tolist(),
         'reach': reach,
         'largest': {w: float(np.quantile(x, 0.98)) if x.size else 1.0 for w, x in lengths.items()},
-        'enlarge': _enlargement(reach, lengths['after']),
+        # log10 of the factor that draws the usual error as 0.05 of the reach
+        'enlarge': round(float(np.log10(max(1.0, 0.05 * reach / max(usual, 1e-9)))), 2),
         'total': len(poses),
         'oriented': poses.oriented,
         'kinds': kinds,
@@ -78,12 +80,6 @@ def explorer(chain: Chain, poses: Poses) -> dict[str, Any]:
         'bins': _bins(chain, poses, [kind for kind, _ in kinds]) if many else None,
         'cells': _cells(poses) if many else None,
     }
-
-
-def _enlargement(reach: float, errors_mm: FloatArray) -> float:
-    """Return log10 of the factor that draws the usual error as 0.05 of the reach [m]."""
-    usual = 1e-3 * float(np.median(errors_mm)) if errors_mm.size else 0.0
-    return round(float(np.log10(max(1.0, 0.05 * reach / max(usual, 1e-9)))), 2)
 
 
 def _packed(values: NDArray[Any], kind: str) -> str:
@@ -129,15 +125,10 @@ def _bins(chain: Chain, poses: Poses, kinds: list[str]) -> dict[str, Any]:
 
 def _quantiles(values: FloatArray, place: Index) -> list[Any]:
     """Return the SHARES (3, B) of values (N,) in bins (N,), None for empty ones."""
-    known = ~np.isnan(values)
-    values, place = values[known], place[known]
-    ordered = values[np.lexsort((values, place))]
-    count = np.bincount(place, minlength=BANDS)
-    first = np.cumsum(count) - count
-    ranks = np.round(np.outer(SHARES, np.maximum(count - 1, 0))).astype(int)
-    table = np.full(ranks.shape, np.nan)
-    table[:, count > 0] = ordered[(first + ranks)[:, count > 0]]
-    return numbers(table, 4)
+    bins = (values[(place == k) & ~np.isnan(values)] for k in range(BANDS))
+    none = np.full(len(SHARES), np.nan)
+    table = [np.quantile(x, SHARES, method='nearest') if x.size else none for x in bins]
+    return numbers(np.transpose(table), 4)
 
 
 def _cells(poses: Poses) -> dict[str, Any]:
