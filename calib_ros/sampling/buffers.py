@@ -23,7 +23,7 @@ class Rows:
 
     def __init__(self, width: int, capacity: int) -> None:
         self.width, self.capacity = width, capacity
-        self.count = self.contrary = 0  # rows held; rows dropped for others of the same stamp
+        self.count = 0
         self._stamps = np.empty(min(1024, capacity), dtype=np.int64)
         self._values = np.empty((len(self._stamps), width))
 
@@ -66,22 +66,19 @@ class Rows:
         """Drop the first rows."""
         self.keep(slice(count, None))
 
-    def sort(self) -> int:
-        """Sort the rows by stamp, one row each; return how many were dropped.
+    def sort(self) -> tuple[int, int]:
+        """Sort the rows by stamp, one row each; return how many were dropped as equal or contrary.
 
         Of equal stamps the smallest values are kept, so that the order of arrival does not matter.
         """
-        before = self.count
-        if before > 1 and not (np.diff(self.stamps) > 0).all():
-            order = np.lexsort((*self.values.T[::-1], self.stamps))
-            stamps, values = self.stamps[order], self.values[order]
-            again = np.diff(stamps) == 0
-            near = np.isclose(
-                values[1:][again], values[:-1][again], AS_FLOATS, AS_FLOATS, equal_nan=True
-            )
-            self.contrary += int((~near.all(axis=1)).sum())
-            self.keep(order[np.concatenate([[True], ~again])])
-        return before - self.count
+        if (np.diff(self.stamps) > 0).all():
+            return 0, 0
+        order = np.lexsort((*self.values.T[::-1], self.stamps))
+        again = np.diff(self.stamps[order]) == 0
+        after, before = self.values[order[1:][again]], self.values[order[:-1][again]]
+        near = np.isclose(after, before, AS_FLOATS, AS_FLOATS, equal_nan=True).all(axis=1)
+        self.keep(order[np.concatenate([[True], ~again])])
+        return int(near.sum()), int((~near).sum())
 
 
 TOO_LATE = 'measurements: later than lateness allows'

@@ -279,12 +279,10 @@ class Collector:
         kept: list[tuple[str, Track | Rows, bool]] = [(JOINTS, self.track, False)]
         kept += [(POSES, rows, key.images) for key, rows in self.waiting.items()]
         for kind, rows, numbered in kept:
-            before = rows.contrary
-            twice = rows.sort()
-            contrary = 0 if numbered else rows.contrary - before  # image numbers always differ
-            for cause, count in ((TWICE, twice - contrary), (CONTRARY, contrary)):
-                if count:
-                    self.dropped[f'{kind}: {cause}'] += count
+            equal, contrary = rows.sort()
+            different = TWICE if numbered else CONTRARY  # image numbers always differ
+            self.dropped += Counter({f'{kind}: {TWICE}': equal})
+            self.dropped += Counter({f'{kind}: {different}': contrary})
 
     def _plan_stops(
         self, plan: Schedule, until: int, rounds: Sequence[int], ends_here: bool

@@ -100,7 +100,6 @@ class Track:
         self._capacity = capacity
         self._parts: dict[tuple[int, ...], Rows] = {}
         self._earlier = np.zeros(len(revolute))  # signs of last moves before the samples
-        self.contrary = 0  # samples dropped for different values of the same stamp
         self.horizon_ns = 0  # samples before this stamp have been dropped
 
     @property
@@ -145,12 +144,10 @@ class Track:
             rows = self._parts[columns] = Rows(len(columns), self._capacity)
         rows.extend(stamps, values)
 
-    def sort(self) -> int:
-        """Sort all samples; return how many had the stamp of another one."""
-        before = sum(rows.contrary for rows in self._parts.values())
-        dropped = sum(rows.sort() for rows in self._parts.values())
-        self.contrary += sum(rows.contrary for rows in self._parts.values()) - before
-        return dropped
+    def sort(self) -> tuple[int, int]:
+        """Sort all samples, as `Rows.sort`."""
+        dropped = [rows.sort() for rows in self._parts.values()]
+        return sum(equal for equal, _ in dropped), sum(contrary for _, contrary in dropped)
 
     def at(self, stamps: Stamps, standing: bool = False) -> Motion:
         """Return the motion at stamps (N,) where it is known (`causes`), after `sort`.

@@ -159,8 +159,8 @@ def test_of_equal_stamps_one_sample_is_kept_and_not_by_arrival():
         made = track()
         for ms, values in both[::order]:
             add(made, BOTH, ms * MS, np.array(values))
-        assert made.sort() == 1
-        assert made.sort() == 0
+        assert made.sort() == (0, 1)
+        assert made.sort() == (0, 0)
         np.testing.assert_array_equal(at(made, 100).joints, [(0.1, 0.3)])
 
 
