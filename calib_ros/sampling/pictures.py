@@ -62,7 +62,7 @@ class Pictures:
     def clear(self) -> None:
         """Forget all images and counts."""
         self._kept: dict[int, tuple[str, int, Callable[[], Any]]] = {}
-        self._queue: deque[tuple[Sample, Future[Sample | Flaw] | None]] = deque()
+        self._queue: deque[tuple[Sample, Future[Sample | Flaw]]] = deque()
         self.dropped: Counter[str] = Counter()  # unused images by cause
         self.refused = ''  # why the last image is not used; empty if it is
         self.reason = ''  # why the last of those dropped is not used
@@ -86,20 +86,13 @@ class Pictures:
 
         With `wait` all of them are finished.
         """
-        for sample in made:
-            if not sample.images:
-                self._queue.append((sample, None))
-            elif (begun := self._begin(sample)) is not None:
-                self._queue.append((sample, begun))
+        self._queue += ((each, begun) for each in made if (begun := self._begin(each)))
         found: list[Sample] = []
-        while self._queue:
-            sample, looked = self._queue[0]
-            result: Sample | Flaw = sample
-            if looked is not None:
-                if not (wait or looked.done()):
-                    break
-                result, self.refused = looked.result(), ''
-            self._queue.popleft()
+        while self._queue and (wait or self._queue[0][1].done()):
+            sample, begun = self._queue.popleft()
+            result = begun.result()
+            if sample.images:
+                self.refused = ''
             if isinstance(result, Flaw):
                 self.refused = self.reason = result.reason
                 self.dropped[f'measurements: image {result.cause}'] += sample.count
@@ -108,8 +101,12 @@ class Pictures:
         return found
 
     def _begin(self, sample: Sample) -> Future[Sample | Flaw] | None:
-        waiting = [looked for _, looked in self._queue if looked is not None]
-        busy = [looked for looked in waiting if not looked.done()]
+        """Return the sample with its image processed, one day, or None if it is dropped."""
+        if not sample.images:
+            ready: Future[Sample | Flaw] = Future()
+            ready.set_result(sample)
+            return ready
+        busy = [begun for _, begun in self._queue if not begun.done()]
         if len(busy) >= MOST_WAITING:
             if not self.patient:
                 self.dropped['measurements: image while others were processed'] += sample.count
