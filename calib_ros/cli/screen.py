@@ -143,11 +143,8 @@ class Work(Progress):
             task = bar.add_task('', total=None, times='')
             while True:
                 total = 1.0 if 0.0 < self.share < 1.0 else None
-                shown: dict[str, Any] = {
-                    'description': _printable(self.words),
-                    'times': self.times,
-                }
-                bar.update(task, total=total, completed=self.share, **shown)
+                bar.update(task, total=total, completed=self.share, times=self.times)
+                bar.update(task, description=_printable(self.words))
                 if self.done.wait(FIRST_S / 5):
                     break
 

@@ -18,7 +18,7 @@ from calib_ros.files.cameras import cameras_of
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.account import ALLOW, Account, allowing, too_much_lost
 from calib_ros.sampling.batches import Deserialise, Stream, batches, feed, links_of
-from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES
+from calib_ros.sampling.messages import BODIES, JOINT_STATE, PICTURES, head_of
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.topics import MessagesOn, Recorded, check_joints, choose_topics
 
@@ -152,8 +152,7 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
                 message = deserialise(data, connection.msgtype)
             except Exception as err:  # a damaged message fails in many ways
                 raise InputError(f'{path}: a damaged image on {connection.topic}') from err
-            stamp = message.header.stamp
-            yield stamp.sec * 1_000_000_000 + stamp.nanosec, message
+            yield head_of(message)[0], message
 
 
 def _chosen(

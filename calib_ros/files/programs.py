@@ -20,13 +20,7 @@ import numpy as np
 
 from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
-from calib_ros.files.columns import (
-    Columns,
-    check_quaternions,
-    columns_of,
-    read_columns,
-    with_rows,
-)
+from calib_ros.files.columns import Columns, check_quaternions, columns_of, read_columns, with_rows
 from calib_ros.files.layouts import ANGLES, LENGTHS, POSITION, QUATERNION, joint_columns
 from calib_ros.files.sheets import name_and_unit, places
 from calib_ros.kinematics import se3

@@ -17,13 +17,7 @@ from visualization_msgs.msg import MarkerArray
 from calib_ros.decision.misfits import Outlier
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.result import Identification
-from calib_ros.errors import (
-    LONGEST,
-    CalibrationError,
-    ConfigError,
-    InputError,
-    shortened,
-)
+from calib_ros.errors import LONGEST, CalibrationError, ConfigError, InputError, shortened
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.archive import Archive
 from calib_ros.files.history import History

@@ -42,11 +42,8 @@ class Account:
             text += f', {self.configurations} of them different'
         if self.waiting:
             text += f', {self.waiting} measurements waiting'
-        for label, counts in (
-            ('not used', self.unused),
-            ('dropped', self.dropped),
-            ('note', self.notes),
-        ):
+        tables = {'not used': self.unused, 'dropped': self.dropped, 'note': self.notes}
+        for label, counts in tables.items():
             if counts:
                 parts = ', '.join(f'{count} x {cause}' for cause, count in counts.items())
                 text += f'; {label}: {parts}'

@@ -39,19 +39,16 @@ def collect(
     """
     frames = Frames() if frames is None else frames
     observed = observed or (lambda some: _observations([samples[k] for k in some], posed))
-    groups: dict[tuple[str, str, str, bool, bool], list[int]] = {}
+    groups: dict[tuple[Any, ...], list[int]] = {}
     for k, sample in enumerate(samples):
-        kind = 'socket' if sample.socket else 'plane' if sample.plane else ''
-        kind = kind or ('distance' if sample.distance is not None else 'pose')
-        kind = 'view' if sample.view is not None and not posed else kind
-        key = (*frames.of(sample), kind, sample.eye_in_hand, sample.validation)
+        cornered = sample.view is not None and not posed
+        kind = (sample.socket, sample.plane, sample.distance is None, cornered)
+        key = (*frames.of(sample), sample.eye_in_hand and not cornered, sample.validation, kind)
         groups.setdefault(key, []).append(k)
     sets: tuple[list[Observations], list[Observations]] = ([], [])
-    for (base, tool, kind, eye_in_hand, validation), members in groups.items():
+    for (base, tool, inverted, validation, _), members in groups.items():
         found = replace(observed(members), base=base, tool=tool)
-        if eye_in_hand and kind != 'view':
-            found = found.inverted(sigmas)
-        sets[validation].append(found)
+        sets[validation].append(found.inverted(sigmas) if inverted else found)
     return tuple(sets[0]), tuple(sets[1])
 
 
