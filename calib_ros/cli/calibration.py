@@ -73,10 +73,9 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
 
 
 def _export(options: argparse.Namespace, screen: Screen) -> int:
-    from calib_ros.files.export import CORRECTED_URDF, FILES, Export, exports, urdf_foot
+    from calib_ros.files.export import CORRECTED_URDF, FILES, exports, urdf_export
     from calib_ros.files.programs import read_joints
     from calib_ros.files.vendors import VENDOR_FILES, vendor_files
-    from calib_ros.kinematics.urdf import corrected_urdf
 
     nominal = load_chain(options.chain)
     calibration = calibration_of(options.calibration, 'export', nominal)
@@ -87,8 +86,8 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
     urdf = ''
     if options.urdf is not None:
         urdf = chain_text(options.urdf)
-        text = corrected_urdf(urdf, chain, **links) + urdf_foot(chain)
-        found = (*found, Export(f'{options.urdf.stem}{CORRECTED_URDF}', text, 0.0))
+        name = f'{options.urdf.stem}{CORRECTED_URDF}'
+        found = (*found, urdf_export(name, urdf, chain, links))
     elif Path(options.chain).suffix in URDF_SUFFIXES:
         urdf = chain_text(Path(options.chain))
     found += vendor_files(chain, nominal, origin, urdf, links, options.ur_hash)

@@ -43,7 +43,7 @@ from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.kinematics.parameter import DH_KINDS, Parameter
 from calib_ros.kinematics.se3 import ROUNDING, FloatArray
-from calib_ros.kinematics.urdf import with_common_normals
+from calib_ros.kinematics.urdf import corrected_urdf, with_common_normals
 from calib_ros.kinematics.urdf_tree import to_rpy
 from calib_ros.texts import csv_text, dump_yaml, from_cell, to_cell
 from calib_ros.values import SAME
@@ -247,9 +247,10 @@ def head(chain: Chain, what: str, error: float, digest: str) -> str:
     return f'# {name}: {what}; metres and radians; {exact}; calibrated table {digest}\n'
 
 
-def urdf_foot(chain: Chain) -> str:
-    """Return the comment at the end of a corrected URDF, which identifies it."""
-    return f'<!-- calibrated table {table_hash(chain)} -->\n'
+def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | None]) -> Export:
+    """Return a corrected URDF; the comment at its end identifies it."""
+    foot = f'<!-- calibrated table {table_hash(chain)} -->\n'
+    return Export(name, corrected_urdf(urdf, chain, **links) + foot, 0.0)
 
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:

@@ -203,13 +203,13 @@ class Inputs:
         return subscription, (stream, hearing)
 
     def _of_other_types(self) -> list[str]:
-        found = {}
+        found = set()
         for subscription, (stream, hearing) in self._inputs.items():
             topic = subscription.topic_name
             infos = [] if hearing.count else self._node.get_publishers_info_by_topic(topic)
             for kind in {info.topic_type for info in infos} - {stream.type}:
-                found[topic, kind] = f'{topic} is published as {kind}, not as {stream.type}'
-        return [found[key] for key in sorted(found)]
+                found.add(f'{topic} is published as {kind}, not as {stream.type}')
+        return sorted(found)
 
 
 def deserialised(data: bytes, name: str) -> Any:

@@ -100,18 +100,18 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         refuse_unknown_names(self, names)
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._take_parameters)
-        self._keeper = Keeper(self, self.session, self._archive, given, urdf)
+        candidates = None
+        if given.candidates:
+            candidates = read_joints(given_path(given.candidates), chain)
+        self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
+        self._keeper = Keeper(self, self.session, self._archive, given, urdf, self._guide.show)
         self._identifying = Identifying(
-            self, self.session, self._archive, filer, self._configuration, self._accept
+            self, self.session, self._archive, filer, self._configuration, self._keeper.adopt
         )
         self._status = self.create_publisher(String, '~/status', LATCHED)
         self._diagnostics = Diagnostics(
             self, self.session, self._archive, self._inputs, self._boundary, given.serial
         )
-        candidates = None
-        if given.candidates:
-            candidates = read_joints(given_path(given.candidates), chain)
-        self._guide = Guide(self, self.session, self._boundary.guarded, candidates)
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may stop and jump
         for period, work in (
@@ -273,10 +273,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         self._take_messages()
         return begin(*arguments)
 
-    def _accept(self, found: Calibration, published: Published, samples: Sequence[Sample]) -> None:
-        self._keeper.adopt(found, published, samples)
-        self._guide.show(found)
-
     def _on_capture(self, request: Any) -> Answer:
         socket = self.get_parameter('socket').value
         count, why = self.session.capture(socket)
@@ -325,8 +321,6 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _on_load(self, request: Any) -> Answer:
         self._identifying.last = f'loaded {self._keeper.load()}'
-        if self.session.calibration is not None:
-            self._guide.show(self.session.calibration)
         return True, self._identifying.last
 
     # Topics out

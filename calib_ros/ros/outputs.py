@@ -17,14 +17,14 @@ from std_msgs.msg import Float64MultiArray, String
 from calib_ros.atomic import confined, given_path, write_file
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.archive import Archive
-from calib_ros.files.export import exports, urdf_foot
+from calib_ros.files.export import exports, urdf_export
 from calib_ros.files.vendors import vendor_files
 from calib_ros.identification.calibration import Calibration, parse_calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import chain_text, parse_chain
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
+from calib_ros.kinematics.urdf import chain_from_urdf
 from calib_ros.ros import to_ros
 from calib_ros.ros.parameters import Given
 from calib_ros.ros.to_ros import LATCHED
@@ -101,13 +101,22 @@ class Published(NamedTuple):
 
 
 class Keeper:
-    """Keeps the calibration of a session, its publishers and its files together."""
+    """Keeps the calibration of a session, its publishers and its files together.
+
+    `adopted` is called with every calibration that comes into use.
+    """
 
     def __init__(
-        self, node: Node, session: CalibrationSession, archive: Archive, given: Given, urdf: str
+        self,
+        node: Node,
+        session: CalibrationSession,
+        archive: Archive,
+        given: Given,
+        urdf: str,
+        adopted: Callable[[Calibration], None],
     ) -> None:
         self._node, self._session, self._archive = node, session, archive
-        self._given, self._urdf = given, urdf
+        self._given, self._urdf, self._adopted = given, urdf, adopted
         self._published = Published('', '')
         self._lock = threading.Lock()  # identifications end on their own thread
         self._posed: tuple[int, Sequence[float]] | None = None
@@ -133,6 +142,7 @@ class Keeper:
             self._dh_parameters.publish(to_ros.dh_parameters(calibration.chain))
             self._calibration.publish(String(data=published.text))
             self._broadcast.publish(calibration.chain, calibration.world_frame)
+        self._adopted(calibration)
 
     def to_save(self) -> Published:
         """Return the calibration to save."""
@@ -199,10 +209,9 @@ class Keeper:
         links = self._given.links
         forms = exports(chain, nominal, joints, record)
         forms += vendor_files(chain, nominal, record, self._urdf, links)
-        files = {each.name: each.content for each in forms}
         if self._urdf:
-            text = corrected_urdf(self._urdf, chain, **links)
-            files['corrected.urdf'] = text + urdf_foot(chain)
+            forms += (urdf_export('corrected.urdf', self._urdf, chain, links),)
+        files = {each.name: each.content for each in forms}
         return True, f'exported to {self._archive.export(files)}: {", ".join(files)}'
 
     def publish_pose(self) -> None:
