@@ -162,7 +162,7 @@ def _chosen(
     definitions: Definitions,
 ) -> tuple[dict[str, Stream], Deserialise]:
     defined = {kind: each for kind, each in definitions.items() if kind in BODIES}
-    recorded = Recorded(available, _decodable(messages_on), _deserialiser(defined))
+    recorded = Recorded(available, messages_on, _deserialiser(defined))
     streams = choose_topics(recorded, session.settings)
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
@@ -233,16 +233,6 @@ def _decoded(store: Any, data: bytes, kind: str) -> Any:
         raise
 
 
-def _is_message(stream: Stream, data: object) -> bool:
-    """Tell whether it may be a message: a file may hold anything."""
-    return isinstance(data, bytes) and len(data) <= stored.largest(stream)
-
-
-def _decodable(messages_on: MessagesOn) -> MessagesOn:
-    """Omit what cannot be a message; `_feed` reports it."""
-    return lambda streams: (each for each in messages_on(streams) if _is_message(*each))
-
-
 def _feed(
     session: CalibrationSession,
     messages: Iterator[tuple[Stream, bytes]],
@@ -255,13 +245,8 @@ def _feed(
     for batch, err in batches(messages):
         if err is not None:
             problem = str(err) or type(err).__name__
-        usable = [each for each in batch if _is_message(*each)]
-        problems = feed(session, usable, deserialise)
-        count += len(usable) - len(problems)
-        if len(usable) < len(batch):
-            problems.append(
-                f'messages without data, or of more than {stored.LARGEST_MESSAGE} bytes'
-            )
+        problems = feed(session, batch, deserialise)
+        count += len(batch) - len(problems)
         problem = (problem, *problems)[-1]
         progress(count / max(expected, count, 1))
     session.finish()

@@ -258,11 +258,6 @@ def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
         found.note(f'cut off or damaged: {err}')
 
 
-def largest(stream: Stream) -> int:
-    """Return the largest size of a message of a stream."""
-    return LARGEST_IMAGE if stream.type in PICTURES else LARGEST_MESSAGE
-
-
 def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream, bytes]]:
     """Return the messages of an open bag on some topics, in order of log time.
 
@@ -271,28 +266,29 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
     """
     storage = getattr(reader, 'storage', None)
     storages = getattr(storage, 'storages', [storage])
-    if not all(map(_is_known, storages)):
-        connections = _wanted(reader, streams)
-        return ((streams[c.topic], data) for c, _, data in reader.messages(connections))
     found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
+    if not all(map(_is_known, storages)):
+        messages = reader.messages(_wanted(reader, streams))
+        found = ((streams[connection.topic], data) for connection, _, data in messages)
     return _unpacked(found)
 
 
 def _unpacked(messages: Iterator[tuple[Stream, bytes]]) -> Iterator[tuple[Stream, bytes]]:
     """Unpack messages that were compressed one by one, as their first bytes tell.
 
-    Metadata, which would tell, may be missing. Damaged ones are empty: the next one may be
-    readable.
+    Metadata, which would tell, may be missing. Damaged or too large ones, and what is no message,
+    are empty, so that they cannot be decoded: the next one may be readable.
     """
     for stream, data in messages:
+        most = LARGEST_IMAGE if stream.type in PICTURES else LARGEST_MESSAGE
         if isinstance(data, bytes) and data.startswith(mcap.ZSTD):
             try:
-                data = mcap.decompressed(data, 'zstd', largest(stream))
+                data = mcap.decompressed(data, 'zstd', most)
             except OSError:  # no decompression module
                 raise
             except Exception:  # decompressors have their own errors
                 data = b''
-        yield stream, data
+        yield stream, data if isinstance(data, bytes) and len(data) <= most else b''
 
 
 def _wanted(storage: Any, streams: Mapping[str, Stream]) -> list[Any]:

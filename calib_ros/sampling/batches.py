@@ -108,7 +108,7 @@ def batches(
         try:
             for each in itertools.islice(messages, BATCH):
                 batch.append(each)
-                size += len(each[1]) if isinstance(each[1], bytes) else 0
+                size += len(each[1])
                 if size > LARGEST_TABLE:  # images
                     break
             else:

@@ -115,10 +115,9 @@ def check_joints(
 ) -> None:
     """Refuse joint states with an InputError if several topics name the same joints."""
     topics: dict[str, set[str]] = {name: set() for name in joint_names}
-    for batch, _ in batches(recorded.messages_on(streams)):
-        for topic in {stream.topic for stream, _ in batch}:
-            of_topic = [each for each in batch if each[0].topic == topic]
-            for part in DecodedBatch(of_topic, recorded.deserialise).parts:
+    for topic, stream in streams.items():
+        for batch, _ in batches(recorded.messages_on({topic: stream})):
+            for part in DecodedBatch(batch, recorded.deserialise).parts:
                 for name in topics.keys() & part.readings.strings[1:]:
                     topics[name].add(topic)
     twice = {name: found for name, found in topics.items() if len(found) > 1}
