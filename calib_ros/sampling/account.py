@@ -13,8 +13,7 @@ from calib_ros.sampling.slices import JOINTS, POSES
 
 LOST = 'were dropped (stamps or full buffers)'
 ALLOW = 'accept the rest with largest_loss (--largest-loss)'
-_LOSS = re.compile(r'stamp|lateness|buffer full|memory')
-_TWICE = re.compile(r'same stamp twice|already exists')
+_LOSS = re.compile('(?!.*(same stamp twice|already exists)).*(stamp|lateness|buffer full|memory)')
 
 
 @dataclass(frozen=True)
@@ -62,11 +61,7 @@ def lost(kind: str, total: int, dropped: Mapping[str, int]) -> tuple[float, str]
     Lost messages were dropped for their stamp or a full buffer; duplicates, and what the device
     did not see, do not count.
     """
-    causes = {
-        cause: count
-        for cause, count in dropped.items()
-        if cause.startswith(kind) and _LOSS.search(cause) and not _TWICE.search(cause)
-    }
+    causes = {c: n for c, n in dropped.items() if c.startswith(kind) and _LOSS.match(c)}
     most = max(causes, key=causes.__getitem__, default='')
     return sum(causes.values()) / total if total else 0.0, most.removeprefix(f'{kind}: ')
 

@@ -67,14 +67,10 @@ class Collector:
         """
         self._sort()
         until = np.iinfo(np.int64).max if now_ns is None else now_ns - self._lateness_ns
-        stamps, joints = self.track.samples()
-        complete = stamps <= until
-        positions = [
-            (rows.stamps[rows.stamps <= until], rows.values[rows.stamps <= until])
-            for key, rows in self.waiting.items()
-            if key.is_place
-        ]
-        return (stamps[complete], joints[complete]), positions
+        places = (rows for key, rows in self.waiting.items() if key.is_place)
+        every = [self.track.samples(), *((rows.stamps, rows.values) for rows in places)]
+        joints, *positions = [(t[t <= until], values[t <= until]) for t, values in every]
+        return joints, positions
 
     def reach(self, given: Slice, calm: tuple[int, int]) -> int:
         """Return how many messages to take up to the next that requires work.

@@ -105,9 +105,8 @@ def find_delay(
     others = peaks(score, RISE)
     apart = np.sqrt(1.0 - np.maximum(score, 0.0) ** 2)
     rivals = others[(others != best) & (apart[others] < ALIKE * apart[best])]
-    return Delay(
-        float(lags[best] + shift * STEP), float(score[best]), tuple(lags[rivals].tolist())
-    )
+    seconds = float(lags[best] + shift * STEP)
+    return Delay(seconds, float(score[best]), tuple(lags[rivals].tolist()))
 
 
 def peaks(score: FloatArray, rise: float) -> Index:
@@ -162,9 +161,8 @@ def _correlations(first: FloatArray, second: FloatArray, known: tuple[int, int])
         return np.asarray(running[end + shift] - running[begin + shift])
 
     means = total(one) / count, total(other, lags) / count
-    squares = (total(one**2) - count * means[0] ** 2) * (
-        total(other**2, lags) - count * means[1] ** 2
-    )
+    squares = total(one**2) - count * means[0] ** 2
+    squares *= total(other**2, lags) - count * means[1] ** 2
     products = np.correlate(other, one, 'valid') - count * means[0] * means[1]
     least = np.finfo(float).eps * (one @ one) * (other @ other)
     good = (count * STEP >= LEAST_MOTION) & (squares > least)

@@ -46,9 +46,8 @@ class JointNames:
                 self._layouts.clear()
             known = {k: key.index(n) for k, n in enumerate(self._names) if n in key}
             some = known.keys() - self.held.keys()
-            known = dict(
-                sorted((dict.fromkeys(self.held, NOWHERE) | known).items()) if some else ()
-            )
+            known = dict.fromkeys(self.held, NOWHERE) | known if some else {}
+            known = dict(sorted(known.items()))
             self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
             named = {name for names in self._layouts for name in names}
             needed = {n for k, n in enumerate(self._names) if k not in self.held}
@@ -77,11 +76,8 @@ class FrameNames:
 
     def required(self, device: str) -> str:
         """Return the frame wanted of a device; none if only others have measured in it."""
-        known = self._known.get(device, ())
-        elsewhere = self.wanted not in known and any(
-            self.wanted in others for others in self._known.values()
-        )
-        return '' if elsewhere else self.wanted
+        there = [name for name, frames in self._known.items() if self.wanted in frames]
+        return '' if there and device not in there else self.wanted
 
     def decides(self, device: str, frame_id: str) -> bool:
         """Tell whether measurements are the first ones of a device in the wanted frame."""

@@ -115,9 +115,7 @@ class Pictures:
         middle = len(sample.images) // 2
         kept = [k for k, number in enumerate(sample.images) if number in self._kept]
         if not kept:
-            self.dropped['measurements: image dropped, the memory for them was full'] += (
-                sample.count
-            )
+            self.dropped['measurements: image beyond the memory for them'] += sample.count
             return None
         nearest = min(kept, key=lambda k: abs(k - middle))
         return self._pool.submit(self._look, sample, *self._kept[sample.images[nearest]])

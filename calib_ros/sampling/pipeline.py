@@ -97,12 +97,12 @@ class Gate:
         if self.held(kind) < NO_ACCIDENT:
             return [], False
         moved = [time for other, time, _ in self._held if other == kind]
-        passing = [
-            other == kind or min(abs(time - each) for each in moved) <= self._far_ns
-            for other, time, _ in self._held
-        ]
-        freed = [each for each, free in zip(self._held, passing, strict=True) if free]
-        self._held = [each for each, free in zip(self._held, passing, strict=True) if not free]
+
+        def passes(each: tuple[str, int, Slice]) -> bool:
+            return min(abs(each[1] - time) for time in moved) <= self._far_ns or each[0] == kind
+
+        freed = [each for each in self._held if passes(each)]
+        self._held = [each for each in self._held if not passes(each)]
         self._last.update((other, time) for other, time, _ in freed)
         return [item for *_, item in freed], any(other == JOINTS for other, *_ in freed)
 

@@ -123,9 +123,7 @@ def socket_place(label: str) -> str:
     location, slash, socket = label.rpartition('/')
     names = location, socket
     if not (slash and all(names)) or '_' in socket or '/' in location or not label.isprintable():
-        raise ConfigError(
-            f'socket must be LOCATION/SOCKET, such as A/1, SOCKET without _, not "{label}"'
-        )
+        raise ConfigError(f'socket must be LOCATION/SOCKET (A/1), SOCKET without _, not "{label}"')
     return f'{location}_{socket}'
 
 

@@ -34,10 +34,7 @@ from calib_ros.settings import Settings
 from calib_ros.values import require
 
 NOT_RECORDING = 'not recording: call ~/record with true'
-ONE_FRAME = (
-    'only one may be used: set frame_id (--frame-id) to it, or start again with a separate '
-    'device for each source'
-)
+ONE_FRAME = 'only one may be used: set frame_id (--frame-id), or give each source its own device'
 
 
 class CalibrationSession:
@@ -366,14 +363,10 @@ class CalibrationSession:
         found = collect(since, self.settings.sigmas, frames)
         sets = [each for part in found for each in part]
         if not sets:
-            raise InputError(
-                'no poses since the calibration was identified or loaded: measure some new poses'
-            )
+            raise InputError('no poses since the calibration came into use: measure some new ones')
         known = calibration.chain.frame_names
         if not all(each.base in known and each.tool in known for each in sets):
-            raise InputError(
-                'the new poses come from a device or target that the calibration does not know'
-            )
+            raise InputError('the new poses are of a device or target unknown to the calibration')
         return calibration, sets
 
     def _flush(self) -> None:

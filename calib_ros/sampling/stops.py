@@ -72,11 +72,9 @@ def _noise(values: FloatArray) -> float:
 
     The second ones have less of a motion in them, the first ones fewer spikes.
     """
-    sizes = [
-        np.median(np.abs(np.diff(values, order, axis=0))) / np.sqrt(factor)
-        for order, factor in ((1, 2.0), (2, 6.0))
-    ]
-    return float(1.4826 * min(sizes))  # the median: spikes do not count
+    first, second = (np.median(np.abs(np.diff(values, k, axis=0))) for k in (1, 2))
+    noise = min(first / np.sqrt(2.0), second / np.sqrt(6.0))
+    return float(1.4826 * noise)  # the median: spikes do not count
 
 
 def _settled(values: FloatArray, reach: float) -> int:
@@ -125,9 +123,8 @@ class Schedule:
         self, stands: Stamps, until: int, newest: int | None, settings: Settings
     ) -> None:
         """Plan for stands (K, 2) up to a stamp; without the newest stamp all of them end there."""
-        shortest, longest = (
-            round(time * 1e9) for time in (settings.shortest_stop, settings.longest_stop)
-        )
+        shortest = round(settings.shortest_stop * 1e9)
+        longest = round(settings.longest_stop * 1e9)
         for begin, end in stands.tolist():
             goes_on = newest is not None and end >= newest
             if newest is None:

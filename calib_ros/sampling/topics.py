@@ -51,9 +51,7 @@ def choose_topics(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
     sources = parse_sources(settings.sources, available)
     for topic in (*settings.joint_topics, *(source.topic for source in sources)):
         if topic in own:
-            raise InputError(
-                f'{topic} is published by the calibration node itself: it measures nothing'
-            )
+            raise InputError(f'{topic} is an output of the calibration node: it measures nothing')
     joints = [topic for topic, kind in available.items() if kind == JOINT_STATE]
     for topic in settings.joint_topics:
         if topic not in joints:
@@ -146,10 +144,8 @@ def _found(available: Mapping[str, str]) -> tuple[Source, ...]:
 
 
 def _no_topic(what: str, types: Sequence[str], available: Mapping[str, str]) -> InputError:
-    return InputError(
-        f'the bag has no {what} ({", ".join(map(short_type, types))}); it holds '
-        f'{_contents(available)}'
-    )
+    kinds, held = ', '.join(map(short_type, types)), _contents(available)
+    return InputError(f'the bag has no {what} ({kinds}); it holds {held}')
 
 
 def _contents(available: Mapping[str, str]) -> str:

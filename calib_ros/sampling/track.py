@@ -265,10 +265,9 @@ class Track:
             if cut <= 0:
                 continue
             cuts = np.array([cut])
-            earlier = last_moves(
-                rows.values, cuts, rows.values[cuts], self._earlier[index], self._revolute[index]
-            )
-            self._earlier[index] = earlier[0]
+            earlier, revolute = self._earlier[index], self._revolute[index]
+            signs = last_moves(rows.values, cuts, rows.values[cuts], earlier, revolute)
+            self._earlier[index] = signs[0]
             rows.release(cut)
             dropped += cut
         self.horizon_ns = max(self.horizon_ns, before_ns)

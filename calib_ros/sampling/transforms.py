@@ -222,10 +222,8 @@ class Links:
         name = f'from {source.parent} to {source.child}'
         for link in links:
             if link in self._moving and link in self._fixed:
-                return (
-                    f'{" to ".join(link)} comes on both {self.topic} and {self.topic}{STATIC}, '
-                    'one is needed'
-                )
+                both = f'{self.topic} and {self.topic}{STATIC}'
+                return f'{" to ".join(link)} comes on both {both}, one is needed'
             if link in self._changed:
                 return f'{" to ".join(link)} has changed on {self.topic}{STATIC}: measure again'
         moving = [k for k, link in enumerate(links) if link in self._moving]

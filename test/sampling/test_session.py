@@ -311,5 +311,5 @@ def test_samples_on_a_target_that_the_calibration_does_not_know_are_no_judges():
     made = session(samples())
     made.identify()
     drive(made, 3, [(Source('x', target='new'), *tracker()[1:])])
-    with pytest.raises(InputError, match='does not know'):
+    with pytest.raises(InputError, match='unknown to the cal'):
         made.validate()

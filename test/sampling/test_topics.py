@@ -113,7 +113,7 @@ def test_a_recording_of_tags_without_their_frames_says_where_those_are(tmp_path)
 )
 def test_outputs_are_refused_by_name_too(tmp_path, settings):
     path = record(tmp_path / 'bag', [*outputs(), *measured()])
-    with pytest.raises(InputError, match='is published by the calibration node itself'):
+    with pytest.raises(InputError, match='is an output of the calibration node'):
         session_of(path, **settings)
 
 
