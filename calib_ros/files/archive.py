@@ -71,8 +71,7 @@ class Journal:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InputError(
-                f'{self.path} is being written by another process: give each robot a serial or '
-                'a data_dir of its own'
+                f'another process writes {self.path}: give each robot its own serial or data_dir'
             ) from None
         except OSError:  # a file system without locks
             pass
@@ -90,8 +89,7 @@ class Journal:
             )
         if not expected.startswith(found):
             raise InputError(
-                f"{self.path} does not have this robot's columns: move it, or choose another "
-                'data_dir'
+                f"{self.path} lacks this robot's columns: move it, or choose another data_dir"
             )
         if found != expected:
             os.ftruncate(self._file, 0)
@@ -130,9 +128,7 @@ class Archive:
     ) -> None:
         self.folder = folder
         self.error = ''  # why poses are in memory only; empty if all are in the journal
-        words = (
-            re.sub(r'[^\w.-]', lambda m: quote(m[0], safe=''), x) for x in robot.split('/', 1)
-        )
+        words = (re.sub(r'[^\w.-]', lambda m: quote(m[0], ''), x) for x in robot.split('/', 1))
         self._robot = short_name('_'.join(words))  # no two robots alike
         self._joints = joints
         self._configuration = configuration
@@ -144,10 +140,8 @@ class Archive:
             with TemporaryFile(dir=folder):
                 pass
         except OSError as err:
-            raise InputError(
-                f'poses cannot be kept in {folder} ({err.strerror}): set data_dir to a writable '
-                'folder'
-            ) from err
+            why = f'poses cannot be kept in {folder} ({err.strerror})'
+            raise InputError(f'{why}: set data_dir to a writable folder') from err
         self._path = self._new_path(_JOURNAL)
 
     @property

@@ -68,16 +68,13 @@ class Board:
         if self.type not in BOARD_TYPES:
             raise UnknownNameError('type of board', self.type, BOARD_TYPES)
         least = 2 if self.type == 'charuco' else 1
-        for name in ('columns', 'rows'):
-            count = getattr(self, name)
+        for count in (self.columns, self.rows):
             if not least <= count <= MOST_ENTRIES:
-                raise ConfigError(
-                    f'{name} of a board must be from {least} to {MOST_ENTRIES}, not {count}'
-                )
+                may = f'must have {least} to {MOST_ENTRIES} columns and rows'
+                raise ConfigError(f'a board of type {self.type} {may}, not {count}')
         if not 0.0 < self.marker < self.square < 1.0:
             raise ConfigError(
-                f'a board needs 0 < marker < square < 1 in metres, not {self.marker:g} and '
-                f'{self.square:g}'
+                f'a board needs 0 < marker < square < 1 [m], not {self.marker:g}, {self.square:g}'
             )
 
     @property
@@ -231,17 +228,12 @@ def read_detections(path: Path, board: Board) -> Detections:
         )
     _, first = np.unique(image * most + corner, return_index=True)
     for row in np.delete(np.arange(len(image)), first)[:1].tolist():
-        raise InputError(
-            f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]} '
-            'already exists'
-        )
-    order = np.argsort(image, kind='stable')
-    pixels = found.block(('u', 'v'))
-    first = np.unique(image, return_index=True)[1].tolist()
-    lines = tuple(int(found.lines[row]) for row in first)
-    return Detections(
-        tuple(names), image[order], corner[order], pixels[order], lines, _size_of(found)
-    )
+        again = f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]}'
+        raise InputError(f'{again} already exists')
+    order, pixels = np.argsort(image, kind='stable'), found.block(('u', 'v'))
+    corners = image[order], corner[order], pixels[order]
+    lines = found.lines[np.unique(image, return_index=True)[1]].tolist()
+    return Detections(tuple(names), *corners, tuple(lines), _size_of(found))
 
 
 def _size_of(found: Columns) -> tuple[int, int] | None:
@@ -252,8 +244,7 @@ def _size_of(found: Columns) -> tuple[int, int] | None:
     if others:
         sizes = ' and '.join(f'{w} x {h}' for w, h in (first, others[0]))
         raise InputError(
-            f'{found.path} has corners of images of {sizes} px: give one size only, as each '
-            'has its own intrinsics'
+            f'{found.path} has corners of images of {sizes} px: give those of one size only'
         )
     return first
 
@@ -298,8 +289,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     missing = [name for name in columns if name not in found.header]
     if missing:
         raise InputError(
-            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or x y z qx qy qz '
-            'qw of the flange'
+            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or a flange pose'
         )
     values = found.block(columns)
     if posed:

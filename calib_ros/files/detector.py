@@ -42,8 +42,7 @@ def opencv() -> Any:
         import cv2
     except ImportError as err:
         raise ConfigError(
-            'boards need OpenCV: sudo apt install python3-opencv, or pip install '
-            '"calib_ros[camera]"'
+            'boards need OpenCV: apt install python3-opencv or pip install "calib_ros[camera]"'
         ) from err
     if not hasattr(cv2, 'aruco'):
         raise ConfigError('this OpenCV has no ArUco module: before 4.7 it is in opencv-contrib')
@@ -133,10 +132,9 @@ class Detector:
             return Flaw('without the board', reason)
         own = ids < self._count
         if (~own).sum() > len(ids) // 2:
-            reason = (
-                f'it shows another board: marker {int(ids[~own][0])}, and this board has 0 to '
-            )
-            return Flaw('of another board', f'{reason}{self._count - 1}')
+            number, last = int(ids[~own][0]), self._count - 1
+            reason = f'it shows another board: marker {number}, and this board has 0 to {last}'
+            return Flaw('of another board', reason)
         return self._judged(image, corners[own], ids[own]) if coarse is image else found
 
     def _sought(self, image: Image) -> Markers:

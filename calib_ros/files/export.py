@@ -90,10 +90,8 @@ def exports(
     )
     others = [each for each in nominal.effects if each not in arm.effects]
     wanted = arm.forward(q)
-    lost, of_file_lost = (
-        distance(chain, replace(each, effects=(*each.effects, *others)), q)
-        for each in (arm, of_file)
-    )
+    controlled = (replace(each, effects=(*each.effects, *others)) for each in (arm, of_file))
+    lost, of_file_lost = (distance(chain, each, q) for each in controlled)
     counting = ', with the effects of the nominal chain'
     of_table, of_file_too = counting * bool(nominal.effects), counting * bool(others)
     digest = table_hash(chain)
@@ -254,10 +252,8 @@ def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | No
 
 
 def _csv(chain: Chain, what: str, error: float, digest: str) -> str:
-    rows = [
-        (to_cell(each.name), each.type, each.sign, *row)
-        for each, row in zip(chain.joints, chain.table.tolist(), strict=True)
-    ]
+    pairs = zip(chain.joints, chain.table.tolist(), strict=True)
+    rows = [(to_cell(each.name), each.type, each.sign, *row) for each, row in pairs]
     return head(chain, what, error, digest) + csv_text([(*ROW, *chain.columns), *rows])
 
 
@@ -276,8 +272,7 @@ def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: f
     difference = float(np.abs(again - wanted).max())
     if not difference <= SAME:
         raise ExportError(
-            f'{name}, read back, differs from the calibration by {difference:.3g} m or more in '
-            'rotation: it is not written'
+            f'{name}, read back, differs from the calibration by {difference:.3g} [m, rad or more]'
         )
     return Export(name, text, lost)
 

@@ -172,7 +172,7 @@ def _schema() -> Any:
 def _rows_of(table: Any) -> list[Row]:
     rows = []
     for record in table.to_pylist():
-        key = record.pop('key')
+        where = f'{record.pop("key")}{ENDING} in the history'
         for each in fields(Row):
             value = record[each.name]
             if str(each.type) == 'FloatArray':
@@ -180,16 +180,13 @@ def _rows_of(table: Any) -> list[Row]:
             elif str(each.type).startswith('tuple'):
                 record[each.name] = tuple(value or ())
             elif value is None and 'None' not in str(each.type):
-                raise InputError(f'{key}{ENDING} in the history has no {each.name}: {AWAY}')
+                raise InputError(f'{where} has no {each.name}: {AWAY}')
         size = len(record['names'])
         square, offsets, tilts = (record[name] for name in ('covariance', 'offsets', 'tilts'))
         numbers = np.concatenate([square, offsets, tilts])
         fits = (square.size, offsets.size, tilts.size % max(size, 1)) == (size**2, size, 0)
         if not (fits and np.isfinite(numbers).all()):
-            raise InputError(
-                f'the offsets or covariance of {key}{ENDING} in the history do not match its '
-                f'{size} names: {AWAY}'
-            )
+            raise InputError(f'offsets or covariance of {where} do not match its names: {AWAY}')
         record['covariance'] = square.reshape(size, size)
         record['tilts'] = tilts.reshape(size, tilts.size // max(size, 1))
         rows.append(Row(**record))

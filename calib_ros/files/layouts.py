@@ -316,8 +316,7 @@ def _rotations(
         return se3.exp_rotation(angles), np.asarray(left)
     if not layout.euler:
         raise ConfigError(
-            f'{made.path} has {called}: say which, --euler XYZ (or ZYX, '
-            'zyx, ...) or --rotation-vector'
+            f'{made.path} has {called}: say which, --euler XYZ (ZYX, zyx ...) or --rotation-vector'
         )
     return _from_euler(angles, layout.euler, names)
 

@@ -55,9 +55,7 @@ class Loaded:
             observations=first,
             more=more,
             held_out=[each.between(names) for each in problem.judging],
-            separations=[
-                (names.get(a, a), names.get(b, b), apart) for a, b, apart in problem.separations
-            ],
+            separations=[(names.get(a, a), names.get(b, b), d) for a, b, d in problem.separations],
         )
 
     def identified(self, model: str, progress: Notify = quiet) -> Identification:

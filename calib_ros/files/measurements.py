@@ -174,8 +174,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     for row in np.flatnonzero(filled.sum(axis=0, dtype=np.uint8) > 1)[:1].tolist():
         kinds = ' and '.join(np.array(KINDS)[filled[:, row]])
         raise InputError(
-            f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each kind of '
-            'measurement its own row'
+            f'{columns.path}, line {columns.lines[row]} has both {kinds}: give each its own row'
         )
     kind = filled.argmax(axis=0)
     placed = kind == POSE

@@ -221,8 +221,7 @@ def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
         import openpyxl
     except ImportError as err:
         raise InputError(
-            f'{path} is a workbook, which needs openpyxl: pip install "calib_ros[xlsx]", or save '
-            'it as CSV'
+            f'{path} needs openpyxl: pip install "calib_ros[xlsx]", or save it as CSV'
         ) from err
     try:
         with zipfile.ZipFile(path) as packed:

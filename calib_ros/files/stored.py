@@ -9,7 +9,6 @@ which trusts them, must not open.
 
 from __future__ import annotations
 
-import itertools
 import mmap
 import re
 import shutil
@@ -266,8 +265,9 @@ def read(reader: Reader, streams: Mapping[str, Stream]) -> Iterator[tuple[Stream
     """
     storage = getattr(reader, 'storage', None)
     storages = getattr(storage, 'storages', [storage])
-    found = itertools.chain.from_iterable(_stored(each, streams) for each in storages)
-    if not all(map(_is_known, storages)):
+    if all(map(_is_known, storages)):
+        found = (each for storage in storages for each in _stored(storage, streams))
+    else:
         messages = reader.messages(_wanted(reader, streams))
         found = ((streams[connection.topic], data) for connection, _, data in messages)
     return _unpacked(found)

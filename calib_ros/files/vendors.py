@@ -113,8 +113,7 @@ def vendor_files(
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(
-            f'"{checksum}" is not a Universal Robots checksum: the driver prints it at its start '
-            'as calib_ and digits'
+            f'"{checksum}" is not a Universal Robots checksum: calib_ and digits, by its driver'
         )
     found = []
     for vendor in (UR, FRANKA):

@@ -98,7 +98,7 @@ def test_the_newest_journal_is_resumed_without_what_was_taken_back(tmp_path):
         second.add(each)
     second.remove(samples[2])
     second.remove(samples[3])
-    with pytest.raises(InputError, match='written by another process'):
+    with pytest.raises(InputError, match='another process writes'):
         open_archive(tmp_path).resume()
     second.close()
     third = open_archive(tmp_path)

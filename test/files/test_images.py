@@ -183,7 +183,7 @@ BOARD = 'type: charuco\ncolumns: 5\nrows: 7\nsquare: 0.036\nmarker: 0.026\ndicti
     ('old', 'new', 'said'),
     [
         ('columns: 5', 'columns: 5.5', 'columns must be a whole number'),
-        ('columns: 5', 'columns: 1', 'columns of a board must be from 2 to 1000, not 1'),
+        ('columns: 5', 'columns: 1', 'must have 2 to 1000 columns and rows, not 1'),
         ('marker: 0.026', 'marker: 0.036', 'needs 0 < marker < square'),
         ('square: 0.036', 'square: 36', 'in metres, not 0.026 and 36'),
         ('rows: 7\n', '', 'key "rows" is missing'),

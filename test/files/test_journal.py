@@ -243,7 +243,7 @@ def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
 def test_a_file_that_is_no_journal_is_refused_and_left_as_it_is(tmp_path, content):
     path = tmp_path / 'cell.csv'
     path.write_text(content)
-    with pytest.raises(InputError, match="does not have this robot's columns"):
+    with pytest.raises(InputError, match="lacks this robot's columns"):
         Journal(path, JOINTS)
     assert path.read_text() == content
 
