@@ -154,15 +154,11 @@ class Guide:
             self._next_pose.publish(to_ros.joints(self._session.joint_names, best, self._now()))
 
     def _show(self, calibration: Calibration) -> None:
-        found = survey(calibration, CLOUD, np.random.default_rng(0))
-        points = found.cloud
+        points = survey(calibration, CLOUD, np.random.default_rng(0)).cloud
         base = calibration.chain.frame('base').matrix
         points[:, :3] = points[:, :3] @ base[:3, :3].T + base[:3, 3]
-        self._errors.publish(
-            to_ros.cloud(
-                ('x', 'y', 'z', 'error', 'sigma'), points, calibration.world_frame, self._now()
-            )
-        )
+        fields = ('x', 'y', 'z', 'error', 'sigma')
+        self._errors.publish(to_ros.cloud(fields, points, calibration.world_frame, self._now()))
 
     def _on_trajectory(self, data: bytes) -> None:
         if sum(not each.done() for each in self._pending) > MOST_QUEUED:
@@ -187,9 +183,7 @@ class Guide:
 
     def _corrected_by(self, message: Any, calibration: Calibration | None) -> tuple[Any, str]:
         if calibration is None:
-            raise InputError(
-                'there is no accepted calibration to correct it with: call ~/identify or ~/load'
-            )
+            raise InputError('no accepted calibration can correct it: call ~/identify or ~/load')
         compensator = _compensator(self._session.chain, calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
         program = trajectory_program(

@@ -114,9 +114,7 @@ def usage(program: str) -> argparse.ArgumentParser:
     """Return a parser of the non-ROS arguments: only --help, which lists the parameters."""
     lines = ['parameters:']
     for each in PARAMETERS.values():
-        text = textwrap.fill(
-            _described(each), 90, initial_indent=' ' * 6, subsequent_indent=' ' * 6
-        )
+        text = textwrap.indent(textwrap.fill(_described(each), 84), ' ' * 6)
         lines += [f'  {each.name}{"" if each.fixed else " *"}', text]
     lines += ['', '* can change while the node runs: ros2 param set /' + program + ' NAME VALUE']
     return argparse.ArgumentParser(

@@ -132,11 +132,9 @@ class DeferredTrigger:
         if not self._snapshot:
             self._send(response, header)
             return
-        snapshot = self._snapshot.pop()
+        given = self._snapshot.pop(), response, header
         self._running.set()
-        self._thread = threading.Thread(
-            target=self._run, args=(snapshot, response, header), daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, args=given, daemon=True)
         self._thread.start()
 
     def _run(self, snapshot: Any, response: Any, header: Any) -> None:

@@ -65,12 +65,8 @@ class Diagnostics:
     def _judged(self, account: Account) -> tuple[bytes, str]:
         unloaded = '' if self._session.calibration else self.unloaded
         wrong = [*filter(None, [unloaded]), *self._namesakes(), *self._inputs.troubles()]
-        fresh = {
-            cause: count
-            for cause, count in account.dropped.items()
-            if count > self._dropped_before.get(cause, 0)
-        }
-        self._dropped_before = account.dropped
+        before, self._dropped_before = self._dropped_before, account.dropped
+        fresh = [cause for cause, count in account.dropped.items() if count > before.get(cause, 0)]
         if fresh:
             wrong.append(f'messages are dropped ({", ".join(fresh)})')
         doubt = wrong or self._session.doubtful  # of what the status says

@@ -178,17 +178,15 @@ class Identifying:
         page = partial(_page, given, result)
         if result.accepted:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)
-            self._accepted(
-                found, Published(found.dump(), given.configuration, page), given.samples
-            )
+            published = Published(found.dump(), given.configuration, page)
+            self._accepted(found, published, given.samples)
             self.last += KEEP
         else:
             if self._session.calibration is not None:
                 self.last += '; the last good calibration stays in use'
             self._keep_report(page)
-        self.last += self._filer.file(
-            lambda: loaded.problem, settings, partial(identified, result)
-        )
+        row = partial(identified, result)
+        self.last += self._filer.file(lambda: loaded.problem, settings, row)
         return result.accepted, self.last
 
     def _keep_report(self, page: Callable[[], str | None]) -> None:

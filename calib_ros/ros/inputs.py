@@ -144,11 +144,8 @@ class Inputs:
             hearing.look(now, span)
         topics = self._topics.items()
         self.failures = [f'no more messages on {topic}' for topic, each in topics if each.silent]
-        self.failures += [
-            f'{topic} is published {each.deaf} is asked for'
-            for topic, each in topics
-            if each.deaf and not each.count
-        ]
+        deaf = [(topic, each.deaf) for topic, each in topics if each.deaf and not each.count]
+        self.failures += [f'{topic} is published {how} is asked for' for topic, how in deaf]
         self.failures += self._of_other_types()
         streams = [stream for stream, _ in self._inputs.values()]
         self.failures += [words for links in links_of(streams) for words in links.problems()]
@@ -171,9 +168,7 @@ class Inputs:
         return found
 
     def _subscribe(self, stream: Stream) -> tuple[Subscription, tuple[Stream, Hearing]]:
-        overriding = QoSOverridingOptions(
-            (QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY)
-        )
+        policies = QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH, QoSPolicyKind.HISTORY
         try:
             name = self._node.resolve_topic_name(stream.topic)
         except rclpy_implementation.RCLError as err:
@@ -192,7 +187,7 @@ class Inputs:
                 stream.topic,
                 lambda data: None,  # no executor serves it
                 _qos(stream),
-                qos_overriding_options=overriding,
+                qos_overriding_options=QoSOverridingOptions(policies),
                 event_callbacks=events,
                 raw=True,
             )

@@ -194,13 +194,11 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
 
     def _streams(self) -> list[Stream]:
         settings = self.session.settings
-        streams = [
-            Stream(topic, JOINT_STATE) for topic in settings.joint_topics or ('joint_states',)
-        ]
+        topics = settings.joint_topics or ('joint_states',)
         sources = parse_sources(settings.sources) or STANDARD
-        return streams + source_streams(
-            sources, {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
-        )
+        types = {source.topic: 'geometry_msgs/msg/PoseStamped' for source in sources}
+        streams = [Stream(topic, JOINT_STATE) for topic in topics]
+        return streams + source_streams(sources, types)
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -261,8 +259,7 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
                 log.error(self._diagnostics.unloaded)
         elif path is not None:
             log.info(
-                f'no calibration is published yet. There is {path}: call ~/load, or start with '
-                'autoload:=true'
+                f'no calibration is published yet: for {path} call ~/load, or set autoload:=true'
             )
         elif self._given.autoload:
             log.info(f'autoload: there is no saved calibration in {self._archive.folder} yet')
@@ -351,11 +348,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         return words
 
     def _answers(self) -> dict[str, Any]:
-        return {
-            'last identification': self._identifying.last,
-            'observability': self._identifying.observability,
-            **self._guide.figures(),
-        }
+        last, observability = self._identifying.last, self._identifying.observability
+        answers = {'last identification': last, 'observability': observability}
+        return answers | self._guide.figures()
 
     def _answer(self, name: str, work: Callable[[], Answer]) -> Answer:
         answer = self._boundary.answer(name, work)

@@ -49,10 +49,8 @@ class Broadcast:
         try:
             from tf2_msgs.msg import TFMessage
         except ImportError as err:
-            raise ConfigError(
-                f'base_frame and flange_frame need tf2_msgs ({err}): apt install '
-                'ros-jazzy-tf2-msgs, or leave them empty'
-            ) from err
+            needs = f'base_frame and flange_frame need tf2_msgs ({err})'
+            raise ConfigError(f'{needs}: apt install ros-jazzy-tf2-msgs') from err
         self._type = TFMessage
         self._publisher = node.create_publisher(TFMessage, '/tf_static', to_ros.LATCHED)
         self._base = self._tool = np.eye(4)
@@ -155,9 +153,8 @@ class Keeper:
 
         Returns the paths. The calibration is saved even without the report.
         """
-        path = self._archive.save(
-            published.text, published.configuration, self._named('target_filename')
-        )
+        target = self._named('target_filename')
+        path = self._archive.save(published.text, published.configuration, target)
         written = [path]
         try:
             page = published.page()
@@ -180,10 +177,8 @@ class Keeper:
         path, _ = self.at_start()
         session = self._session
         if path is None:
-            raise InputError(
-                f'there is no saved calibration of {session.chain.name} in '
-                f'{self._archive.folder}: set calibration_filename'
-            )
+            there = f'{session.chain.name} in {self._archive.folder}'
+            raise InputError(f'there is no saved calibration of {there}: set calibration_filename')
         text = _calibration_text(path)
         calibration = parse_calibration(text, str(path), session.chain, session.settings)
         calibration.serial_of(str(path), self._given.serial)
@@ -221,9 +216,8 @@ class Keeper:
             return
         self._posed = latest
         stamp_ns, values = latest
-        self._corrected_pose.publish(
-            to_ros.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
-        )
+        pose = to_ros.pose(calibration.chain, values, stamp_ns, calibration.world_frame)
+        self._corrected_pose.publish(pose)
 
     def _named(self, parameter: str) -> Path | None:
         return self.file_of(parameter, self._node.get_parameter(parameter).value)

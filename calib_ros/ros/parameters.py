@@ -53,18 +53,12 @@ def declare_all(node: Node) -> tuple[Given, Sequence[str]]:
     The node declares whatever is set, because rclpy lists it in no other way. Each parameter is
     declared again here with its description. Impossible values raise ConfigError.
     """
-    overrides = {
-        name: each.value
-        for name, each in node.get_parameters_by_prefix('').items()
-        if not name.startswith(OF_ROS)
-    }
+    given = node.get_parameters_by_prefix('').items()
+    overrides = {name: each.value for name, each in given if not name.startswith(OF_ROS)}
     for name in overrides:
         node.undeclare_parameter(name)
-    own = {
-        each.name: _declare(node, overrides, each)
-        for each in PARAMETERS.values()
-        if each.name not in OF_ROS
-    }
+    ours = (each for each in PARAMETERS.values() if each.name not in OF_ROS)
+    own = {each.name: _declare(node, overrides, each) for each in ours}
     settings = Settings(**{each.name: own[each.name] for each in fields(Settings)})
     refuse_unknown_names(node, [*overrides], QOS)
     if not own['chain']:
@@ -103,10 +97,8 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
             if found:
                 break
         else:
-            raise ConfigError(
-                f'no robot_description arrived within {DESCRIPTION_WAIT:g} s: start '
-                'robot_state_publisher first, or set chain to a file'
-            )
+            came = f'no robot_description arrived within {DESCRIPTION_WAIT:g} s'
+            raise ConfigError(f'{came}: start robot_state_publisher, or set chain to a file')
         text = message.data
     elif Path(name).suffix in URDF_SUFFIXES:
         text = chain_text(Path(name))

@@ -315,7 +315,7 @@ def test_what_images_need_is_told(monkeypatch, board):
             load_chain('ur10e'), Settings(mode='continuous', sources=sources(board, Image))
         )
     monkeypatch.setitem(sys.modules, 'cv2', None)
-    with pytest.raises(ConfigError, match='boards need OpenCV: sudo apt install'):
+    with pytest.raises(ConfigError, match='boards need OpenCV: apt install'):
         cameras_of(sources(board, Image))
 
 
