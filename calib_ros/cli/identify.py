@@ -85,9 +85,7 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     else:
         show(found, screen)
         if options.out is None:
-            screen.bullet(
-                'nothing was saved: add --out FOLDER to write the calibration and its report'
-            )
+            screen.bullet('nothing was saved: --out FOLDER writes the calibration and its report')
         else:
             screen.say(common.written(options.out, contents))
     return 0 if found.result.accepted else common.Status.NOT_ACCEPTED
@@ -191,9 +189,7 @@ def _source(options: argparse.Namespace) -> str:
             options.csv, options.measured = options.measured, None
     source = 'table' if options.csv or options.detections else 'bag'
     if (options.measured is None) == (source == 'bag'):
-        raise InputError(
-            'give a bag, or a table, or --detections FILE; a table and --detections go together'
-        )
+        raise InputError('give a bag, or a table, --detections FILE or both of these')
     common.refuse_ignored(options, source)
     return source
 
@@ -283,9 +279,7 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
         if each.steps:
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
-        screen.bullet(
-            'What else was found probably follows from that: the report (--out) lists it'
-        )
+        screen.bullet('What else was found probably follows from it: the report (--out) lists it')
     elif 1.0 < result.noise.position < FAR and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
 

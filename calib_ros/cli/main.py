@@ -113,9 +113,8 @@ def _unknown(word: str, parser: argparse.ArgumentParser) -> str:
     if not word.startswith('-'):
         return f'unexpected argument "{word}"'
     option = word.partition('=')[0]
-    hint = near(
-        option, (each for action in parser._actions for each in action.option_strings), 0.7
-    )
+    known = (each for action in parser._actions for each in action.option_strings)
+    hint = near(option, known, 0.7)
     return f'unknown option "{option}"' + (f': {hint}' if hint else '')
 
 

@@ -88,9 +88,7 @@ def _measurement(
         candidates = read_joints(options.candidates, design.chain)
         candidates = candidates[visibility.sees(design, candidates)]
         if not len(candidates):
-            raise InputError(
-                f'the device can measure the target at no pose of {options.candidates}'
-            )
+            raise InputError(f'the device sees the target at no pose of {options.candidates}')
     choice = {'criterion': options.criterion, 'apart': options.apart, 'progress': progress}
     needed = chosen = None
     if options.accuracy is not None:

@@ -66,9 +66,8 @@ def _write_simulation(
     standing = np.repeat(configurations, cell.poses_per_dwell, axis=0)
     noise = cell.noise_position, cell.noise_orientation
     poses = measure(true, standing, rng, *noise, approach=approaches(standing))
-    recording = Recording(
-        chain.joint_names, joint_stamps, joints, poses.at(pose_stamps), np.zeros(len(poses), bool)
-    )
+    measured, held_out = poses.at(pose_stamps), np.zeros(len(poses), bool)
+    recording = Recording(chain.joint_names, joint_stamps, joints, measured, held_out)
     truth = bag.parent / f'{bag.name}_truth.yaml'
     beside = {truth: dump_chain(true, {'source': 'simulation'})}
     with screen.work('simulating') as work:

@@ -88,12 +88,9 @@ def _task(
         return read_poses(options.task)
     if options.joint_box is None:
         return None
-    size = len(arm.chain.joints)
-    if len(options.joint_box) != 2 * size:
-        raise InputError(
-            f'--joint-box: give {size} lower and {size} upper values, not '
-            f'{len(options.joint_box)} in all'
-        )
+    size, count = len(arm.chain.joints), len(options.joint_box)
+    if count != 2 * size:
+        raise InputError(f'--joint-box: give {size} lower and {size} upper values, not {count}')
     lower, upper = box = np.reshape(options.joint_box, (2, size))
     check_limits(box, arm.chain, lambda *_: '--joint-box: ')
     if not (lower <= upper).all():

@@ -230,12 +230,9 @@ def _client(cluster: Cluster) -> Iterator[Any]:
             client.wait_for_workers(1, timeout=ANSWER_S)
         except (OSError, TimeoutError, ValueError) as err:
             raise LostError(f'no workers at {cluster.address or "this machine"}: {err}') from err
-        others = set(client.run(_version).values()) - {calib_ros.__version__}
-        if others:
-            raise ConfigError(
-                f'workers have calib_ros {", ".join(sorted(others))}, this is '
-                f'{calib_ros.__version__}: install the same'
-            )
+        own = calib_ros.__version__
+        if others := ', '.join(sorted(set(client.run(_version).values()) - {own})):
+            raise ConfigError(f'workers have calib_ros {others}, this is {own}: install the same')
         yield client
 
 

@@ -70,12 +70,8 @@ class RobotStatus:
         known = tuple(r for r in verifications(rows) if robot.compares(r.time))
         found = drift([r.rms_mm or 0 for r in known], [r.rms_freedom or 0 for r in known], years)
         watched = watch(compared, years)
-        errors, copies = (
-            by_robot.get(robot.serial, {}) for by_robot in (done.errors, done.copies)
-        )
-        remarks = [
-            f'{copy} has the content of {source}: one night' for copy, source in copies.items()
-        ]
+        errors, copies = (of.get(robot.serial, {}) for of in (done.errors, done.copies))
+        remarks = [f'{one} has the content of {other}: one night' for one, other in copies.items()]
         remarks += [*_clocks(rows, own), *_others(robot, rows, own), *watched.remarks]
         return cls(robot, last, watched, errors, known, found, tuple(remarks))
 

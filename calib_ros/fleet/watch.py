@@ -160,10 +160,8 @@ def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
     nights = tuple(Night(row, each) for row, each in zip(rows, strengths, strict=True))
     newest = set(arms[-1])
     left = sorted(newest.union(*arms[first:]) - newest.intersection(*arms[first:]))
-    remark = (
-        f'since {rows[first].time:%Y-%m-%d}, {", ".join(some(left))} are not compared: only some '
-        'nights fitted them'
-    )
+    lack = f'{", ".join(some(left))} are not compared: only some nights fitted them'
+    remark = f'since {rows[first].time:%Y-%m-%d}, {lack}'
     return Watched(nights, tuple(changes), (remark,) if left else ())
 
 
