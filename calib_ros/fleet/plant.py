@@ -115,15 +115,10 @@ def _robot(
     loss = parse_number(given.get('largest_loss', Robot.largest_loss), f'{where}: largest_loss')
     if not 0.0 <= loss <= 1.0:
         raise ConfigError(f'{where}: largest_loss must be from 0 to 1, not {loss:g}')
-    return Robot(
-        serial,
-        _chain(given.get('chain'), folder, where, chains),
-        _measured(own.get('measured'), folder, where),
-        settings,
-        tolerance,
-        loss,
-        _moment(own.get('since'), f'{where}: since'),
-    )
+    chain = _chain(given.get('chain'), folder, where, chains)
+    measured = _measured(own.get('measured'), folder, where)
+    since = _moment(own.get('since'), f'{where}: since')
+    return Robot(serial, chain, measured, settings, tolerance, loss, since)
 
 
 def _chain(name: object, folder: Path, where: str, chains: dict[str, Chain]) -> Chain:

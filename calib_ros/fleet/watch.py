@@ -123,11 +123,9 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
 
 
 def _other(names: frozenset[Parameter], newest: frozenset[Parameter]) -> str:
-    differences = (
-        ('they alone determine', names - newest),
-        ('it alone determines', newest - names),
-    )
-    return '; '.join(f'{who} {", ".join(some(sorted(what)))}' for who, what in differences if what)
+    alone = {'they alone determine': names - newest, 'it alone determines': newest - names}
+    found = ((who, ', '.join(some(sorted(what)))) for who, what in alone.items() if what)
+    return '; '.join(map(' '.join, found))
 
 
 def _alike(fitted: Sequence[_Fitted], years: float) -> Watched:
