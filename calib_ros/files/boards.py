@@ -73,9 +73,8 @@ class Board:
                 may = f'must have {least} to {MOST_ENTRIES} columns and rows'
                 raise ConfigError(f'a board of type {self.type} {may}, not {count}')
         if not 0.0 < self.marker < self.square < 1.0:
-            raise ConfigError(
-                f'a board needs 0 < marker < square < 1 [m], not {self.marker:g}, {self.square:g}'
-            )
+            sizes = f'{self.marker:g} and {self.square:g}'
+            raise ConfigError(f'a board needs 0 < marker < square < 1 in metres, not {sizes}')
 
     @property
     def corners(self) -> FloatArray:
@@ -222,10 +221,8 @@ def read_detections(path: Path, board: Board) -> Detections:
     image, names = found.labels('image')
     corner, most = found.integers('corner'), len(board.corners)
     for row in np.flatnonzero((corner < 0) | (corner >= most))[:1].tolist():
-        raise InputError(
-            f'{found.where(row, "corner")} must be from 0 to {most - 1} on this board, not '
-            f'{corner[row]}'
-        )
+        where = found.where(row, 'corner')
+        raise InputError(f'{where} must be from 0 to {most - 1} on this board, not {corner[row]}')
     _, first = np.unique(image * most + corner, return_index=True)
     for row in np.delete(np.arange(len(image)), first)[:1].tolist():
         again = f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]}'
@@ -289,7 +286,7 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     missing = [name for name in columns if name not in found.header]
     if missing:
         raise InputError(
-            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or a flange pose'
+            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or x y z qx ... qw'
         )
     values = found.block(columns)
     if posed:

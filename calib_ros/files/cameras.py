@@ -86,8 +86,7 @@ def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
     for source in sources:
         if 'image_rect' in source.topic.rpartition('/')[2]:
             raise ConfigError(
-                f'source "{source.topic}": CameraInfo describes the image before it is '
-                'rectified, give that (image_raw)'
+                f'source "{source.topic}" is rectified: give what CameraInfo describes, image_raw'
             )
     return {source.topic: BoardCamera(source) for source in sources}
 
