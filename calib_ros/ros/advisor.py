@@ -82,13 +82,8 @@ class Guide:
         self._corrected = node.create_publisher(
             JointTrajectory, '~/compensated_joint_trajectory', MOST_QUEUED
         )
-        node.create_subscription(
-            JointTrajectory,
-            '~/joint_trajectory',
-            self._guarded(self._on_trajectory),
-            MOST_QUEUED,
-            raw=True,  # see `_too_large`
-        )
+        taken, size = self._guarded(self._on_trajectory), MOST_QUEUED  # raw: see `_too_large`
+        node.create_subscription(JointTrajectory, '~/joint_trajectory', taken, size, raw=True)
 
     def join(self, timeout: float) -> bool:
         """Start nothing more and wait [s] for running work; return whether it has ended."""
@@ -186,11 +181,9 @@ class Guide:
             raise InputError('no accepted calibration can correct it: call ~/identify or ~/load')
         compensator = _compensator(self._session.chain, calibration)
         robot = dict(zip(self._session.joint_names, self._session.chain.joint_names, strict=True))
-        program = trajectory_program(
-            [robot.get(name, name) for name in message.joint_names],
-            [{key: list(getattr(point, key)) for key in RATES} for point in message.points],
-            'the trajectory',
-        )
+        names = [robot.get(name, name) for name in message.joint_names]
+        points = [{key: list(getattr(point, key)) for key in RATES} for point in message.points]
+        program = trajectory_program(names, points, 'the trajectory')
         corrected, result = compensate_program(compensator, program)
         words = in_words(compensator, result)
         if result.refusals:

@@ -167,14 +167,10 @@ class Identifying:
         hint = next(iter((*loaded.warnings, *words.other_remarks(result))), '')
         self._advice = telling or first or hint
         self.observability = words.observability_in_words(result)
-        self._residuals.publish(
-            to_ros.residual_markers(
-                result,
-                loaded.problem.sets,
-                self._node.get_parameter('marker_scale').value,
-                self._node.get_clock().now().to_msg(),
-            )
-        )
+        scale = self._node.get_parameter('marker_scale').value
+        now = self._node.get_clock().now().to_msg()
+        markers = to_ros.residual_markers(result, loaded.problem.sets, scale, now)
+        self._residuals.publish(markers)
         page = partial(_page, given, result)
         if result.accepted:
             found = Calibration.of(result, given.origin, loaded.owners, loaded.problem.sets)

@@ -80,12 +80,9 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         chain, urdf = load_robot(self, given)
         self._given = given
         self._boundary = Boundary(self.get_logger())
-        self._archive = Archive(
-            given_path(given.data_dir or f'{home}/calib_ros'),
-            f'{chain.name}/{given.serial or self.get_namespace()[1:]}'.rstrip('/'),
-            len(chain.joints),
-            self._configuration,
-        )
+        folder = given_path(given.data_dir or f'{home}/calib_ros')
+        robot = f'{chain.name}/{given.serial or self.get_namespace()[1:]}'.rstrip('/')
+        self._archive = Archive(folder, robot, len(chain.joints), self._configuration)
         self.session = CalibrationSession(
             chain, given.settings, self._on_sample, self._archive.remove
         )
@@ -114,10 +111,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         )
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may stop and jump
-        for period, work in (
-            (DIAGNOSTICS_PERIOD, self._on_second),
-            (TAKING_PERIOD, self._on_tick),
-        ):
+        timed = {DIAGNOSTICS_PERIOD: self._on_second, TAKING_PERIOD: self._on_tick}
+        for period, work in timed.items():
             self.create_timer(period, self._boundary.guarded(work), clock=steady)
         self._load_at_start()
 

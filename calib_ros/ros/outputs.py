@@ -228,12 +228,9 @@ class Keeper:
             return None
         if not name.endswith(('.yaml', '.yml')):
             raise InputError(f'{parameter} must end in .yaml or .yml')
-        allowed = self._given.allowed_folders
-        return confined(
-            name,
-            (self._archive.folder, *map(given_path, allowed)),
-            f'choose {parameter} in data_dir, or start the node with allowed_folders',
-        )
+        folders = self._archive.folder, *map(given_path, self._given.allowed_folders)
+        allowed_by = f'choose {parameter} in data_dir, or start the node with allowed_folders'
+        return confined(name, folders, allowed_by)
 
 
 def _calibration_text(path: Path) -> str:
