@@ -272,17 +272,10 @@ class LiveEstimate:
         jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
         variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
         sigma = float(np.sqrt(variance.mean()))
-        rms, excess = self._left(chain)
-        return Estimate(
-            chain,
-            self._names,
-            covariance,
-            len(self._added),
-            sigma,
-            float(np.sqrt(noise)),
-            rms,
-            excess if self._enough(self._rows) else None,
-        )
+        rms, ratio = self._left(chain)
+        excess = ratio if self._enough(self._rows) else None
+        arm = chain, self._names, covariance
+        return Estimate(*arm, len(self._added), sigma, float(np.sqrt(noise)), rms, excess)
 
     def _left(self, chain: Chain) -> tuple[float, float]:
         """Return the RMS position residual [m], and in units of the measurement scatter."""

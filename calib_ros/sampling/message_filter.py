@@ -201,15 +201,9 @@ class MessageFilter:
                 if width > 7:  # a covariance of zeros means none
                     none = ~readings.numbers[:, 7:].any(axis=1)
                     readings.numbers[none, 7:] = np.nan
-                key = StreamKey(
-                    source.device,
-                    source.target or readings.child,
-                    source.validation,
-                    width == 1 and not source.board,
-                    source.eye_in_hand,
-                    frame_id,
-                    bool(source.board),
-                )
+                target, board = source.target or readings.child, bool(source.board)
+                kind = source.validation, width == 1 and not board, source.eye_in_hand
+                key = StreamKey(source.device, target, *kind, frame_id, board)
                 yield Piece(key, places, readings.stamps_ns, readings.numbers)
 
     def _by_frame(self, parts: Sequence[Part]) -> list[Part]:

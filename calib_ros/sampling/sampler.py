@@ -237,12 +237,5 @@ def _sigmas(values: FloatArray, begins: Index, sigma: float) -> FloatArray:
 
 
 def _key(sample: Sample) -> StreamKey:
-    return StreamKey(
-        sample.device,
-        sample.target,
-        sample.validation,
-        sample.distance is not None,
-        sample.eye_in_hand,
-        sample.frame_id,
-        sample.view is not None,
-    )
+    kind = sample.validation, sample.distance is not None, sample.eye_in_hand
+    return StreamKey(sample.device, sample.target, *kind, sample.frame_id, sample.view is not None)

@@ -206,19 +206,13 @@ class CalibrationSession:
         notes = collector.notes.copy()
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
-        return Account(
-            self.received[JOINTS],
-            self.received[POSES],
-            collector.waiting.count + self._pipeline.gate.held(POSES),
-            len(fitted),
-            len(self.samples) - len(fitted),
-            distinct,
-            dict(sorted((self._filter.unused + collector.unused).items())),
-            dict(sorted(self._dropped.items())),
-            dict(sorted(notes.items())),
-            self._names.foreign,
-            self._names.never,
-        )
+        waiting = collector.waiting.count + self._pipeline.gate.held(POSES)
+        received = self.received[JOINTS], self.received[POSES], waiting
+        made = len(fitted), len(self.samples) - len(fitted), distinct
+        causes = self._filter.unused + collector.unused, self._dropped, notes
+        unused, dropped, noted = (dict(sorted(each.items())) for each in causes)
+        names = self._names.foreign, self._names.never
+        return Account(*received, *made, unused, dropped, noted, *names)
 
     @property
     def _dropped(self) -> Counter[str]:

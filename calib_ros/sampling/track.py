@@ -194,11 +194,8 @@ class Track:
         last = np.minimum(after, len(known) - 1)
         hit = known[last] == stamps
         first = np.where(hit, last, np.maximum(after - 1, 0))
-        cause = np.select(
-            [hit, after == len(known), after == 0, known[last] - known[first] > self._max_gap_ns],
-            [0, 2, 1, 3],
-            0,
-        )
+        apart = known[last] - known[first] > self._max_gap_ns
+        cause = np.select([hit, after == len(known), after == 0, apart], [0, 2, 1, 3])
         return cause.astype(np.intp), first.astype(np.intp), last.astype(np.intp)
 
     def standing(self, still: float, window: float) -> Stamps:
@@ -207,16 +204,10 @@ class Track:
         A joint stands if its value [rad or m] stayed within `still` during a window [s]. Of
         several publishers of a joint, one must show that, and none that was received the contrary.
         """
-        stands = {
-            columns: standing_intervals(
-                rows.stamps,
-                continuous(rows.values, self._revolute[list(columns)]),
-                still,
-                round(window * 1e9),
-                self._max_gap_ns,
-            )
-            for columns, rows in self._parts.items()
-        }
+        stands, limits = {}, (still, round(window * 1e9), self._max_gap_ns)
+        for columns, rows in self._parts.items():
+            values = continuous(rows.values, self._revolute[list(columns)])
+            stands[columns] = standing_intervals(rows.stamps, values, *limits)
         common: Stamps | None = None
         named = [tuple(c for c in stands if k in c) for k in range(len(self._revolute))]
         for several in dict.fromkeys(filter(None, named)):

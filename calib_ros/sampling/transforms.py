@@ -257,10 +257,8 @@ class Links:
         while links := self._parents[frames[-1]]:
             if len(links) > 1:
                 parents = ' and '.join(parent for parent, _ in links)
-                return frames, (
-                    f'frame "{frames[-1]}" has several parents, {parents}: what is measured needs '
-                    'a frame name of its own'
-                )
+                several = f'frame "{frames[-1]}" has several parents, {parents}'
+                return frames, f'{several}: what is measured needs a frame name of its own'
             if links[0][0] in frames:
                 return frames, f'frame "{frames[-1]}" is above itself'
             frames.append(links[0][0])
