@@ -112,11 +112,10 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
         changes += found.changes
         remarks += found.remarks
         if names != newest:
-            remarks.append(
-                f'{len(fitted)} night{"s" * (len(fitted) > 1)}, the last of '
-                f'{fitted[-1][0].time:%Y-%m-%d}, cannot be compared with the newest: '
-                f'{_other(names, newest)}'
-            )
+            number, last = len(fitted), fitted[-1][0].time
+            nights = f'{number} night{"s" * (number > 1)}, the last of {last:%Y-%m-%d}'
+            why = _other(names, newest)
+            remarks.append(f'{nights}, cannot be compared with the newest: {why}')
     nights.sort(key=lambda night: night.row.time)
     changes.sort(key=lambda change: change.seen)
     return Watched(tuple(nights), tuple(changes), tuple(remarks))

@@ -101,7 +101,7 @@ class Pictures:
         return found
 
     def _begin(self, sample: Sample) -> Future[Sample | Flaw] | None:
-        """Return the sample with its image processed, one day, or None if it is dropped."""
+        """Return the sample once its image is processed; None if it is dropped."""
         if not sample.images:
             ready: Future[Sample | Flaw] = Future()
             ready.set_result(sample)
