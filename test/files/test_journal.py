@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
 from calib_ros.files import tables
-from calib_ros.files.archive import Journal
+from calib_ros.files.journal import Journal
 from calib_ros.files.tables import read_journal, read_table, table_text
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens

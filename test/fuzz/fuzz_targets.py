@@ -152,7 +152,7 @@ def detections(path):
 
 @target('.csv')
 def journal(path):
-    from calib_ros.files.archive import Journal
+    from calib_ros.files.journal import Journal
     from calib_ros.files.tables import read_journal
 
     samples, _ = read_journal(path, len(ARM.joints))
