@@ -113,9 +113,9 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
         remarks += found.remarks
         if names != newest:
             number, last = len(fitted), fitted[-1][0].time
-            nights = f'{number} night{"s" * (number > 1)}, the last of {last:%Y-%m-%d}'
+            these = f'{number} night{"s" * (number > 1)}, the last of {last:%Y-%m-%d}'
             why = _other(names, newest)
-            remarks.append(f'{nights}, cannot be compared with the newest: {why}')
+            remarks.append(f'{these}, cannot be compared with the newest: {why}')
     nights.sort(key=lambda night: night.row.time)
     changes.sort(key=lambda change: change.seen)
     return Watched(tuple(nights), tuple(changes), tuple(remarks))
