@@ -265,7 +265,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
             coupled[k, k - 1] = float(f'{way}1')
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
-            yield Suspect(what, remedy, (_joints(coupled),), 2)
+            yield Suspect(what, remedy, (_joints(coupled),), 2, part=names[k])
 
 
 def hidden(chain: Chain, others: Sequence[Suspect]) -> list[tuple[Suspect, ...]]:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values in the order of a controller, which names external axes behind those of the arm."""
+"""Joint values as controllers give them: external axes behind those of the arm, coupled joints."""
 
 from dataclasses import replace
 
@@ -21,3 +21,24 @@ def test_external_axes_that_come_last_are_named(oriented):
     found = explained(Problem(arm, replace(seen, joints=np.roll(q, -1, axis=1)))).suspects[0]
     assert f'in another order, {arm.joint_names[0]} last' in found.what
     assert found.remedy == '--columns q1=q7,q2=q1,q3=q2,q4=q3,q5=q4,q6=q5,q7=q6'
+
+
+@pytest.mark.parametrize(
+    ('length', 'angle', 'remedy'),
+    [
+        (1e3, 180.0 / np.pi, '--length mm --joint-angle deg'),
+        (1e3, 1.0, '--length mm'),
+        (1.0, 180.0 / np.pi, '--joint-angle deg'),
+    ],
+)
+def test_a_coupled_joint_in_a_table_without_units_is_named(length, angle, remedy):
+    """As a Fanuc logs it: J3 against the horizontal, in degrees."""
+    arm, rng = load_chain('fanuc_r2000ic_165f'), np.random.default_rng(1)
+    q = arm.random_joints(25, rng)
+    seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, oriented=False)
+    logged = angle * (q - q[:, [1]] * np.eye(6)[2])
+    spoilt = replace(seen, joints=logged, positions=length * seen.positions)
+    (found,) = explained(Problem(arm, spoilt)).suspects
+    assert found.what == 'several mistakes at once'
+    assert f'({remedy})' in found.remedy
+    assert found.remedy.endswith('(--columns q3=q3+q2)')
