@@ -132,6 +132,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         or _of_a_lost_row(problem, chain, sets, given)
         or _named(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
+        or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
     if found is None:
@@ -139,7 +140,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
     named = found.suspects
     if problem.of_messages:
         named = tuple(replace(each, remedy=each.published) for each in named)
-    return replace(found, suspects=named, where=where)
+    return replace(found, suspects=named, where=where + found.where)
 
 
 def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
@@ -224,6 +225,41 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
     # the typical error tells nothing if most rows are right
     corrected = error if error < NEARER * given.error else np.nan
     return Explained((Suspect(what, remedy),), given.error, corrected)
+
+
+def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
+    """Return what is wrong with rows that the arm does not explain, if it explains others.
+
+    A third at one end of the session and the other end, or every second row and the others.
+    """
+    if len(sets) > 1 or sets[0].socket or _of_images(problem):
+        return None
+    whole = _moved(problem, sets[0], 0)
+    rows, third = np.arange(len(whole)), len(whole) // 3
+    if third < 2 * IN_A_FRAME:
+        return None
+    ends = {'first third of the rows': rows < third, 'last third of the rows': rows >= 2 * third}
+    turns = {'odd rows': rows % 2 == 0, 'even rows': rows % 2 == 1}
+    for halves in (ends, turns):
+        parts = [whole.select(part) for part in halves.values()]
+        trials = [in_frames(problem, chain, (part,)) for part in parts]
+        fits = [each is not None and each.error <= _largest(problem) for each in trials]
+        if all(fits) and halves is turns:
+            remedy = 'name them in a column session, and identify each alone (--session)'
+            two = Suspect(
+                'odd and even rows are of two arms, or of two devices or targets',
+                remedy,
+                published='give each its own device in sources',
+            )
+            return Explained((two,), given.error, np.nan)
+        for fit, name, part, trial in zip(fits[::-1], halves, parts, trials, strict=True):
+            if fit and trial is not None and (found := _named(problem, chain, (part,), trial)):
+                these = [
+                    replace(each, remedy=f'write them as the others ({each.remedy} reads them)')
+                    for each in found.suspects
+                ]
+                return replace(found, suspects=(*these,), where=f'in the {name} alone, ')
+    return None
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:

@@ -1,6 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Joint values as controllers give them: external axes behind those of the arm, coupled joints."""
+"""Joint values as controllers give them: external axes behind those of the arm, coupled joints;
+and rows that are not like the others.
+"""
 
 from dataclasses import replace
 
@@ -42,3 +44,20 @@ def test_a_coupled_joint_in_a_table_without_units_is_named(length, angle, remedy
     assert found.what == 'several mistakes at once'
     assert f'({remedy})' in found.remedy
     assert found.remedy.endswith('(--columns q3=q3+q2)')
+
+
+def test_rows_that_are_not_like_the_others_are_named():
+    """Of two arms in turn; of a second part in another unit."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
+    q = arm.random_joints(50, rng)
+    one, other = (measure(faulty(arm, Cell(), rng), q, rng, 5e-5, oriented=False) for _ in '12')
+    rows = np.arange(50)[:, np.newaxis]
+    mixed = replace(one, positions=np.where(rows % 2, one.positions, other.positions))
+    found = explained(Problem(arm, mixed))
+    assert str(found).startswith('odd and even rows are of two arms, or of two devices or targets')
+    for part, where in ((rows < 22, 'first'), (rows >= 27, 'last')):
+        spoilt = replace(one, positions=np.where(part, 1e3 * one.positions, one.positions))
+        found = explained(Problem(arm, spoilt))
+        assert found.where == f'in the {where} third of the rows alone, '
+        assert found.suspects[0].remedy == 'write them as the others (--length mm reads them)'
+        assert found.corrected < 0.01
