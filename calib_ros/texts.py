@@ -105,10 +105,10 @@ def dump_json(value: Any, indent: str = '') -> str:
     return f'{first}\n{indent}  ' + f',\n{indent}  '.join(lines) + f'\n{indent}{last}'
 
 
-def csv_text(rows: Iterable[Iterable[object]]) -> str:
+def csv_text(rows: Iterable[Iterable[object]], separator: str = ',') -> str:
     """Return rows as the text of a table."""
     text = io.StringIO(newline='')
-    csv.writer(text, lineterminator='\n').writerows(rows)
+    csv.writer(text, delimiter=separator, lineterminator='\n').writerows(rows)
     return text.getvalue()
 
 

@@ -184,14 +184,16 @@ def read_columns(path: Path, needed: Sequence[str]) -> Columns:
     return with_rows(columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)), needed)
 
 
-def columns_of(path: Path, data: bytes, progress: Notify = quiet, above: int = 0) -> Columns:
+def columns_of(
+    path: Path, data: bytes, progress: Notify = quiet, above: int = 0, separator: str = ','
+) -> Columns:
     """Return the columns of a CSV's content; refuse anything else, or too large.
 
     `above` is the number of lines of the file before it.
     """
     _refuse_zeros(path, data, above)
     as_text(data, str(path), ColumnsError)  # all of it, before any row
-    blocks = csv_blocks(path, data, strict=True, above=above)
+    blocks = csv_blocks(path, data, separator, strict=True, above=above)
     first: list[Cells] = next(blocks, [(above, [])])
     header = [name.strip() for name in first[0][1]]
     twice = [name for name, count in Counter(header).items() if name and count > 1]

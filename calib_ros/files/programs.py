@@ -20,15 +20,20 @@ import numpy as np
 
 from calib_ros.apply.program import Program, joint_values
 from calib_ros.errors import InputError
-from calib_ros.files.columns import Columns, check_quaternions, columns_of, read_columns, with_rows
+from calib_ros.files.columns import (
+    Columns,
+    check_quaternions,
+    columns_of,
+    with_rows,
+)
 from calib_ros.files.layouts import ANGLES, LENGTHS, POSITION, QUATERNION, joint_columns
-from calib_ros.files.sheets import name_and_unit, places
+from calib_ros.files.sheets import name_and_unit, places, text_and_signs
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.inverse import limits
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
+from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
 
 POSE_COLUMNS = (*POSITION, *QUATERNION)
@@ -41,7 +46,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
     Columns of held joints may be missing.
     """
-    found = read_columns(path, ())
+    found, _, _ = _columns(path)
     names, _, program = _program(found, chain)
     values, _ = joint_values(chain, program)
 
@@ -50,6 +55,13 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
     check_limits(values, chain, lambda k, i: f'{found.where(k, names[i])} ', remedy)
     return values
+
+
+def _columns(path: Path) -> tuple[Columns, str, str]:
+    """Return the columns of a table, its text, and the sign between its cells."""
+    text, separator, decimal = text_and_signs(path)
+    found = columns_of(path, text.encode(), separator=separator)
+    return with_rows(replace(found, decimal=decimal), ()), text, separator
 
 
 def check_limits(
@@ -139,7 +151,7 @@ def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
 
 def read_poses(path: Path) -> FloatArray:
     """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
-    found = read_columns(path, POSE_COLUMNS)
+    found = with_rows(_columns(path)[0], POSE_COLUMNS)
     numbers = found.block(POSE_COLUMNS)
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
@@ -182,14 +194,14 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
     """
     suffix = path.suffix.lower()
     if suffix == '.csv':
-        return _read_csv(read_text(path, LARGEST_TABLE, InputError), path, chain)
+        return _read_csv(path, chain)
     if suffix in ('.yaml', '.yml'):
         return _read_yaml(read_text(path, LARGEST_TEXT, InputError), str(path))
     raise InputError(f'{path} must be a table (.csv with q1 ... qn) or a JointTrajectory (.yaml)')
 
 
-def _read_csv(text: str, path: Path, chain: Chain) -> ProgramFile:
-    found = columns_of(path, text.encode())
+def _read_csv(path: Path, chain: Chain) -> ProgramFile:
+    found, text, separator = _columns(path)
     names, units, program = _program(found, chain)
     signs = joint_columns(len(names), 's')
     known = [k for k, sign in enumerate(signs) if sign in found.header]
@@ -199,13 +211,14 @@ def _read_csv(text: str, path: Path, chain: Chain) -> ProgramFile:
         program = replace(program, approach=approach)
 
     def text_with(corrected: Program) -> str:
-        header, *rows = (row for row in csv.reader(io.StringIO(text, newline='')) if row)
+        lines = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
+        header, *rows = (row for row in lines if row)
         given = [k for k, name in enumerate(names) if name in found.header]
         at = [found.header.index(names[k]) for k in given]
         for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):
             for k, value in zip(at, values, strict=True):
-                row[k] = repr(value)
-        return csv_text([header, *rows])
+                row[k] = repr(value).replace('.', found.decimal)
+        return csv_text([header, *rows], separator)
 
     return ProgramFile(program, tuple(f'line {line}' for line in found.lines), text_with)
 

@@ -142,12 +142,7 @@ def _sheet(
     path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
-    commas = any(
-        DECIMAL_COMMA.fullmatch(cell) and not THOUSANDS.fullmatch(cell)
-        for _, cells in rows
-        for cell in cells
-    )
-    decimal = layout.decimal or (',' if commas and content.separator != ',' else '.')
+    decimal = layout.decimal or _decimal(rows, content.separator)
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
     at, header = _header(path, rows, names, known)
@@ -168,6 +163,20 @@ def _sheet(
     columns = replace(columns, decimal=decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(header, above, columns, tuple(notes))
+
+
+def text_and_signs(path: Path) -> tuple[str, str, str]:
+    """Return the text of a table, and the signs between its cells and in its numbers."""
+    text, _ = _text(path)
+    separator = _separator(path, text, [])
+    head = _cells(path, text[: _after(text, HEAD_LINES)], separator)
+    return text, separator, _decimal(head, separator)
+
+
+def _decimal(rows: Sequence[Cells], separator: str) -> str:
+    cells = (cell for _, cells in rows for cell in cells)
+    commas = any(DECIMAL_COMMA.fullmatch(c) and not THOUSANDS.fullmatch(c) for c in cells)
+    return ',' if commas and separator != ',' else '.'
 
 
 def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tuple[str, ...]:

@@ -106,11 +106,12 @@ def test_the_whole_way_from_identification_to_program(run, tmp_path, oriented):
     assert np.sqrt(np.mean(after**2)) < 2e-4 < 1e-3 < before.max()
 
 
-@pytest.mark.parametrize(('mark', 'name'), [(';', 'semicolon'), ('\t', 'tab')])
-def test_cells_separated_otherwise_are_named(run, mark, name):
-    status, _, err = run(TABLE.replace(',', mark))
-    assert status == 1
-    assert f'are separated by {name}s: save it with commas' in err
+@pytest.mark.parametrize('mark', [';', '\t'])
+def test_cells_separated_otherwise_are_read_and_written(run, tmp_path, mark):
+    assert run(TABLE)[0] == 0
+    plain = (tmp_path / 'out.csv').read_text()
+    assert run(TABLE.replace(',', mark), '--force')[0] == 0
+    assert (tmp_path / 'out.csv').read_text() == plain.replace(',', mark)
 
 
 @pytest.mark.parametrize('names', [UR.joint_names, [f'Q{k}' for k in range(1, 7)]])
@@ -169,6 +170,22 @@ def test_a_program_is_written_as_it_was_read(tmp_path, suffix):
         assert yaml.safe_load(text) == yaml.safe_load(given.removesuffix('---\n'))
     again.write_text(text, encoding='utf-8')
     assert read_program(again, UR).text_with(source.program) == text
+
+
+@pytest.mark.parametrize('coding', ['utf-8-sig', 'utf-16', 'cp1252'])
+def test_a_program_keeps_its_separators_and_decimal_commas(tmp_path, coding):
+    """As tables of measurements; they were refused, and had to be saved in another form."""
+    path = tmp_path / 'program.csv'
+    given = 'q1;note;q2\n0,25;ä, b. c;1e-05\n-1,5;;2,0\n'
+    path.write_text(given, encoding=coding)
+    arm = Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    source = read_program(path, arm)
+    np.testing.assert_array_equal(source.program.positions, [[0.25, 1e-5], [-1.5, 2.0]])
+    np.testing.assert_array_equal(read_joints(path, arm), source.program.positions)
+    assert source.text_with(source.program) == given
+    path.write_text(given.replace('2,0', '1.234'), encoding=coding)
+    with pytest.raises(InputError, match=r'line 3: q2 .* without the marks between thousands'):
+        read_program(path, arm)
 
 
 def test_units_are_those_of_the_header(tmp_path):
