@@ -229,7 +229,7 @@ def _below(
 def csv_blocks(
     path: Path, data: bytes, separator: str = ',', strict: bool = False, above: int = 0
 ) -> Iterator[list[Cells]]:
-    """Yield rows that are not blank: the line at which each ends, and its cells.
+    """Yield rows that are not empty: the line at which each ends, and its cells.
 
     `above` lines precede the content, which is in UTF-8.
     """
@@ -239,7 +239,7 @@ def csv_blocks(
     try:
         for row in reader:
             line = reader.line_num
-            if row:
+            if any(row):
                 block.append((above + line, row))
             if len(row) > MOST_ENTRIES:
                 raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
@@ -282,7 +282,7 @@ def _numbers(text: str, decimal: str = '.') -> FloatArray:
 
 def cell_number(text: str) -> float:
     """Return the number in a cell (1.5D-3 as Fortran writes), NaN if blank, else infinity."""
-    low = text.lower()
+    low = text.lower().replace('\u2212', '-')  # the minus of typesetting
     with suppress(ValueError):
         return math.nan if low in MISSING else float(low.replace('d', 'e'))
     return math.inf

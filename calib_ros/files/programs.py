@@ -212,7 +212,7 @@ def _read_csv(path: Path, chain: Chain) -> ProgramFile:
 
     def text_with(corrected: Program) -> str:
         lines = csv.reader(io.StringIO(text, newline=''), delimiter=separator)
-        header, *rows = (row for row in lines if row)
+        header, *rows = (row for row in lines if any(row))
         given = [k for k, name in enumerate(names) if name in found.header]
         at = [found.header.index(names[k]) for k in given]
         for row, values in zip(rows, (corrected.positions / units[given]).tolist(), strict=True):

@@ -19,6 +19,8 @@ FORMS = {
     'a header of numpy': '# ' + PLAIN,
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
     'a date': 'Time;' + PLAIN.replace('\n', '\n2026-11-24 10:00:00;', 3).replace(',', ';'),
+    'empty rows of a workbook': PLAIN + ',,,,\n' * 3,
+    'a typographic minus': PLAIN.replace('-', '\u2212'),
     'exponents of Fortran': PLAIN.replace('0.25', '2.5D-01'),
     'other separators in quotes': 'note,' + PLAIN.replace('\n', '\n"a; b; c; d; e; f, g",', 3),
 }
