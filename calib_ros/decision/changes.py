@@ -24,17 +24,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from scipy import linalg, special
 
 from calib_ros.estimation.identifiability import followed
-from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, chance_of
+from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.parameter import DH_KINDS, Parameter, parameters_of
+from calib_ros.kinematics.parameter import DH_KINDS, FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
@@ -74,7 +75,7 @@ class Explanation(Shown):
     def in_words(self) -> str:
         """Return the changed parameter and its size, or the changed parameters."""
         if len(self.names) > 1:
-            return f'{self.owner} ({", ".join(name.kind for name in self.names)})'
+            return f'{self.owner} ({", ".join(dict.fromkeys(n.kind for n in self.names))})'
         what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
         return f'{what} by {self.size_in_words()}'
 
@@ -101,6 +102,11 @@ def reason_in_words(reasons: Sequence[Explanation]) -> str:
 def changes_in_words(changed: Sequence[Sequence[Explanation]]) -> str:
     """Return several changes, each with its indistinguishable explanations."""
     return '; '.join(map(reason_in_words, changed))
+
+
+def names_of(changed: Sequence[Sequence[Explanation]]) -> list[tuple[Parameter, ...]]:
+    """Return the parameters of all explanations of several changes."""
+    return [each.names for reasons in changed for each in reasons]
 
 
 def reasons_document(reasons: Sequence[Explanation]) -> list[dict[str, Any]]:
@@ -177,14 +183,27 @@ def explanations(
     """
     if not columns.sets:
         return ()
-    logs = [information.evidence(columns.of(names), _sizes(names)) for _, names in columns.sets]
-    found = []
-    for (owner, names), share in zip(columns.sets, special.softmax(logs).tolist(), strict=True):
-        gain, change, covariance, rank = information.explained(columns.of(names))
-        sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        chance = min(1.0, len(logs) * chance_of(gain, rank, freedom))
-        found.append(Explanation(owner, names, gain, chance, share, change, sigma))
+    logs = [columns.evidence(information, names) for _, names in columns.sets]
+    shares = special.softmax(logs).tolist()
+    found = [
+        _explanation(information, columns, freedom, *each, share)
+        for each, share in zip(columns.sets, shares, strict=True)
+    ]
     return tuple(sorted(found, key=lambda each: -each.share))
+
+
+def _explanation(
+    information: Information,
+    columns: Effects,
+    freedom: float,
+    owner: str,
+    names: tuple[Parameter, ...],
+    share: float = 1.0,
+) -> Explanation:
+    gain, change, covariance, rank = information.explained(columns.of(names))
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    chance = min(1.0, len(columns.sets) * chance_of(gain, rank, freedom))
+    return Explanation(owner, names, gain, chance, share, change, sigma)
 
 
 def reasons_of(
@@ -193,6 +212,41 @@ def reasons_of(
     """Return the likely explanations; none if the change may be chance."""
     found = explanations(information, columns, freedom)
     return likeliest(found) if any(each.chance <= FALSE for each in found) else ()
+
+
+def likelier(
+    information: Information,
+    columns: Effects,
+    freedom: float,
+    changed: list[tuple[Explanation, ...]],
+) -> list[tuple[Explanation, ...]]:
+    """Return changes found one by one, or those of a few or all joint zeros if likelier.
+
+    The best single explanation of several changed zeros may be another. Each change is chosen from
+    all explanations; all zeros count as one more than SEVERAL.
+    """
+    if not changed:
+        return changed
+    given = [reasons[0].names for reasons in changed]
+    single = [(name,) for name in columns.zeros]
+    tried = [given, [columns.zeros]]
+    tried += [list(some) for k in range(2, SEVERAL + 1) for some in combinations(single, k)]
+
+    def likely(causes: Sequence[Sequence[Parameter]]) -> float:
+        count = SEVERAL + 1 if causes == [columns.zeros] else len(causes)
+        names = [name for each in causes for name in each]
+        return columns.evidence(information, names) - count * float(np.log(len(columns.sets)))
+
+    best = max(tried, key=likely)
+    if best is given:
+        return changed
+    found: list[tuple[Explanation, ...]] = []
+    for names in best:
+        others = columns.spread([other for other in best if other is not names])
+        owner = names[0].owner if len(names) == 1 else 'all joints'
+        alone = information.marginalised(others)
+        found.append((_explanation(alone, columns, freedom, owner, names),))
+    return found
 
 
 def likeliest(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
@@ -226,6 +280,7 @@ class Effects:
         seen = shows & (left < HALF_THE_DIGITS)
         self._columns = {n: c for n, c, yes in zip(every, mapped.T, seen, strict=True) if yes}
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
+        self._count = len(names)
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
         for joint in chain.joint_names:
             own = self._distinct(parameters_of(joint, ORDER))
@@ -240,6 +295,8 @@ class Effects:
             self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
             sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
         self.sets = tuple(sets)
+        zeros = (joint.driven for joint in chain.joints)
+        self.zeros = tuple(name for name in zeros if name in self._columns)
 
     def _distinct(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:
         """Return the observable parameters, without those equivalent to an earlier one."""
@@ -255,11 +312,17 @@ class Effects:
         """Return the columns (P, k) of k parameters."""
         return np.array([self._columns[name] for name in names]).T
 
-    def spread(self, reasons: Sequence[Explanation]) -> FloatArray:
+    def evidence(self, information: Information, names: Sequence[Parameter]) -> float:
+        """Return the log evidence of changes of typical size of k parameters."""
+        return information.evidence(self.of(names), _sizes(names))
+
+    def spread(self, changed: Sequence[Sequence[Parameter]]) -> FloatArray:
         """Return the prior covariance (P, P) of changes whose sizes the data determine."""
-        parts = [self.of(each.names) * (SPREAD * _sizes(each.names)) for each in reasons]
-        square = np.hstack(parts)
-        return np.asarray(square @ square.T)
+        found = np.zeros((self._count, self._count))
+        for names in changed:
+            root = self.of(names) * (SPREAD * _sizes(names))
+            found += root @ root.T
+        return found
 
 
 def gauged(
@@ -275,7 +338,9 @@ def gauged(
     frames = [n for end in ('base', 'tool') for n in parameters_of(end)] if free else []
     fitted = list(dict.fromkeys([*frames, *names]))
     approach = rng.choice([-1.0, 1.0], q.shape)
-    taken, wanted, left = followed(chain, fitted, others, q, LEVER, approach=approach)
+    turned = any(n.kind in FRAME_KINDS[3:] and not n.owner.startswith('base') for n in fitted)
+    lever = LEVER if turned else 0.0  # positions do not show turns of the target
+    taken, wanted, left = followed(chain, fitted, others, q, lever, approach=approach)
     size = np.maximum(np.linalg.norm(wanted, axis=0), 1e-300)
     return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size
 

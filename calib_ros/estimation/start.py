@@ -17,9 +17,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.identifiability import DEGENERATE, excited, structurally_independent
-from calib_ros.estimation.leastsquares import System, factor_of, minimise, normal_equations
+from calib_ros.estimation.leastsquares import (
+    System,
+    factor_of,
+    minimise,
+    normal_equations,
+    triangular_factor,
+)
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
@@ -62,6 +69,30 @@ def start_frames(problem: Problem) -> Chain:
             chain = chain.with_frame(name, frame)
         found |= {base, tool}
     return chain
+
+
+def in_new_frames(problem: Problem, arm: Chain, new: Sequence[str], system: System) -> Chain:
+    """Return a known arm in `new` frames fitted to the system of all measurements.
+
+    Raises InputError if these do not show where the frames are.
+    """
+    known = arm
+    for name in arm.frame_names:
+        frame = arm.frame(name)
+        known = known.with_frame(name, replace(frame, fixed=frame.fixed or name not in new))
+    own = movable(known, new)
+    found = start_frames(replace(problem, chain=known))
+    seen = excited(triangular_factor(found, own, system), own)
+    if hidden := set(structurally_independent(known, own, problem.kinds)).difference(seen):
+        frames = ' and '.join(dict.fromkeys(name.owner for name in own if name in hidden))
+        raise InputError(
+            f'{system.count} poses do not show where the new {frames} is: measure more, all over '
+            'the joint range'
+        )
+    placed = minimise(found, seen, system).chain
+    for name in new:
+        arm = arm.with_frame(name, replace(arm.frame(name), matrix=placed.frame(name).matrix))
+    return arm
 
 
 def _start_one(

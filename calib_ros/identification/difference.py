@@ -135,13 +135,15 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     square, lacking = _squares((first, second), names)
     freedom = min(first.freedom, second.freedom)
     columns = Effects(chain, names)
-    left_over = _information(names, change, square)
-    chance = _chance(left_over, freedom)
+    every = left_over = _information(names, change, square)
+    chance = _chance(every, freedom)
     beyond = _chance(_information(names, change, lacking), freedom)
     changed: list[tuple[Explanation, ...]] = []
     while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
         changed.append(reasons)
-        left_over = left_over.marginalised(columns.spread(reasons))
+        left_over = every.marginalised(columns.spread(changes.names_of(changed)))
+    changed = changes.likelier(every, columns, freedom, changed)
+    left_over = every.marginalised(columns.spread(changes.names_of(changed)))
     predicted = changes.mean_square_change(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')

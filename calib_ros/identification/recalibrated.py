@@ -7,6 +7,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Explanation
 from calib_ros.decision.comparison import Comparison, ErrorFigures
@@ -23,12 +25,11 @@ class Recalibration(Shown):
 
     `changed` lists the changes, each with those indistinguishable from it; `unexplained` is the
     probability of residuals as large as the remaining ones. `comparison` holds the errors of the
-    new poses by the earlier calibration, and predicted from the other poses. `known_before` and
-    `known_after` are the RMS uncertainty [m] of positions over the joint range, `moved` is their
-    change. If new frames are fitted to all new poses for `before`, `refitted` is the ratio by
-    which held-out errors are larger. `reused` is the share of poses that the earlier calibration
-    was fitted to: they would count twice. `odd` names a pose without which the others would be
-    accepted, `step` tells what moved while they were measured.
+    new poses by the earlier calibration, and predicted from the other poses; both in new frames by
+    the others. `known_before` and `known_after` are the RMS uncertainty [m] of positions over the
+    joint range, `moved` is their change. `reused` is the share of poses that the earlier
+    calibration was fitted to: they would count twice. `odd` names a pose without which the others
+    would be accepted, `step` tells what moved while they were measured.
     """
 
     calibration: Calibration
@@ -39,7 +40,6 @@ class Recalibration(Shown):
     known_after: float
     moved: float
     reused: float = 0.0
-    refitted: float = 1.0
     odd: str = ''
     step: Step | None = None
 
@@ -56,18 +56,19 @@ class Recalibration(Shown):
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
-        better = self.after.rms_mm <= self.refitted * self.before.rms_mm
-        agrees = better or 1e-3 * self.after.rms_mm <= (self.calibration.limit() or 0.0)
+        agrees = self.after.rms_mm <= ALIKE * self.before.rms_mm
         fits = self.unexplained > changes.FALSE and agrees
         return fits and self.determined and not (self.reused or self.scale)
 
     @property
     def determined(self) -> bool:
-        """Tell whether other poses confirm a change, and the arm is then known well enough.
+        """Tell whether other poses confirm a change or new frames, and the arm is known enough.
 
         About as well as before, or far better than it changed.
         """
-        confirmed = not self.changed or self.after.rms_mm < self.refitted * self.before.rms_mm
+        after, residual = self.after.rms_mm, 1e3 * (self.calibration.residual or np.inf)
+        most = self.before.rms_mm if self.changed else CLEARLY * residual
+        confirmed = after < most
         known = self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
         return confirmed and known
 
@@ -111,11 +112,7 @@ class Recalibration(Shown):
         if self.unexplained <= changes.FALSE:
             return 'no change of a few parameters explains the new poses', 'identify again'
         if not self.determined:
+            what = 'what has changed' if self.changed else 'where the new frames are'
             step = 'measure more poses, all over the joint range'
-            return 'the new poses do not show well enough what has changed', step
-        if self.refitted > 1.0:
-            return (
-                'the earlier calibration, in new frames, fits the new poses better',
-                'keep it, or identify again from more poses',
-            )
+            return f'the new poses do not show well enough {what}', step
         return 'the new poses contradict each other', 'measure more'

@@ -9,7 +9,7 @@ larger change must have a cause that affects few parameters (`changes.py`). Thes
 both causes if indistinguishable), and the estimate is the mean of dx given A and b, relinearised
 until it converges. Smooth device errors (`considered.py`), then and now, are no change of the arm.
 The result is used if the arm is then known about as well as before, or far better than it changed:
-with few or similar poses, one cause imitates another.
+few or similar poses let one cause imitate another.
 """
 
 from __future__ import annotations
@@ -29,18 +29,13 @@ from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import Doubts, doubted_products
-from calib_ros.estimation.identifiability import excited
-from calib_ros.estimation.leastsquares import (
-    System,
-    minimise,
-    products_of,
-    triangular_factor,
-)
+from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
 from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
+from calib_ros.estimation.start import in_new_frames
 from calib_ros.identification.calibration import Calibration, about, made
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.identification.records import Fingerprint
@@ -86,7 +81,7 @@ def recalibrate(
     for number, pose, rest in _without_one(problem, arm):
         try:
             others, _ = _recalibrated(previous, rest, years, growth, new)
-        except np.linalg.LinAlgError:
+        except (np.linalg.LinAlgError, InputError):  # too few
             continue
         chain = others.calibration.chain
         away = residuals(chain, problem.all_sets[number]).position[pose]
@@ -134,37 +129,39 @@ def _recalibrated(
     own = [name for frame in free for name in parameters_of(frame)]
     shown = changes.shown(nominal, arm.names, own)
     names = [name for name in arm.names if name in own or name in shown]
+    anywhere = np.isin(arm.names, names) * 10.0  # m, rad
     if names:
-        seen = excited(triangular_factor(arm.chain, own, system), own)
-        which = [k for k, name in enumerate(arm.names) if name in names]
-        square = arm.square.copy()
-        square[which], square[:, which] = 0.0, 0.0
-        square[which, which] = 100.0  # m^2, rad^2: anywhere
-        arm = replace(arm, chain=minimise(arm.chain, seen, system).chain, square=square)
+        kept = anywhere == 0.0
+        square = arm.square * np.outer(kept, kept) + np.diag(anywhere**2)
+        chain = in_new_frames(problem, arm.chain, new, system)
+        arm = replace(arm, chain=chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
     columns = Effects(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
     changed: list[tuple[Explanation, ...]] = []
-    earlier, before = arm.changed(np.zeros(len(arm.names)), arm.square), arm.square
+    then, earlier = arm, arm.changed(np.zeros(len(arm.names)), arm.square)
     found = arm.solved(system)
     while len(changed) < SEVERAL and (reasons := arm.reasons(found.information, columns)):
         if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
             columns = Effects(nominal, arm.names, movable)  # as much is usual
             continue
         changed.append(reasons)
-        arm = replace(arm, square=arm.square + columns.spread(reasons))
+        arm = then.widened(columns, changed)
         found = arm.solved(system)
-    rows, fitted = system.rows, len(names)
+    left_over = found.information.marginalised(then.doubted)
+    likelier = changes.likelier(left_over, columns, previous.freedom, changed)
+    if likelier is not changed:
+        changed, arm = likelier, then.widened(columns, likelier)
+        found = arm.solved(system)
     expected, _ = found.information.mean(root_of(arm.doubted))
     left = found.squares - float(found.information.vector @ expected)
     result = Recalibration(
         _updated(arm, found, problem, changed),
         tuple(changed),
-        chance_of(left, rows, previous.freedom),
-        _judged(arm, earlier, found, system, sets),
-        *_known(arm, before, found),
+        chance_of(left, system.rows, previous.freedom),
+        _judged(arm, np.diag(anywhere), found, system, sets),
+        *_known(arm, then.square, found),
         previous.reused(sets),
-        float(np.sqrt((rows + fitted) / (rows - fitted))) if rows > fitted else np.inf,
     )
     return result, earlier
 
@@ -263,6 +260,10 @@ class _Arm:
         """Return the covariance (P, P) of arm and device."""
         return self.square + self.device
 
+    def widened(self, columns: Effects, changed: Sequence[Sequence[Explanation]]) -> _Arm:
+        """Return the arm with changes of unknown size."""
+        return replace(self, square=self.square + columns.spread(changes.names_of(changed)))
+
     def reasons(self, information: Information, columns: Effects) -> tuple[Explanation, ...]:
         """Return what has changed; of possible device errors only another scale."""
         freedom = self.previous.freedom
@@ -338,9 +339,12 @@ def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
 
 
 def _judged(
-    arm: _Arm, earlier: Chain, found: _Found, system: System, sets: Sequence[Observations]
+    arm: _Arm, frames: FloatArray, found: _Found, system: System, sets: Sequence[Observations]
 ) -> Comparison:
-    """Return the errors of the new poses by the earlier arm, and predicted from the others."""
+    """Return the errors of the new poses by the earlier arm, and predicted from the others.
+
+    `frames` (P, P) is a root of the covariance of new frames alone, which the others tell too.
+    """
     groups = numbered(sets)
     count = min(SOME_POSES, distinct(np.concatenate(groups)))
     folds = [numbers % count for numbers in groups]
@@ -350,7 +354,7 @@ def _judged(
     for products in parts.sum(axis=0) - parts:
         matrix = products[:-1, :-1]
         rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
-        chains.append((earlier, arm.changed(*rest.mean(arm.root))))
+        chains.append((arm.changed(*rest.mean(frames)), arm.changed(*rest.mean(arm.root))))
     before, after = left_out(chains, sets, groups, folds)
     every = np.ones(len(before.position), dtype=bool)
     return Comparison(before, after, every)

@@ -37,9 +37,10 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
     away = np.tile([1e-3 * rms_mm, 0.0, 0.0], (20, 1))
     off = Residuals(away, np.nan * away, np.arange(20), np.nan * away)
     both = Comparison(off, off, np.ones(20, bool))
+    less = replace(off, position=0.6 * away)
     updates = [
-        Recalibration(previous, (), 1.0, both, 1e-4, 1e-4, 0.0, refitted=ratio)
-        for ratio in (0.9, 1.1)  # new frames make held-out errors larger by that
+        Recalibration(previous, (), 1.0, judged, 1e-4, 1e-4, 0.0)
+        for judged in (both, Comparison(less, off, both.judged))  # predicted worse by 1.7
     ]
     told = verdict(previous, both)
     assert told[0] == says
@@ -57,7 +58,7 @@ def test_a_calibration_holds_by_one_rule(rms_mm, says):
         found, text = verdict(of, both, share)
         assert found == proves_nothing
         assert (why in text) == (found == 'no verdict')
-    assert [each.accepted for each in updates] == [rms_mm < 0.15, True]
+    assert [each.accepted for each in updates] == [True, False]
 
 
 @pytest.mark.parametrize(('rms_mm', 'says'), [(0.1, 'UNDECIDED'), (0.3, 'does not hold')])

@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Several or all joint zeros have changed at once, or both frames; eight poses tell."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SCARA, SIGMAS, UR10E, rms
+
+from calib_ros import Calibration, Problem, difference, identify, recalibrate
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.errors import InputError
+
+ALL = np.radians([0.1, -0.15, 0.08, 0.2, -0.12, 0.05])
+
+
+def seen(true, count, seed, oriented=True, chain=UR10E):
+    rng = np.random.default_rng(seed)
+    measured = measure(true, chain.random_joints(count, rng), rng, *NOISE, oriented)
+    return Problem(chain, measured, **SIGMAS)
+
+
+@pytest.fixture(scope='module', params=[True, False])
+def earlier(request):
+    """Return an arm, its calibration from poses or positions, and which of these."""
+    true = faulty(UR10E, Cell(), np.random.default_rng(4))
+    return true, Calibration.of(identify(seen(true, 60, 0, request.param))), request.param
+
+
+def slipped(true, zeros):
+    return true.with_offsets({str(j.driven): x for j, x in zip(true.joints, zeros, strict=True)})
+
+
+def owners(changed):
+    return [{each.owner for each in reasons} for reasons in changed]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_new_zeros_of_all_joints_are_one_change(earlier, seed):
+    """Mastered again: with at most three changes, one by one, two of three were refused."""
+    true, previous, oriented = earlier
+    now = slipped(true, ALL)
+    found = recalibrate(previous, seen(now, 8, seed, oriented), 0.1)
+    assert found.accepted
+    assert owners(found.changed) == [{'all joints'}]
+    assert found.changed[0][0].in_words() == 'all joints (theta)'
+    q = UR10E.random_joints(300, np.random.default_rng(99))
+    assert rms(found.calibration.chain, now, q) < 0.1 * rms(previous.chain, now, q)
+
+
+@pytest.mark.parametrize('joints', [(0, 5), (3, 4)])
+def test_two_changed_zeros_are_told_by_name(earlier, joints):
+    """Single explanations of both were a moved base, and the wrong joint."""
+    true, previous, oriented = earlier
+    zeros = np.zeros(6)
+    zeros[list(joints)] = 2e-3, -1e-3
+    found = recalibrate(previous, seen(slipped(true, zeros), 8, 1, oriented), 0.1)
+    assert found.accepted
+    told = owners(found.changed)
+    assert set().union(*told) >= {UR10E.joint_names[k] for k in joints}
+    assert all('all joints' not in each for each in told)
+
+
+def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):
+    """There it moves the target only: a turn of it does not show."""
+    true, previous, oriented = earlier
+    now = slipped(true, [0.0] * 5 + [4e-3])
+    found = recalibrate(previous, seen(now, 8, 1, oriented), 0.1)
+    assert 'wrist_3_joint' in owners(found.changed)[0]
+
+
+def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show():
+    true = faulty(UR10E, Cell(), np.random.default_rng(4))
+    pair = enumerate((true, slipped(true, ALL)))
+    first, second = (Calibration.of(identify(seen(arm, 50, k))) for k, arm in pair)
+    found = difference(first, second)
+    assert 'changed: all joints (theta); nothing else' in found.in_words()
+    true = faulty(SCARA, Cell(), np.random.default_rng(4))  # beside free frames only its elbow
+    first, second = (
+        Calibration.of(identify(seen(arm, 50, k, chain=SCARA)))
+        for k, arm in enumerate((true, slipped(true, [1e-3, 2e-3, 1e-3, -2e-3])))
+    )
+    assert owners(difference(first, second).changed) == [{'elbow'}]
+
+
+@pytest.mark.parametrize('count', [6, 8])
+@pytest.mark.parametrize('seed', range(4))
+def test_an_unchanged_arm_between_new_frames_is_accepted(earlier, seed, count):
+    """Frames that lie anywhere, judged by the other poses for both arms."""
+    true, previous, oriented = earlier
+    rng = np.random.default_rng(seed)
+    there = replace(true, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
+    found = recalibrate(previous, seen(there, count, seed, oriented), 0.1, new=('base', 'tool'))
+    assert found.accepted
+    assert not found.changed
+    assert found.after.rms_mm < 1.2 * found.before.rms_mm
+
+
+def test_too_few_poses_for_a_new_frame_are_refused(earlier):
+    """Two positions leave a turn of the base open; a calibration with that was accepted."""
+    true, previous, oriented = earlier
+    there = replace(true, base=random_frame(np.random.default_rng(1), 2.0))
+    few = seen(there, 1 if oriented else 2, 1, oriented)
+    new = ('base', 'tool') if oriented else ('base',)
+    with pytest.raises(InputError, match=f'{len(few.observations)} poses do not show where the n'):
+        recalibrate(previous, few, 0.1, new=new)
