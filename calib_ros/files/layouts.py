@@ -47,8 +47,9 @@ MATRIX = tuple(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3))
 """Rotation matrices, row by row."""
 SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
 """Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
-WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand')  # text columns
-NUMBERS = (*POSITION, *QUATERNION, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time')
+WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'stamp_ns')  # as text
+ROTATION = (*QUATERNION, *TURNS, *IN_TURN, *MATRIX)
+NUMBERS = (*POSITION, *ROTATION, *SIGMAS, 'distance', 'time', 'delay')
 UNREADABLE = (
     '"{}" is not an expression of columns: give names, {{names with blanks}} or column '
     'numbers (#7) with + - * / and brackets'

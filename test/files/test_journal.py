@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 import os
+from contextlib import closing
 from dataclasses import fields, replace
 
 import numpy as np
@@ -9,7 +10,9 @@ from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
 from calib_ros.files import tables
+from calib_ros.files.foreign import Foreign
 from calib_ros.files.journal import Journal
+from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import read_journal, read_table, table_text
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
@@ -224,6 +227,18 @@ def test_a_row_that_was_cut_off_anywhere_is_left_out(tmp_path, name, share):
     assert 'was cut off and is ignored' in warning
     written(path, [plain(3, target=name)])
     assert_equal(read_journal(path, JOINTS)[0], [plain(1, target=name), plain(3, target=name)])
+
+
+def test_a_journal_read_with_the_unit_of_another_system_keeps_stamps_and_removals(tmp_path):
+    path = tmp_path / 'cell.csv'
+    with closing(Journal(path, JOINTS)) as journal:
+        for number, removed in ((1, False), (2, False), (3, False), (2, True)):
+            journal.add(plain(number, rotation=np.eye(3), delay=0.01), removed)
+    (found,) = read_table(path, JOINTS, foreign=Foreign(Layout(length='mm'))).fitted
+    (known,) = read_table(path, JOINTS).fitted
+    assert found.stamps_ns.tolist() == [1, 3]
+    assert found.delay.tolist() == known.delay.tolist()
+    np.testing.assert_allclose(found.positions, 1e-3 * known.positions, rtol=1e-12)
 
 
 def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
