@@ -105,7 +105,10 @@ def _opened(path: Path, folder: Path) -> Any:
         reader = library.Reader(folder)
         reader.open()
     except Exception as err:  # a damaged file fails in many ways, in the library and below it
-        raise InputError(f'{path} is not a readable rosbag2 recording: {err}') from err
+        raise InputError(
+            f'{path} is not a readable rosbag2 recording ({err}): give the folder of one, or copy '
+            'it again from the computer that made it'
+        ) from err
     return reader
 
 

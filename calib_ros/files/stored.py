@@ -212,8 +212,12 @@ def _growing(rows: Iterable[tuple[Any, ...]], name: str) -> Iterator[tuple[Any, 
 
 def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
     with closing(_open(file)) as connection:
+        cut = ''
         try:
             connection.execute('PRAGMA writable_schema=ON')
+            (pages,) = connection.execute('PRAGMA page_count').fetchone()
+            (size,) = connection.execute('PRAGMA page_size').fetchone()
+            cut = 'the file is cut off' * (pages * size > file.stat().st_size)
             _check_layout(connection)
             rows = connection.execute('SELECT id, name, type FROM topics')
             topics = {key: (name, kind) for key, name, kind in _growing(rows, 'topics')}
@@ -221,12 +225,10 @@ def _of_sqlite3(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:
             rows = connection.execute('SELECT id, topic_id, data FROM messages ORDER BY id')
             for _, key, data in _growing(rows, 'messages'):
                 yield topics[key][0], data
-            (pages,) = connection.execute('PRAGMA page_count').fetchone()
-            (size,) = connection.execute('PRAGMA page_size').fetchone()
-            if pages * size > file.stat().st_size:
-                found.note('the file is cut off')
         except Exception as err:  # cells may hold anything
             found.note(str(err) or type(err).__name__)
+        if cut:  # whatever the error is
+            found.note(cut)
 
 
 def _of_mcap(file: Path, found: Salvage) -> Iterator[tuple[str, bytes]]:

@@ -51,7 +51,7 @@ def test_of_a_truncated_bag_the_rest_is_used(tmp_path, long_bags, storage, metad
     part = session.problem().observations
     (warning,) = warnings
     assert str(path) in warning
-    assert 'damaged' in warning
+    assert 'is damaged (the file is cut off' in warning or 'is damaged (cut off' in warning
     assert 'lost' in warning
     account = session.account()
     assert str(account.joint_states + account.poses) in warning
@@ -206,6 +206,7 @@ def test_what_is_no_bag_is_refused(tmp_path, file, content):
     with pytest.raises(InputError, match='not a readable rosbag2 recording') as caught:
         session_of(path)
     assert str(path) in str(caught.value)
+    assert 'copy it again from the computer' in str(caught.value)
 
 
 def test_one_packed_message_that_is_damaged_costs_no_other(tmp_path):
