@@ -56,6 +56,13 @@ def _run(options: argparse.Namespace, screen: Screen) -> int:
     if chain.tool is None:
         place = ' '.join(f'{x:g}' for x in ASSUMED_TOOL)
         remarks.append(f'the tool is unknown: the target is assumed at {place} m from the flange')
+    for joint in chain.joints if options.candidates is None else ():
+        if joint.guessed:
+            lower, upper = joint.range
+            remarks.append(
+                f'{joint.name} has no limits: it is planned from {lower:g} to {upper:g} m; give '
+                'its limits in the chain file (lower, upper)'
+            )
     screen.say('\n'.join([*table, *remarks, *([VISIT] if plan is None else [])]))
     if options.out is not None:
         page = _page_beside(options.out)

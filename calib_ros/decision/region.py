@@ -80,6 +80,11 @@ class Region(Shown):
         """Return where the calibration may be used."""
         if self.whole:
             return 'valid over the whole joint range'
+        if guessed := [joint.name for joint in self.chain.joints if joint.guessed]:
+            return (
+                'valid near the measured poses; how far is not known, because the chain file has '
+                f'no limits of {", ".join(guessed)}'
+            )
         share = f'{min(100.0 * self.share, 99.0):.0f}' if self.share >= 0.01 else 'under 1'
         return (
             f'valid near the measured poses, in {share} % of the joint range; elsewhere it may '
@@ -212,7 +217,8 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         doubts = judge.of_the_arm([(1.0, mean, covariance)])
         by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))
     share = float(np.mean(far <= limit))
-    limit = np.inf if share == 1.0 else limit
+    if share == 1.0 and not any(joint.guessed for joint in posterior.chain.joints):
+        limit = np.inf
     arm = posterior.chain, posterior.names, posterior.square, posterior.device
     return Region(*arm, limit, share, *ends, by_scale)
 

@@ -88,6 +88,11 @@ class Joint:
         return math.hypot(self.a, self.b)
 
     @property
+    def guessed(self) -> bool:
+        """Tell whether `range` is only a guess: of a linear joint without one of its limits."""
+        return self.type == 'prismatic' and None in (self.lower, self.upper)
+
+    @property
     def range(self) -> tuple[float, float]:
         """Return the limits [rad or m], by default +-180 degrees or +-0.5 m."""
         reach = np.pi if self.type == 'revolute' else 0.5

@@ -79,6 +79,14 @@ def test_plan_writes_joint_values_in_order_of_visit(run, tmp_path):
     assert (tmp_path / 'plan.csv').read_bytes() != before
 
 
+def test_plan_names_a_rail_without_limits(run, tmp_path):
+    rail = load_chain('ur10e_on_linear_axis')
+    rail = replace(rail, joints=(replace(rail.joints[0], upper=None), *rail.joints[1:]))
+    (tmp_path / 'rail.yaml').write_text(dump_chain(rail))
+    _, said, _ = run('plan', '--chain', 'rail.yaml', '--poses', 10, '--draw', 50)
+    assert 'linear_axis_joint has no limits: it is planned from 0 to 1 m; give' in said
+
+
 def test_plan_takes_candidates_task_and_poses_taken_from_files(run, tmp_path):
     chain = arm()
     (tmp_path / 'chain.yaml').write_text(dump_chain(chain))

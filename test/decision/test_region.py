@@ -9,11 +9,12 @@ import yaml
 from fits import UR10E, arm, rms
 
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
-from calib_ros.apply.simulation import measure
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.region import region_of_record
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
+from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.report.documents import as_document
 from calib_ros.report.words import summary
@@ -75,6 +76,21 @@ def test_an_arm_measured_everywhere_may_be_used_everywhere(seed):
         part = replace(found.region, limit=1e-3, share=share).in_words()
         assert f'in {text} % of the joint range; elsewhere it may make the arm worse' in part
     assert as_document(found, {})['region'] == {'whole': True, 'share': 1.0, 'limit_mm': None}
+
+
+def test_a_rail_without_limits_is_not_known_to_its_end(rng):
+    """It may be 10 m long; with limits all of the range is valid."""
+    rail = load_chain('ur10e_on_linear_axis')
+    endless = replace(rail, joints=(replace(rail.joints[0], upper=None), *rail.joints[1:]))
+    q = np.column_stack([rng.uniform(0.1, 0.7, 60), around(0, 1.0)])
+    seen = measure(faulty(rail, Cell(), rng), q, rng, 5e-5, 2e-4)
+    found = identify(Problem(endless, seen))
+    assert found.accepted
+    assert 'no limits of linear_axis_joint' in summary(found)
+    q = np.repeat(q, 2, axis=0)
+    q[1::2, 0] = 10.0
+    assert found.region.covers(q).tolist() == [True, False] * 60
+    assert identify(Problem(rail, seen)).region.whole
 
 
 @pytest.mark.parametrize('way', ['fixed', 'priors'])
