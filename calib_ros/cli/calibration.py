@@ -97,9 +97,10 @@ def _export(options: argparse.Namespace, screen: Screen) -> int:
         screen.say(f'{options.out / each.name}: {exact}{beyond}')
     known = dict(nominal.effects)
     if lost := [name for name, value in chain.effects if value != known.get(name, 0.0)]:
+        held = ' --fixed "*.coupling_*"' if any('.coupling_' in name for name in known) else ''
         screen.warn(
             f'tables cannot hold the fitted effects {", ".join(some(lost))}; for the best table '
-            'without them, identify with --model geometric --fixed "*.coupling_*"'
+            f'without them, identify with --model geometric{held}'
         )
     if calibration.region is not None and not calibration.region.whole:
         screen.warn(f'the calibration is {calibration.region.in_words()}')

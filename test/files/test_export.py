@@ -268,9 +268,15 @@ def test_the_command_line_fits_tables_to_the_measured_region(files, tmp_path):
     assert all(float(row['beta']) == 0.0 for row in rows)
 
 
-def test_the_command_line_tells_what_tables_cannot_hold(run, tmp_path):
-    _, chain = corrected('ur10e')
-    chain = replace(chain, effects=(('elbow_joint.ratio', 1e-3),))
+@pytest.mark.parametrize('coupled', [False, True])
+def test_the_command_line_tells_what_tables_cannot_hold(run, tmp_path, coupled):
+    """A pattern that no effect of the arm has is refused by `identify --fixed`."""
+    nominal, chain = corrected('ur10e')
+    known = (('elbow_joint.coupling_shoulder_lift_joint', -1.0),) if coupled else ()
+    chain = replace(chain, effects=(*known, ('elbow_joint.ratio', 1e-3)))
+    (tmp_path / 'nominal.yaml').write_text(dump_chain(replace(nominal, effects=known)))
     (tmp_path / 'calibration.yaml').write_text(dump_chain(chain, {'source': 'simulation'}))
-    _, _, said = run('export', 'calibration.yaml', '--chain', 'ur10e', '--out', 'out')
+    _, _, said = run('export', 'calibration.yaml', '--chain', 'nominal.yaml', '--out', 'out')
     assert 'tables cannot hold the fitted effects elbow_joint.ratio; for the best' in said
+    held = ' --fixed "*.coupling_*"' if coupled else ''
+    assert said.endswith(f'without them, identify with --model geometric{held}\n')
