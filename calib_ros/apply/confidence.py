@@ -35,7 +35,7 @@ from calib_ros.decision.comparison import Comparison
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import successive
 from calib_ros.estimation.levels import CONFIDENT
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import FloatArray, Index, norms
 
 SAFETY = 4.0
 """Intervals of 95 % then hold in 95 % if places differ (benchmarks/verification.py)."""
@@ -64,7 +64,7 @@ def rms_interval(errors: FloatArray, group: Index) -> tuple[float, float]:
     moments = moments_of(errors, successive(group))
     if len(moments) < 2:
         return 0.0, np.inf
-    rms = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    rms = float(np.sqrt(np.mean(norms(errors) ** 2)))
     if rms == 0.0:
         return 0.0, 0.0
     freedom = np.array([freedom_of(moments) * len(moments)])
@@ -92,8 +92,8 @@ def freedom_of(moments: FloatArray) -> float:
 
 def moments_of(errors: FloatArray, group: Index) -> FloatArray:
     """Return the mean of e e^T (K, 3, 3) [m^2] of errors (N, 3) [m] over each configuration."""
-    sums = [np.bincount(group, first * second) for first in errors.T for second in errors.T]
-    return np.stack(sums, axis=1).reshape(-1, 3, 3) / np.bincount(group)[:, None, None]
+    sums = [[np.bincount(group, one * other) for other in errors.T] for one in errors.T]
+    return np.asarray((sums / np.bincount(group)).transpose(2, 0, 1))
 
 
 SLOPES = (0.5, 2.0)

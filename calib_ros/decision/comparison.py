@@ -63,8 +63,7 @@ class Residuals:
 
     def figures(self, which: Flags) -> ErrorFigures:
         """Return RMS, mean and maximum over the pairs of a mask (N,)."""
-        parts = self.position, self.orientation, self.pixels
-        distance, angle, away = (norms(part[which]) for part in parts)
+        distance, angle, away = (lengths[which] for lengths in self._lengths)
         distance, angle = 1e3 * distance, 1e3 * angle[~np.isnan(angle)]
         away = away[~np.isnan(away)]
         return ErrorFigures(
@@ -76,6 +75,10 @@ class Residuals:
             float(np.sqrt(np.mean(angle**2))) if angle.size else None,
             float(np.sqrt(np.mean(away**2))) if away.size else None,
         )
+
+    @cached_property
+    def _lengths(self) -> list[FloatArray]:
+        return [norms(part) for part in (self.position, self.orientation, self.pixels)]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,6 +138,8 @@ class Comparison(Shown):
     @cached_property
     def figures_of_all(self) -> tuple[ErrorFigures, ErrorFigures]:
         """Return the figures before and after with outliers."""
+        if not self.outliers:
+            return self.figures
         return self.before.figures(self.counting), self.after.figures(self.counting)
 
 

@@ -183,10 +183,12 @@ def _order(problem: Problem) -> str:
 def _lag(problem: Problem, result: Identification) -> Identification:
     """Return the result with the lag that explains most of its residuals, refused if it harms."""
     known = {each.rule for each in result.refusals} & {Rule.MISTAKE, Rule.ENCODER, Rule.MOVED}
-    first, *more = map(_with_moves, problem.sets)
     stands = all(each.velocity is None and each.pixels is None for each in problem.sets)
+    if result.noise.position <= 1.0 or known or not stands:
+        return result
+    first, *more = map(_with_moves, problem.sets)
     bases = {each.base for each in (first, *more) if each.moving}
-    if result.noise.position <= 1.0 or known or not stands or not bases:
+    if not bases:
         return result
     late, chain = replace(problem, observations=first, more=more, held_out=()), result.chain
     for name in bases:

@@ -100,15 +100,10 @@ def left_out(
 
     `groups` and `folds` hold the configuration and the fold of every pair (N,), set by set.
     """
-    ordered = [
-        each.select(np.argsort(numbers, kind='stable'))
-        for each, numbers in zip(sets, folds, strict=True)
-    ]
     pieces: tuple[list[Residuals], list[Residuals]] = ([], [])
     for k, pair in enumerate(chains):
-        for each, numbers in zip(ordered, folds, strict=True):
-            first = np.count_nonzero(numbers < k)
-            out = each.select(slice(first, first + np.count_nonzero(numbers == k)))
+        for each, numbers in zip(sets, folds, strict=True):
+            out = each.select(np.flatnonzero(numbers == k))
             for side, chain in zip(pieces, pair, strict=True):
                 side.append(residuals(chain, out))
     order = np.argsort(np.concatenate(folds), kind='stable')

@@ -215,7 +215,7 @@ class Samples:
 
     def misfits(self, chain: Chain) -> Iterator[tuple[FloatArray, Index | slice]]:
         """Yield residuals (M, c) in sigma, NaN if not measured, and each sample's row (N,)."""
-        for part in self.whitened_residuals(chain):
+        for part in self.whitened_residuals(chain)[: 1 + self.oriented]:
             yield part, slice(None)
 
 

@@ -126,6 +126,9 @@ class Columns:
         """Return (N,) which cells of a column are empty."""
         if name in self.values:
             return np.isnan(self.values[name])
+        cells = f'{BETWEEN}{self.words[name].lower()}{BETWEEN}'
+        if not any(f'{BETWEEN}{each}{BETWEEN}' in cells for each in MISSING):
+            return np.zeros(len(self.lines), dtype=bool)
         return np.array([text.lower() in MISSING for text in self.texts(name)], dtype=bool)
 
     def texts(self, name: str) -> list[str]:
@@ -139,8 +142,7 @@ class Columns:
         index = np.arange(len(self.lines))[rows].tolist()
         words = {}
         for name in self.words:
-            texts = self.texts(name)
-            words[name] = BETWEEN.join([texts[k] for k in index])
+            words[name] = BETWEEN.join(map(self.texts(name).__getitem__, index))
         values = {name: value[rows] for name, value in self.values.items()}
         return replace(self, lines=self.lines[rows], values=values, words=words)
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from calib_ros.kinematics.se3 import Flags, FloatArray, cos_sin
 
-BLOCK = 1024
+BLOCK = 2048
 """Samples per operation: their arrays fit the caches (benchmarks/peers.py)."""
 
 

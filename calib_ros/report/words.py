@@ -300,9 +300,9 @@ def cameras_in_words(result: Identification) -> list[str]:
     chain = result.chain
     cameras = [name for name in chain.frame_names if chain.frame(name).lens is not None]
     lines = []
-    fitted = result.fitted.figures[1]
-    if fitted.rms_px is not None:
-        lines.append(f'RMS {fitted.rms_px:.3f} px on the corners fitted')
+    fitted = result.fitted.figures[1].rms_px if cameras else None
+    if fitted is not None:
+        lines.append(f'RMS {fitted:.3f} px on the corners fitted')
     on_flange, other = ('camera', 'board') if 'tool' in cameras else ('board', 'camera')
     about = {'base': f' (arm seen from the {other})', 'tool': f' ({on_flange} on the flange)'}
     if len(chain.frame_names) > 2:  # several devices
