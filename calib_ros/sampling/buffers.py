@@ -130,7 +130,6 @@ class Waiting(dict[StreamKey, Rows]):
     def __init__(
         self, width: int, capacity: int, dropped: Counter[str], kept: Callable[[StreamKey], bool]
     ) -> None:
-        super().__init__()
         self._width, self._capacity = width, capacity
         self._dropped, self._kept = dropped, kept
         self.apart: dict[StreamKey, Apart] = {}

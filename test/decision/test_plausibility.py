@@ -10,8 +10,11 @@ from fits import SIGMAS, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.plausibility import _motion
 from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.leastsquares import stacked
+from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Frame, Joint
 
 UR = load_chain('ur10e')
@@ -107,6 +110,21 @@ def test_images_of_two_robots_are_not_averaged(seed):
     chain = chain.with_frame('base_B', Frame(lens=camera.lens))
     result = identify(Problem(chain, first, more=[second], sigma_pixel=0.1))
     assert any(NOT_OF_ONE_ARM in each for each in result.refusals) == (seed != 0)
+
+
+def test_the_share_explained_is_that_of_least_squares():
+    added = effects.members(UR, 'coupling')
+    true = arm(3).with_effect_values(dict.fromkeys(added, 2e-3))
+    problem = Problem(UR, seen_of(true), **SIGMAS)
+    chain = replace(UR, base=true.base, tool=true.tool).with_effects(added)
+    names = [name for name in UR.parameter_names if UR.owns_frame(name)]
+    rows = stacked(problem.system(problem.sets).rows_of(chain, [*names, *added]))
+    fewer, more = (
+        np.linalg.lstsq(rows[:, :count], rows[:, -1])[1][0] for count in (len(names), -1)
+    )
+    found = explained_share(problem, chain, names, added)
+    assert found == pytest.approx(1.0 - more / fewer, rel=1e-6)
+    assert 0.1 < found < 0.9
 
 
 @pytest.mark.parametrize('sigma', [0.05, 5e-3])

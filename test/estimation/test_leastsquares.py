@@ -233,6 +233,7 @@ def test_the_factor_is_refused_where_the_normal_matrix_has_lost_its_digits(scale
 
 def test_equations_after_a_step_are_those_of_the_moved_chain():
     start, _, system = still_joint('ur10e', 0)
+    start = start.with_offsets({'base.y': 1e-3})  # where the gradient is not zero
     step = {'base.x': 1e-3, 'base.y': -2e-3, 'base.z': 5e-4}
     system = replace(system, prior=Prior(start, {'base.x': 1e-3}, 2.0))
     after = normal_equations(start, [*step], system).after(np.array([*step.values()]))

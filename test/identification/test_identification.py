@@ -46,7 +46,10 @@ def test_what_is_free_of_noise_gives_exact_predictions(joints, oriented, rank, s
     nominal = random_arm(rng, joints)
     true = faulty(nominal, Cell(), rng)
     seen = measure(true, nominal.random_joints(80, rng), rng)
-    result = identify(Problem(nominal, replace(seen, oriented=np.arange(80) < 80 * oriented)))
+    problem, shares = Problem(nominal, replace(seen, oriented=np.arange(80) < 80 * oriented)), []
+    result = identify(problem, progress=shares.append)
+    assert sorted(shares) == shares
+    assert 0.0 < shares[0] < shares[-1] < 1.0
     assert result.converged
     assert result.rank == rank
     position, turn = worst_prediction(result.chain, true, rng)

@@ -149,6 +149,8 @@ def test_a_device_that_stands_elsewhere_and_a_new_target_are_no_change_of_the_ar
         assert found.accepted
         assert not found.changed
         assert rms(found.calibration.chain, now, Q) < 1e-4
+        nominal = rms(previous.before, true, Q)
+        assert rms(found.calibration.before, now, Q) == pytest.approx(nominal, rel=0.05)
     touched = true.base.matrix.copy()
     touched[:3, 3] += [1e-3, -5e-4, 2e-4]
     shifted = true.with_frame('base', replace(true.base, matrix=touched))

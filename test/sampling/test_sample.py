@@ -29,6 +29,15 @@ def test_the_first_that_comes_needs_no_name():
     assert frames.of(labelled('s', '', '', False)) == ('base_4', 'tool_4')
 
 
+def test_no_socket_and_no_plane_is_the_first():
+    frames = Frames()
+    hole = replace(labelled('s', 'hole', '', False), socket=True)
+    wall = replace(labelled('s', 'wall', '', False), plane=True)
+    assert frames.of(hole) == ('base_hole', 'tool')
+    assert frames.of(wall) == ('base_wall', 'tool')
+    assert frames.of(labelled('s', 'tracker', '', False)) == ('base', 'tool')
+
+
 @given(labels)
 def test_frames_are_shared_by_those_that_share_them_and_by_no_others(many):
     """Whatever the names: a session may be called like a device."""

@@ -24,7 +24,7 @@ def test_the_way_of_a_stop_can_be_changed_while_it_runs():
     drive(made, where + 0.1, [tracker()], start=end)
     made.finish()
     assert len(made.samples) == 3
-    assert made.account().unused['measurements: the stop was too short'] > 0
+    assert made.account().unused['measurements: the stop was too short'] == 79
 
 
 def test_the_status_tells_how_far_it_is():

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which topics of a recording are read, where it holds more than measurements."""
 
+import re
+
 import numpy as np
 import pytest
 from recorded import (
@@ -144,6 +146,20 @@ def test_joints_that_come_twice_are_named(tmp_path):
     said = 'joints c come on several topics: /controller/desired, /goal, /joint_states'
     with pytest.raises(InputError, match=said):
         session_of(record(tmp_path / 'bag', [*measured(), *others]))
+
+
+@pytest.mark.parametrize(
+    ('settings', 'said'),
+    [
+        ({'sources': ('/typo',)}, '"/typo" (PoseStamped, '),
+        ({'sources': ('/tracker type=PointStamped',)}, '"/tracker" (PointStamped); it holds '),
+        ({'joint_topics': ('/typo',)}, '"/typo" (JointState); it holds '),
+    ],
+)
+def test_a_topic_that_a_bag_lacks_is_named_with_those_that_it_holds(tmp_path, settings, said):
+    with pytest.raises(InputError, match=re.escape(said)) as caught:
+        session_of(record(tmp_path / 'bag', measured()), **settings)
+    assert str(caught.value).endswith('/joint_states (JointState), /tracker (PoseStamped)')
 
 
 def test_a_gripper_is_no_second_arm(tmp_path):

@@ -185,6 +185,7 @@ def test_publishers_of_parts_make_one_arm():
 def test_a_joint_that_nobody_names_is_missing():
     made = filled([(0, (0.0,)), (10, (0.0,))], columns=(1,))
     assert made.missing == (0,)
+    assert made.silent(MS) == ()
     assert words(made, 5) == [CAUSES[1]]
     assert made.samples()[0].tolist() == []
 
@@ -216,6 +217,7 @@ def test_a_publisher_that_falls_silent_stops_everything_where_nobody_else_names_
     made = filled([(ms, (0.0,)) for ms in range(0, 1000, 10)], (0,))
     fill(made, [(ms, (0.0,)) for ms in range(0, 310, 10)], (1,))
     assert made.newest_ns == 300 * MS
+    assert made.silent(MS) == (1,)
     made.release(500 * MS)
     assert made.newest_ns == 300 * MS
     assert made.missing == ()
