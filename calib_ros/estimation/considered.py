@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import fnmatch
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations_with_replacement
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from scipy import linalg
 
 from calib_ros.estimation.identifiability import DEGENERATE
 from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
-from calib_ros.estimation.leastsquares import System, normal_equations
+from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import Samples
@@ -108,7 +108,7 @@ def doubted_products(
     waves = moving(chain) if doubts.unmodelled.waves else ()
     columns = list(dict.fromkeys([*names, *doubts.lengths, *waves]))
     share = -(-system.count // most)
-    few = replace(system.spread(most), prior=None)
+    few = system.spread(most)
     products = share * _products(chain, columns, few, doubts)
     extra = np.column_stack(system.separation_rows(chain, columns))
     own = len(columns) + 1
@@ -156,7 +156,7 @@ def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doub
     fields = bends(system.sets) if doubts.by_device else []
     waves = 8 * len(chain.joints) if unmodelled.waves else 0
     if not (any(map(len, fields)) or waves):
-        return np.asarray(normal_equations(chain, columns, system).products.sum(axis=0))
+        return np.asarray(products_of(chain, columns, system)[0].sum(axis=0))
     found = np.zeros((len(columns) + len(fields[0]) + waves + 1,) * 2)
     for samples, bend in zip(system.sets, fields, strict=True):
         first = 0
