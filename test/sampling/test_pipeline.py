@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 from streams import S, hear, stamps, stops
 
 from calib_ros import CalibrationSession, load_chain
-from calib_ros.sampling.pipeline import STRAY, Gate
+from calib_ros.sampling.gate import STRAY, Gate
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Piece, Slice, StreamKey
 
 ARM = load_chain('ur5e')
