@@ -22,6 +22,7 @@ from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.files import boards
+from calib_ros.files.lenses import read_lens
 from calib_ros.files.loading import Loaded, of_bag, of_table
 from calib_ros.files.rows import identified as row_of
 from calib_ros.identification.calibration import Calibration
@@ -224,7 +225,7 @@ def _detected(
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
-    lens = known if options.intrinsics is None else boards.read_lens(options.intrinsics, found)
+    lens = known if options.intrinsics is None else read_lens(options.intrinsics, found)
     if lens is not None:
         chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
     chosen = settings.for_problem() | touched

@@ -15,9 +15,8 @@ upper left corner of the first square or marker.
 
 from __future__ import annotations
 
-import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,23 +31,15 @@ from calib_ros.files.layouts import joint_columns
 from calib_ros.files.programs import POSE_COLUMNS
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.lens import Lens
-from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import csv_text, parse_yaml, read_text, to_cell
-from calib_ros.values import parse_like, parse_mapping, parse_number
+from calib_ros.values import parse_like, parse_mapping
 
 BOARD_TYPES = ('charuco', 'markers')
 BOARD_KEYS = ('type', 'columns', 'rows', 'square', 'marker', 'dictionary', 'legacy')
 HEADER = ('image', 'corner', 'u', 'v')
 SIZE = ('width', 'height')  # optional columns: size of the images [px]
-DISTORTION = ('distortion_model', 'distortion_coefficients')
-DISTORTED = ('plumb_bob', 'rational_polynomial')
-DO_INSTEAD = (
-    'calibrate the camera as plumb_bob (k1 k2 p1 p2 k3), or give no distortion and fit the lens '
-    '(--lens fitted)'
-)
 POSED = 'flange_pose'  # name of the virtual arm
 
 
@@ -126,71 +117,6 @@ def read_board(path: Path) -> Board:
         for key, value in content.items()
     }
     return Board(**parsed)
-
-
-def read_lens(path: Path, found: Detections | None = None) -> Lens:
-    """Read intrinsics as written by camera_calibration or OpenCV, or as plain keys.
-
-    Refuses another image size than that of the corners `found`.
-    """
-    text = re.sub('^%YAML:1.0|!!opencv-matrix', '', read_text(path, what='intrinsics '))
-    content = parse_yaml(text, str(path))
-    if not isinstance(content, dict):
-        raise ConfigError(f'{path} must be a mapping, as camera_calibration writes it')
-    for key in content:
-        if str(key).lower().startswith('dist') and key not in DISTORTION:
-            raise ConfigError(f'{path}: unknown key "{key}": call it {DISTORTION[1]}')
-    if found is not None:
-        _require_size(path, content, found)
-    matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
-    distortion = _numbers(content, (DISTORTION[1], 'd', 'D'), path, required=False)
-    return lens_of(content.get('distortion_model', DISTORTED[0]), matrix, distortion, str(path))
-
-
-def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> None:
-    keys = [next((k for k in (f'image_{each}', each) if k in content), '') for each in SIZE]
-    if not all(keys):
-        return
-    size = tuple(parse_number(content[key], f'{path}: {key}') for key in keys)
-    farthest = found.pixels.max(axis=0)
-    if found.size is not None:
-        what, right = 'of images of {} x {} px'.format(*found.size), found.size == size
-    else:
-        what, right = 'reach {:.1f}, {:.1f}'.format(*farthest), (farthest < size).all()
-    if not right:
-        raise InputError(
-            f'{path} is of images of {size[0]:g} x {size[1]:g} px, the corners {what}: give the '
-            'intrinsics of the camera as it took these images'
-        )
-
-
-def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
-    """Return the lens of a camera matrix (9), row by row, and its distortion k1 k2 p1 p2 k3."""
-    if model not in DISTORTED:
-        raise ConfigError(f'{where}: distortion_model {model!r} is not supported: {DO_INSTEAD}')
-    if len(matrix) != 9:
-        raise ConfigError(f'{where}: camera_matrix must hold 9 numbers, not {len(matrix)}')
-    fx, skew, cx, under, fy, cy, *last = matrix
-    if skew or under or last != [0.0, 0.0, 1.0] or fx <= 0.0 or fy <= 0.0:
-        raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
-    if any(distortion[5:]):
-        raise ConfigError(f'{where}: distortion beyond k3 is not supported: {DO_INSTEAD}')
-    distorted: dict[str, Any] = dict(zip(LENS_KINDS[4:], distortion, strict=False))
-    return Lens(fx, fy, cx, cy, **distorted)
-
-
-def _numbers(
-    content: Mapping[str, Any], keys: Sequence[str], path: Path, required: bool = True
-) -> list[float]:
-    value = next((content[key] for key in keys if key in content), None)
-    if isinstance(value, dict):
-        value = value.get('data')
-    if value is None and not required:
-        return []
-    if not isinstance(value, list):
-        raise ConfigError(f'{path}: {keys[0]} must be numbers, as camera_calibration writes it')
-    rows = [row if isinstance(row, list) else [row] for row in value]
-    return [parse_number(each, f'{path}: {keys[0]}') for row in rows for each in row]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from calib_ros.atomic import given_path
 from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
-from calib_ros.files.boards import lens_of, read_board
+from calib_ros.files.boards import read_board
 from calib_ros.files.detector import Detector, Image, opencv
+from calib_ros.files.lenses import lens_of
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.pictures import Flaw

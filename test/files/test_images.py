@@ -17,7 +17,7 @@ from robots import DATA, needs_data
 from calib_ros.cli.main import main
 from calib_ros.decision.suspects import NOT_ON_FLANGE
 from calib_ros.errors import CalibrationError, ConfigError, InputError
-from calib_ros.files import boards
+from calib_ros.files import boards, lenses
 from calib_ros.files.cameras import decoded, read_image
 from calib_ros.files.detector import Detector, detect
 from calib_ros.files.stored import LARGEST_IMAGE
@@ -229,7 +229,7 @@ def test_joints_that_the_arm_does_not_have_are_told(tmp_path):
 def test_intrinsics_as_camera_calibration_writes_them(tmp_path):
     path = tmp_path / 'camera.yaml'
     path.write_text(INTRINSICS)
-    lens = boards.read_lens(path)
+    lens = lenses.read_lens(path)
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (1352.02747, 1356.14287, 789.67065, 627.2995)
     assert (lens.k1, lens.p2, lens.fixed) == (0.0, 0.0, True)
 
@@ -248,10 +248,10 @@ def test_intrinsics_of_other_images_are_refused(tmp_path):
         table.write_text(f'image,corner,u,v{sized}\na,0,{beyond},20{size}\na,1,5,5{size}\n')
         found = boards.read_detections(table, CHARUCO)
         if said is None:
-            assert boards.read_lens(path, found).fx == 1352.02747
+            assert lenses.read_lens(path, found).fx == 1352.02747
             continue
         with pytest.raises(InputError, match=said):
-            boards.read_lens(path, found)
+            lenses.read_lens(path, found)
     table.write_text('image,corner,u,v,width,height\na,0,1,2,800,600\nb,0,1,2,640,480\n')
     with pytest.raises(InputError, match='images of 640 x 480 and 800 x 600 px'):
         boards.read_detections(table, CHARUCO)
@@ -264,7 +264,7 @@ def test_intrinsics_as_others_write_them(tmp_path):
     nested = 'camera_matrix: [[1350, 0, 795], [0, 1355, 605], [0, 0, 1]]\n'
     for text in (matrix, nested):
         path.write_text(f'{text}distortion_coefficients: [[-0.1, 0.2, 0, 0, 0]]\n')
-        lens = boards.read_lens(path)
+        lens = lenses.read_lens(path)
         assert (lens.fx, lens.cy, lens.k1, lens.k2) == (1350.0, 605.0, -0.1, 0.2)
 
 
@@ -370,10 +370,10 @@ MATRIX = 'k: [800, 0, 320, 0, 800, 240, 0, 0, 1]'
 def test_intrinsics_that_are_none_are_refused(tmp_path, text, said):
     path = tmp_path / 'camera.yaml'
     path.write_text(MATRIX)
-    assert boards.read_lens(path) == Lens(800.0, 800.0, 320.0, 240.0)
+    assert lenses.read_lens(path) == Lens(800.0, 800.0, 320.0, 240.0)
     path.write_text(text)
     with pytest.raises(ConfigError, match=said):
-        boards.read_lens(path)
+        lenses.read_lens(path)
 
 
 @pytest.mark.parametrize(

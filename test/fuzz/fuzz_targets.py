@@ -132,7 +132,7 @@ def board(path):
 
 @target('.yaml')
 def lens(path):
-    from calib_ros.files.boards import read_lens
+    from calib_ros.files.lenses import read_lens
 
     read_lens(path)
 
