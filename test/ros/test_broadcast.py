@@ -23,7 +23,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import dump_chain
 from calib_ros.kinematics.urdf import chain_from_urdf, corrected_urdf
-from calib_ros.ros.outputs import Broadcast
+from calib_ros.ros.broadcast import Broadcast
 
 NAMES = {'base_frame': 'base_link', 'flange_frame': 'tool0', 'target_frame': 'ball'}
 
