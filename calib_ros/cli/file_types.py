@@ -9,7 +9,7 @@ from pathlib import Path
 from calib_ros.errors import InputError
 from calib_ros.files import cameras
 from calib_ros.files.loading import TABLES
-from calib_ros.files.stored import RECORDED
+from calib_ros.files.unpacked import RECORDED
 from calib_ros.kinematics.chain_file import URDF_SUFFIXES
 
 BEGINNINGS = (

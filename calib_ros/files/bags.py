@@ -15,6 +15,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.errors import InputError, UnknownNameError, shortened
 from calib_ros.files import stored
 from calib_ros.files.cameras import cameras_of
+from calib_ros.files.unpacked import unpacked_files
 from calib_ros.progress import Notify, quiet
 from calib_ros.sampling.account import ALLOW, Account, allowing, too_much_lost
 from calib_ros.sampling.batches import Deserialise, Stream, batches, feed, links_of
@@ -66,7 +67,7 @@ def replay(path: Path | str, session: CalibrationSession, progress: Notify = qui
     if not (path.is_dir() or path.is_file()):
         raise InputError(f'there is no bag at {path}: give its folder or one of its files')
     session.pictures.cameras, session.pictures.patient = cameras_of(session.settings.sources), True
-    with stored.unpacked_files(path) as folder:
+    with unpacked_files(path) as folder:
         return _replay(path, folder, session, progress)
 
 
@@ -141,7 +142,7 @@ def pictures(path: Path, topic: str = '') -> Iterator[tuple[int, Any]]:
     if not path.exists():
         raise InputError(f'there is no bag at {path}')
     deserialise = _deserialiser({})
-    with stored.unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
+    with unpacked_files(path) as folder, closing(_opened(path, folder)) as reader:
         found = {c.topic: c for c in reader.connections if c.msgtype in PICTURES}
         if topic and topic not in found:
             raise UnknownNameError(f'topic of images in {path}', topic, found)

@@ -11,20 +11,19 @@ from __future__ import annotations
 
 import mmap
 import re
-import shutil
 import sqlite3
 import struct
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
 from operator import attrgetter, itemgetter
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
+from calib_ros.errors import MOST_ENTRIES, ConfigError
 from calib_ros.files import mcap
+from calib_ros.files.unpacked import recorded_files
 from calib_ros.sampling.batches import Stream
 from calib_ros.sampling.messages import PICTURES
 from calib_ros.texts import LARGEST_TABLE, parse_yaml, read_text
@@ -39,8 +38,6 @@ CHUNK = (*TIMES, 'channel_count', 'chunk_start_offset', 'chunk_length', 'uncompr
 LARGEST_MESSAGE = 64 * MOST_ENTRIES
 """Bytes of a message: a joint state with a name and three numbers per joint."""
 LARGEST_IMAGE = 2 * LARGEST_TABLE  # bytes of an image, as a message or a file
-UNPACKED = ('.mcap', '.db3')  # suffixes of the files of a recording
-RECORDED = (*UNPACKED, '.zstd')  # also if it is compressed as a whole
 NOT_CLOSED = 'the recording was not closed'
 GROWING = {
     'topics': 'SELECT id FROM topics NOT INDEXED',
@@ -63,67 +60,6 @@ def recorded(path: Path) -> int | None:
     return None if found is None else int(found.group(1))
 
 
-@contextmanager
-def unpacked_files(path: Path) -> Iterator[Path]:
-    """Provide a bag whose files are neither compressed nor partly in a write-ahead log."""
-    files = _files(path, RECORDED)
-    if not any(file.suffix == '.zstd' or _log(file).is_file() for file in files):
-        yield path
-        return
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        for file in files:
-            if file.suffix != '.zstd':
-                _with_log(file, folder / file.name)
-            elif not (folder / file.stem).exists():
-                _unpack_file(file, folder / file.stem)
-        with suppress(ConfigError):
-            text = read_text((path if path.is_dir() else path.parent) / 'metadata.yaml')
-            text = re.sub(r'(?m)^(\s*compression_mode:).*$', r'\1 ""', text).replace('.zstd', '')
-            (folder / 'metadata.yaml').write_text(text, encoding='utf-8')
-        yield folder if path.is_dir() else folder / path.name.removesuffix('.zstd')
-
-
-def _log(file: Path) -> Path:
-    return file.with_name(f'{file.name}-wal')
-
-
-def _with_log(file: Path, target: Path) -> None:
-    """Copy a file with its log applied; link to one without."""
-    if not _log(file).is_file():
-        target.symlink_to(file.resolve())
-        return
-    shutil.copyfile(file, target)
-    shutil.copyfile(_log(file), _log(target))
-    try:
-        with closing(sqlite3.connect(target)) as connection:
-            _, pages, _ = connection.execute('PRAGMA wal_checkpoint').fetchone()
-    except sqlite3.OperationalError as err:  # full disk
-        raise InputError(f'{_log(file)} cannot be applied to a copy of {file}: {err}') from err
-    except sqlite3.DatabaseError:  # no database; reported later
-        return
-    if pages == 0 and _log(file).stat().st_size > 32:  # more than its header
-        raise InputError(
-            f'{_log(file)} is damaged, what was recorded last cannot be read: copy it again, or '
-            'move it away to use the rest'
-        )
-
-
-def _unpack_file(file: Path, target: Path) -> None:
-    room = mcap.Room(file.stat().st_size)
-    try:
-        with target.open('wb') as out, mcap.module_of('zstd').open(file, 'rb') as packed:
-            while part := packed.read(1 << 20):
-                room.take(len(part))
-                out.write(part)
-    except InputError as err:
-        raise InputError(f'{file} is too large: {err}') from err
-    except OSError:  # full disk
-        raise
-    except Exception:  # decompressors have their own errors; losses are reported later
-        return
-
-
 def topic_types(topics: Iterable[tuple[object, object]]) -> dict[str, str]:
     """Return the types of topics; a database may hold something other than text."""
     return {name: kind for name, kind in topics if isinstance(name, str) and isinstance(kind, str)}
@@ -134,9 +70,9 @@ def check_bag(path: Path) -> None:
     metadata = path / 'metadata.yaml'
     if metadata.exists():
         parse_yaml(read_text(metadata), str(metadata))
-    elif not _files(path):
+    elif not recorded_files(path):
         raise ValueError('no .mcap or .db3 file is in it')
-    for file in _files(path):
+    for file in recorded_files(path):
         if file.suffix == '.db3':
             with closing(_open(file)) as connection:
                 _check_layout(connection)
@@ -174,17 +110,11 @@ class Salvage:
 
 def salvage(path: Path) -> Salvage | None:
     """Return what can be read of a bag folder or file, or None."""
-    found = Salvage(_files(path))
+    found = Salvage(recorded_files(path))
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         found.problem = NOT_CLOSED
     found.count = sum(1 for _ in found.messages())
     return found if found.count else None
-
-
-def _files(path: Path, kinds: Sequence[str] = UNPACKED) -> tuple[Path, ...]:
-    files = path.iterdir() if path.is_dir() else [path]
-    ordered = sorted(files, key=lambda file: (len(file.name), file.name))  # bag_9 before bag_10
-    return tuple(file for file in ordered if file.suffix in kinds)
 
 
 def _open(file: Path) -> sqlite3.Connection:

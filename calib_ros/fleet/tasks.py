@@ -25,7 +25,7 @@ from calib_ros.files.rows import (
     inputs_of,
     measured_at,
 )
-from calib_ros.files.stored import RECORDED
+from calib_ros.files.unpacked import RECORDED
 from calib_ros.fleet.plant import Robot
 from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, render
