@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, strategies as st
 from tracked import MS, fill, filled
 
-from calib_ros.sampling.track import LOOKS_BACK
+from calib_ros.sampling.intervals import LOOKS_BACK
 
 # Standing
 
