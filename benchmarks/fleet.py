@@ -40,9 +40,10 @@ import psutil
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.files.history import History
 from calib_ros.fleet import run as running
+from calib_ros.fleet.page import write_report
 from calib_ros.fleet.plant import read_plant
 from calib_ros.fleet.run import Cluster, run
-from calib_ros.fleet.status import statuses, write_report
+from calib_ros.fleet.status import statuses
 from calib_ros.fleet.tasks import Outcome, Task, sources, work
 from calib_ros.kinematics.chain_file import load_chain
 
