@@ -55,7 +55,7 @@ class ErrorModel:
     ) -> None:
         self.chain = chain
         self.names = tuple(names)
-        self._ends = (base, tool)
+        self.ends = (base, tool)
         self._base = chain.frame(base).matrix
         self._origin = np.vstack([np.eye(3), self._base[:3, 3]])[..., np.newaxis]
         turning = tuple(bool(turns) for turns in chain.walk.turning)
@@ -63,7 +63,7 @@ class ErrorModel:
         fitted = tuple(name for name in self.names if name in known)
         standard = chain.convention == 'standard'
         joints = tuple(zip(chain.joint_names, turning, strict=True))
-        self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self._ends)
+        self._layout = _layout(self.names, joints, standard, chain.frame_names, fitted, self.ends)
         self.rotations = self._layout.rotations
         """Number of rotations; they come first in the arrays of `linearise`."""
         self.motions = self.rotations + len(self._layout.shifts)
@@ -96,18 +96,14 @@ class ErrorModel:
         phi = effects.basis(self.chain, names, q, approach)
         frames, target = self._frames(effects.moved_joints(self.chain, names, phi, q))
         flat = frames.reshape(4 * len(frames), 3, samples)
-        axes = flat[layout.axes]
-        levers = np.zeros((len(axes) + 1, 3, samples))  # the last stays zero
-        se3.cross(axes, target[3] - flat[layout.points], levers[:-1])
         shift, turn = out or (
-            np.empty((self.rotations + len(layout.shifts) + 1, 3, samples)),
+            np.empty((self.motions + 1, 3, samples)),
             np.empty((self.rotations + 1, 3, samples)),
         )
-        np.take(levers, layout.levers, axis=0, out=shift[: self.rotations], mode='clip')
-        np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
         np.take(flat, layout.turns, axis=0, out=turn[:-1], mode='clip')
-        for k in layout.still:
-            (turn if k < self.rotations else shift)[k] = 0.0
+        se3.cross(turn[:-1], target[3] - flat[layout.points], shift[: self.rotations])
+        np.take(flat, layout.shifts, axis=0, out=shift[self.rotations : -1], mode='clip')
+        shift[layout.still], turn[layout.unturned] = 0.0, 0.0
         if velocity is not None and layout.delay is not None:
             turn[layout.delay], shift[layout.delay] = _twist(walk, velocity, frames, target[3])
         phi = phi[: len(layout.effects)] * walk.signs[layout.joints]
@@ -116,16 +112,16 @@ class ErrorModel:
     def _frames(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return frames (F, 4, 3, B) along the chain and the target's (4, 3, B).
 
-        Those before the joints, of the flange, of the world at the base, the flange's axes without
-        an origin, and the y axes that b shifts along; q (n, B) holds effective joint values.
+        Those before the joints, of the flange, of the world at the base, the flange's axes at the
+        target, and the y axes that b shifts along; q (n, B) holds effective joint values.
         """
         count, samples = q.shape
         walk, behind = self.chain.walk, self._layout.behind
         frames = np.empty((count + 3 + self._layout.beside * count, 4, 3, samples))
         walk.frames(q, self._base, frames[: count + 1])
-        target = self.chain.at_the_tool(frames[count], self._ends[1])
+        target = self.chain.at_the_tool(frames[count], self.ends[1])
         frames[count + 1] = self._origin
-        frames[count + 2, :3] = frames[count, :3]
+        frames[count + 2, :3], frames[count + 2, 3] = frames[count, :3], target[3]
         if self._layout.beside:
             after = frames[behind, :3]
             frames[count + 3 :, 1] = np.einsum('jk,jkcb->jcb', walk.beside, after)
@@ -168,8 +164,8 @@ class ErrorModel:
 class _Layout(NamedTuple):
     """Rows of the columns, rotations first, and that of each name in `order`.
 
-    Of the rows of all frames, four each, `axes` and `points` belong to rotations; `levers` (of
-    these), `shifts` and `turns` to each column; `still` ones move nothing. `behind` are the
+    Of the rows of all frames, four each, `turns` and `points` belong to rotations, `shifts` to the
+    others; `still` ones move nothing, `unturned` are the rotations among them. `behind` are the
     frames after the constant part of each link, `bent` if something moves along or about x there,
     `beside` if b does along y before it. `effects`, with numbers `spread` among the names, share
     the columns of the motion of their `joints`; `delay` is the row of a delay.
@@ -177,12 +173,11 @@ class _Layout(NamedTuple):
 
     rotations: int
     order: Index
-    axes: Index
-    points: Index
-    levers: Index
-    shifts: Index
     turns: Index
-    still: tuple[int, ...]
+    points: Index
+    shifts: Index
+    still: Index
+    unturned: Index
     behind: slice
     bent: bool
     beside: bool
@@ -239,20 +234,15 @@ def _layout(
     row = {name: k for k, name in enumerate(ordered)}
     rotations = sum(lines[name][2] for name in ordered)
     taken = [4 * (lines[name][0] or 0) + lines[name][1] for name in ordered]
-    moved = [lines[name][0] is not None for name in ordered]
-    # rotations of the target about itself do not move it
-    away = [lines[name][0] not in (None, len(joints) + 2) for name in ordered[:rotations]]
-    axes = sorted({k for k, yes in zip(taken, away, strict=False) if yes})
-    levers = [axes.index(k) if yes else len(axes) for k, yes in zip(taken, away, strict=False)]
+    still = [k for k, name in enumerate(ordered) if lines[name][0] is None]
     return _Layout(
         rotations,
         _indices(row[driven.get(name, name)] for name in names),
-        _indices(axes),
-        _indices(k // 4 * 4 + 3 for k in axes),
-        _indices(levers),
-        _indices(taken[rotations:]),
         _indices(taken[:rotations]),
-        tuple(k for k, yes in enumerate(moved) if not yes),
+        _indices(k // 4 * 4 + 3 for k in taken[:rotations]),
+        _indices(taken[rotations:]),
+        _indices(still),
+        _indices(k for k in still if k < rotations),
         slice(1, len(joints) + 1) if standard else slice(0, len(joints)),
         any(Parameter(name).kind in ('a', 'alpha') for name in names),
         any(Parameter(name).kind == 'b' for name in names),
