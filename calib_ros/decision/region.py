@@ -63,8 +63,8 @@ class Region(Shown):
 
     def known(self, joints: FloatArray) -> FloatArray:
         """Return the expected error (N,) [m] by the parameters alone, compared with `limit`."""
-        known = self.chain, self.names, self.square, (self.base, self.tool)
-        squares = NOTHING.expected(*known, joints)[:, :3, :3]
+        model = ErrorModel(self.chain, self.names, self.base, self.tool)
+        squares = NOTHING.expected(model, self.square, joints)[:, :3, :3]
         return np.asarray(np.sqrt(np.trace(squares, axis1=1, axis2=2)))
 
     def covers(self, joints: FloatArray) -> Flags:

@@ -32,6 +32,7 @@ from calib_ros.estimation.levels import OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.sizes import TYPICAL, Evidence, mixed, solved
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.shown import Shown
@@ -85,8 +86,8 @@ class Posterior(Shown):
 
         In world axes, unmodelled effects included.
         """
-        known = self.chain, self.names, self.square, (base, tool)
-        return self.unmodelled.expected(*known, joints)
+        model = ErrorModel(self.chain, self.names, base, tool)
+        return self.unmodelled.expected(model, self.square, joints)
 
     def stds_of(self, names: Sequence[str]) -> FloatArray:
         """Return the standard deviations (K,) of undetermined parameters of the arm."""
@@ -105,16 +106,15 @@ class Posterior(Shown):
         def padded(matrix: FloatArray) -> FloatArray:
             return np.asarray(np.pad(matrix, (0, count)) + more)
 
-        none = np.zeros(count)
         return replace(
             self,
             names=(*self.names, *names),
-            offsets=np.append(self.offsets, none),
-            shift=np.append(self.shift, none),
+            offsets=np.pad(self.offsets, (0, count)),
+            shift=np.pad(self.shift, (0, count)),
             covariance=padded(self.covariance),
             device=np.pad(self.device, ((0, count), (0, 0))),
             rival=None,  # nothing measures the scale
-            doubted=tuple((w, np.append(m, none), padded(c)) for w, m, c in self.doubted),
+            doubted=tuple((w, np.pad(m, (0, count)), padded(c)) for w, m, c in self.doubted),
         )
 
     def held(self, name: str) -> float:

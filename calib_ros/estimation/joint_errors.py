@@ -60,25 +60,19 @@ class Unmodelled(NamedTuple):
         left = waved(tilts, joints) - np.tensordot(self.followed, own, (0, 0))
         return np.concatenate([self.turns * turns, self.tilts * tilts, self.waves * left])
 
-    def expected(
-        self,
-        chain: Chain,
-        names: Sequence[str],
-        square: FloatArray,
-        ends: tuple[str, str],
-        joints: FloatArray,
-    ) -> FloatArray:
+    def expected(self, model: ErrorModel, square: FloatArray, joints: FloatArray) -> FloatArray:
         """Return the expected squares (N, 6, 6) of pose errors [m, rad] at joint values (N, n).
 
-        Between the `ends`, in world axes, with expected squares (P, P) of the parameters `names`.
+        In world axes, with expected squares (P, P) of the model's parameters.
         """
-        some, joints = any(self.sizes.values()), chain.joint_values(joints)
-        every = tuple(dict.fromkeys((*names, *(moving(chain) if some else ()))))
-        model, squares = ErrorModel(chain, every, *ends), np.empty((len(joints), 6, 6))
+        chain, count, some = model.chain, len(model.names), any(self.sizes.values())
+        every = tuple(dict.fromkeys((*model.names, *(moving(chain) if some else ()))))
+        joints = chain.joint_values(joints)
+        model, squares = ErrorModel(chain, every, *model.ends), np.empty((len(joints), 6, 6))
         for first in range(0, len(joints), BLOCK):
             block = np.s_[first : first + BLOCK]
             jacobian = model.jacobian(joints[block])
-            own = jacobian[..., : len(names)]
+            own = jacobian[..., :count]
             squares[block] = own @ square @ np.swapaxes(own, 1, 2)
             if some:
                 rows = jacobian.transpose(2, 1, 0)

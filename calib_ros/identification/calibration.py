@@ -48,6 +48,7 @@ from calib_ros.kinematics.chain_file import (
     parse_chain,
     table_hash,
 )
+from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import MODELS, Model, Settings
 from calib_ros.shown import Shown
@@ -177,13 +178,13 @@ class Calibration(Shown):
         error, unmodelled effects included.
         """
         if (region := self.region) is not None:
-            ends, lacking = (region.base, region.tool), self.unmodelled
-            known = region.chain, region.names, region.square, ends
+            model = ErrorModel(region.chain, region.names, region.base, region.tool)
+            squares = self.unmodelled.expected(model, region.square, joints)
         elif self.covariance is not None:
-            lacking, known = NOTHING, (self.chain, self.names, self.covariance, ('base', 'tool'))
+            model = ErrorModel(self.chain, self.names)
+            squares = NOTHING.expected(model, self.covariance, joints)
         else:
             return np.full(len(joints), np.nan)
-        squares = lacking.expected(*known, joints)
         return np.asarray(np.sqrt(np.diagonal(squares, 0, 1, 2)[:, components].sum(axis=1)))
 
     def remaining(self, joints: FloatArray) -> FloatArray:
