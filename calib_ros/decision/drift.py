@@ -45,19 +45,17 @@ class Shifts:
     """
 
     def __init__(self, system: System, residuals: Sequence[FloatArray]) -> None:
-        numbers = [samples.observations.stops for samples in system.sets]
-        self._begins = [np.flatnonzero(np.diff(each, prepend=-1)) for each in numbers]
-        count = min(SHIFTS, 2 * max(len(begins) for begins in self._begins))
-        self._weights = [
-            _weights(samples.observations, begins)
-            for samples, begins in zip(system.sets, self._begins, strict=True)
-        ]
+        self._stops = []  # of each set, where they begin, and weights of their rows
+        for seen in (samples.observations for samples in system.sets):
+            begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
+            self._stops.append((begins, _weights(seen, begins)))
+        count = min(SHIFTS, 2 * max(len(begins) for begins, _ in self._stops))
         windows = []
-        for begins, weights, residual in zip(self._begins, self._weights, residuals, strict=True):
-            series = _by_stop(residual, begins, weights)
+        for stops, residual in zip(self._stops, residuals, strict=True):
+            series = _by_stop(residual, *stops)
             circle = np.concatenate([series, series[:, ::-1], series], axis=1)
-            every = sliding_window_view(circle, len(begins), axis=1).swapaxes(0, 1)
-            starts = (np.arange(count) / count * 2 * len(begins)).astype(int)
+            every = sliding_window_view(circle, series.shape[1], axis=1).swapaxes(0, 1)
+            starts = (np.arange(count) / count * 2 * series.shape[1]).astype(int)
             windows.append(_detrended(every[starts]).reshape(count, -1))
         self._shifted = np.concatenate(windows, axis=1)
         self._energy = (self._shifted**2).sum(axis=1)
@@ -67,12 +65,11 @@ class Shifts:
         rows = []
         for lot in columns:
             parts = []
-            for begins, weights, column in zip(self._begins, self._weights, lot, strict=True):
-                series = _by_stop(column, begins, weights)
-                whole = np.linalg.norm(series, axis=(1, 2))
-                series = _detrended(series)
-                rounding = np.linalg.norm(series, axis=(1, 2)) <= HALF_THE_DIGITS * whole
-                series[rounding] = 0.0
+            for stops, column in zip(self._stops, lot, strict=True):
+                whole = _by_stop(column, *stops)
+                series = _detrended(whole)
+                size, left = (np.linalg.norm(each, axis=(1, 2)) for each in (whole, series))
+                series[left <= HALF_THE_DIGITS * size] = 0.0  # rounding
                 parts.append(series.reshape(len(series), -1))
             rows.append(np.concatenate(parts, axis=1))
         every = np.concatenate(rows)
