@@ -127,12 +127,6 @@ def joint_values(chain: Chain, program: Program) -> tuple[FloatArray, Index]:
     Raises InputError or UnknownNameError for a missing joint that can move, and arrays that do not
     match the names.
     """
-    columns = np.array(_columns(chain, program))
-    ends = [chain.held.get(k, 0.0) for k in range(len(columns))]
-    return np.where(columns < 0, ends, program.positions[:, columns]), columns
-
-
-def _columns(chain: Chain, program: Program) -> list[int]:
     names = chain.joint_names
     shape = program.positions.shape
     if len(shape) != 2 or shape[1] != len(program.names):
@@ -155,7 +149,10 @@ def _columns(chain: Chain, program: Program) -> list[int]:
         raise UnknownNameError('joint in the program', strange, names)
     if missing:
         raise InputError(f'the program has no values of {", ".join(missing)}')
-    return [program.names.index(name) if name in program.names else -1 for name in names]
+    known = {name: k for k, name in enumerate(program.names)}
+    columns = np.array([known.get(name, -1) for name in names])
+    ends = [chain.held.get(k, 0.0) for k in range(len(names))]
+    return np.where(columns < 0, ends, program.positions[:, columns]), columns
 
 
 def _put(values: FloatArray, columns: Index, new: FloatArray) -> FloatArray:

@@ -39,14 +39,9 @@ def faulty(chain: Chain, cell: Cell, rng: np.random.Generator) -> Chain:
 
     Gauge freedoms get no errors, so that errors can be compared with identified ones.
     """
-    names = [
-        name
-        for name in structurally_independent(chain, chain.parameter_names)
-        if Parameter(name).owner not in ('base', 'tool')
-    ]
-    sizes = [
-        cell.length_error if Parameter(name).is_length else cell.angle_error for name in names
-    ]
+    independent = structurally_independent(chain, chain.parameter_names)
+    names = [Parameter(name) for name in independent if not chain.owns_frame(name)]
+    sizes = [cell.length_error if each.is_length else cell.angle_error for each in names]
     offsets = dict(zip(names, rng.normal(scale=sizes), strict=True))
     return replace(
         chain.with_offsets(offsets), base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2)

@@ -103,10 +103,7 @@ def regions(positions: FloatArray, errors: FloatArray) -> tuple[Sector, ...]:
     radius, height = np.hypot(positions[:, 0], positions[:, 1]), positions[:, 2]
     azimuth = np.arctan2(positions[:, 1], positions[:, 0])
     edges = [np.quantile(each, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0]) for each in (radius, height)]
-    rings, levels = (
-        np.clip(np.searchsorted(edge, each, 'right') - 1, 0, 2)
-        for edge, each in zip(edges, (radius, height), strict=True)
-    )
+    rings, levels = np.digitize(radius, edges[0][1:3]), np.digitize(height, edges[1][1:3])
     sides = np.round(azimuth / (0.5 * np.pi)).astype(int) % 4
     found = []
     for ring, level, side in np.ndindex(3, 3, 4):
@@ -178,8 +175,6 @@ def place(
     cells: int = 9,
     turns: int = 1,
     refinements: int = 4,
-    starts: int = 24,
-    drawn: int = 20_000,
     progress: Notify = quiet,
 ) -> Placements:
     """Find the placement of a task with the smallest expected error, mean or worst of its poses.
@@ -187,12 +182,10 @@ def place(
     Poses (K, 4, 4) of the target are in the task's frame, whose axes are those of the base at turn
     0; `region` (2, 3) are corners [m, base] for its origin, None for all that the arm, commanded
     by a `model`, reaches. The grid has `cells` along each axis and `turns` about the vertical, and
-    is halved `refinements` times about the best placement. The first pose is solved from the
-    nearest `starts` of `drawn` random joint values, since an arm reaches it in several postures
-    with other errors. An arm with fewer than six freedoms reaches a pose at its position, with the
-    orientation to 0.02 rad.
+    is halved `refinements` times about the best placement. An arm with fewer than six freedoms
+    reaches a pose at its position, with the orientation to 0.02 rad.
     """
-    search = _Search(arm, task, aim, model, starts, drawn, progress)
+    search = _Search(arm, task, aim, model, progress)
     corners = search.reach if region is None else region
     if not (corners[0] <= corners[1]).all():
         raise InputError(
@@ -226,27 +219,22 @@ def place(
 class _Search:
     """The expected error of a task at placements (M, 4): x, y, z [m] and a turn [rad].
 
-    The arm reaches only points within the corners (2, 3) of its `reach` [m].
+    The arm reaches only points within the corners (2, 3) of its `reach` [m]. The first pose of the
+    task is solved from the nearest 24 of random joint values, since an arm reaches it in several
+    postures with other errors.
     """
 
     def __init__(
-        self,
-        arm: Calibration,
-        task: FloatArray,
-        aim: Objective,
-        model: Model,
-        starts: int,
-        drawn: int,
-        progress: Notify,
+        self, arm: Calibration, task: FloatArray, aim: Objective, model: Model, progress: Notify
     ) -> None:
         if aim not in AIMS:
             raise UnknownNameError('aim', aim, AIMS)
         self._arm, self._task, self._aim, self._model = arm, task, aim, model
-        self._starts, self._progress, self._solved = starts, progress, 0
+        self._starts, self._progress, self._solved = 24, progress, 0
         self._chain = arm.commanded_by(model)
         self._complete = mobility(self._chain)[0] == 6
         self._base = self._chain.frame('base').matrix
-        self._known = self._chain.random_joints(drawn, np.random.default_rng(0))
+        self._known = self._chain.random_joints(20_000, np.random.default_rng(0))
         poses = in_base(self._chain, self._known)
         self._tree = cKDTree(_features(poses))
         self.reach = np.array([poses[:, :3, 3].min(axis=0), poses[:, :3, 3].max(axis=0)])
