@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import gram
+from calib_ros.estimation.samples import gram, summed
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, cos_sin
 from calib_ros.values import LARGEST
@@ -83,12 +83,6 @@ class Stops:
     def __len__(self) -> int:
         return len(self.count)
 
-    def distances(self, kind: str) -> FloatArray:
-        """Return the distances (n, n) between stops for a kind of kernel."""
-        if kind == 'near':
-            return np.asarray(cdist(self.place, self.place))
-        return np.asarray(np.abs(self.time[:, np.newaxis] - self.time))
-
     def links(self, kind: str) -> csr_array:
         """Return (n, n): 1 for neighbours."""
         count = len(self)
@@ -107,8 +101,10 @@ class Stops:
 
     def kernel(self, kind: str, length: float) -> FloatArray:
         """Return (n, n): covariance of the sums over each stop, per root of count."""
-        root = np.sqrt(self.count)
-        return np.asarray(np.outer(root, root) * np.exp(-self.distances(kind) / length))
+        root, place = np.sqrt(self.count), self.place
+        if kind == 'successive':
+            place = self.time[:, np.newaxis]
+        return np.asarray(np.outer(root, root) * np.exp(-cdist(place, place) / length))
 
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
@@ -283,14 +279,12 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
         few, numbers = samples.select(chosen), numbers[chosen]
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         count = np.diff([*begins, len(numbers)]).astype(float)
-        rows = [np.zeros((len(names) + 1, width, len(begins))) for width in widths]
-        for index, block in few.sums(chain, names, numbers):
-            first = int(np.searchsorted(numbers[begins], index[0]))  # one stop may span blocks
-            for summed, added in zip(rows, block, strict=False):
-                summed[:, : added.shape[1], first : first + len(index)] += added
-        for part, summed in zip(parts, rows, strict=True):
-            summed /= np.sqrt(count)
-            part.append(summed)
+        for part, width in zip(parts, widths, strict=True):
+            part.append(np.zeros((len(names) + 1, width, len(begins))))
+        blocks = zip(*few.parts(chain, names), strict=True)
+        for (*_, rows), whole in zip(parts, blocks, strict=False):  # one part if whitened
+            added = summed(np.concatenate(whole, axis=2), begins)
+            rows[:, : added.shape[1]] = added / np.sqrt(count)
         q = few.observations.joints[begins]
         turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
         places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))
@@ -319,39 +313,29 @@ def _successive(
     names: Sequence[str],
     system: System,
     kernels: Mapping[int, Sequence[tuple[float, float]]],
-    run: int = 64,
 ) -> dict[int, FloatArray]:
     """Return by part J^T K J of errors fading in succession, for (length, size) each.
 
-    In runs of stops: those of one run by a root C of their covariance K = C C^T, with all before
-    it by their sums, faded until then.
+    Each stop is multiplied with the sum of all before it, faded until then: a recursive filter.
     """
+    from scipy.signal import lfilter  # slow to import, rarely needed
+
     size = len(names)
     found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
-        last: dict[int, tuple[FloatArray, int]] = {}
+        states: dict[tuple[int, float], FloatArray] = {}
+        last = -1
         for numbers, sums in samples.sums(chain, names, samples.observations.stops):
-            for part, own in kernels.items():
-                if part >= len(sums):
-                    continue
-                lengths, weights = np.array(own).T[..., np.newaxis]
-                stops = sums[part][:-1].reshape(-1, len(numbers))
-                turned = np.empty_like(stops)
-                faded, time = last.get(part, (np.zeros((len(stops), len(own))), numbers[0]))
-                before, after = [], []
-                for first in range(0, len(numbers), run):
-                    block = slice(first, first + run)
-                    times, rows = numbers[block], stops[:, block]
-                    apart = np.abs(np.subtract.outer(times, times))
-                    near = np.exp(-apart / lengths[..., np.newaxis])
-                    root = np.linalg.cholesky(np.tensordot(weights[:, 0], near, 1))
-                    turned[:, block] = rows @ root
-                    since = np.exp((time - times) / lengths)
-                    before.append(faded)
-                    after.append(rows @ (weights * since).T)
-                    faded, time = since[:, -1] * faded + rows @ near[:, -1].T, times[-1]
-                last[part] = faded, time
-                earlier, later = (np.hstack(each).reshape(size, -1) for each in (before, after))
-                cross = earlier @ later.T
-                found[part] += gram(turned.reshape(size, -1)) + cross + cross.T
+            for part in kernels.keys() & range(len(sums)):
+                rows = sums[part][:-1].reshape(-1, len(numbers))
+                flat = rows.reshape(size, -1)
+                for length, weight in kernels[part]:
+                    fade, key = np.exp(-1.0 / length), (part, length)
+                    state = states.get(key, np.zeros((len(rows), 1)))
+                    if numbers[0] == last:  # one stop may span blocks
+                        state = state / fade
+                    before, states[key] = lfilter([0.0, fade], [1.0, -fade], rows, zi=state)
+                    cross = flat @ before.reshape(size, -1).T
+                    found[part] += weight * (gram(flat) + cross + cross.T)
+            last = numbers[-1]
     return found
