@@ -53,7 +53,8 @@ class Identification(Shown):
     """Samples with gross errors; they carry little or no weight in the fit."""
     gauges: dict[str, list[str]]
     """For each omitted parameter, the fitted ones it trades off against."""
-    observability: identifiability.Observability
+    observability: dict[str, float]
+    """Observability indices o1 to o5."""
     priors: dict[str, float]
     """Standard deviations [m, rad] known beforehand."""
     world_frame: str

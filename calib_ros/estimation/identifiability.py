@@ -290,26 +290,17 @@ def trades(matrix: FloatArray, names: Sequence[str], kept: Sequence[str]) -> dic
     return partners
 
 
-@dataclass(frozen=True)
-class Observability:
-    """Observability indices of a set of poses from the singular values of the scaled Jacobian.
+def observability(factor: FloatArray, poses: int) -> dict[str, float]:
+    """Return the indices o1 to o5 from R (P, P) of the weighted Jacobian of a number of poses.
 
-    O1 Borm and Menq 1991, O2 Driels and Pathre 1990, O3 and O4 Nahvi et al. 1994 and 1996,
-    O5 Sun and Hollerbach 2008. Columns are in sigma of the measurement per metre or radian.
+    From the singular values, in sigma of the measurement per metre or radian. O1 Borm and Menq
+    1991, O2 Driels and Pathre 1990, O3 and O4 Nahvi et al. 1994 and 1996, O5 Sun and Hollerbach
+    2008.
     """
-
-    o1: float
-    o2: float
-    o3: float
-    o4: float
-    o5: float
-
-
-def observability(factor: FloatArray, poses: int) -> Observability:
-    """Return the indices from R (P, P) of the weighted Jacobian of a number of poses."""
     singular = np.asarray(np.linalg.svd(factor, compute_uv=False), dtype=float)
     mean = float(np.exp(np.log(np.maximum(singular, 1e-300)).mean()))
-    return Observability(mean / np.sqrt(poses), *map(float, indices_of(singular).values()))
+    others = {name: float(each) for name, each in indices_of(singular).items()}
+    return {'o1': float(mean / np.sqrt(poses)), **others}
 
 
 def indices_of(singular: FloatArray) -> dict[str, FloatArray]:

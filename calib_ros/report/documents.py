@@ -63,7 +63,7 @@ def as_document(result: Identification, samples: dict[str, Any]) -> dict[str, An
             'lower': [[float(f'{x:.9e}') for x in row] for row in lower],
         },
         'correlated': [list(pair) for pair in result.correlated()],
-        'observability': asdict(result.observability),
+        'observability': result.observability,
         'predicted_sigma_mm': words.sigma_over_range(result),
         'sizes': dict(result.posterior.sizes),
         'unmodelled': result.posterior.unmodelled.sizes,

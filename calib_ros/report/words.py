@@ -320,8 +320,7 @@ def cameras_in_words(result: Identification) -> list[str]:
 
 def observability_in_words(result: Identification) -> str:
     """Return the observability indices."""
-    o = result.observability
-    return f'O1 {o.o1:.4g}, O2 {o.o2:.4g}, O3 {o.o3:.4g}, O4 {o.o4:.4g}, O5 {o.o5:.4g}'
+    return ', '.join(f'{name.upper()} {x:.4g}' for name, x in result.observability.items())
 
 
 def against_truth(result: Identification, truth: Chain) -> str:
