@@ -169,16 +169,11 @@ class Problem(Shown):
         for pattern in (*self.fixed, *self.priors):
             if not fnmatch.filter(self.model.all_parameters, pattern):  # b only of some arms
                 raise UnknownNameError('parameter', pattern, self.model.parameter_names)
-        for pattern in self.priors:
-            if self._places(pattern):
+            of_lens = fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
+            if self.model.owns_frame(pattern) and not of_lens:
                 raise ConfigError(
-                    f'a frame is either known or unknown, and takes no prior: "{pattern}"'
-                )
-        for pattern in self.fixed:
-            if self._places(pattern):
-                raise ConfigError(
-                    'a frame is fixed as a whole: give it in the chain file with "fixed: true" '
-                    f'instead of fixing "{pattern}"'
+                    'a frame is either known or unknown, and takes no prior: if it is known, give '
+                    f'it in the chain file with "fixed: true" instead of "{pattern}"'
                 )
 
     def _check_effects(self) -> None:
@@ -193,11 +188,6 @@ class Problem(Shown):
                 raise ConfigError('compliance needs the masses of the links in the chain file')
             if group == 'backlash' and all(each.approach is None for each in self.sets):
                 raise ConfigError('backlash needs the signs of the last moves (s1 ... sn)')
-
-    def _places(self, pattern: str) -> bool:
-        """Tell whether a pattern matches the place of a frame, not a lens there."""
-        place = self.model.owns_frame(pattern)
-        return place and not fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
 
     @cached_property
     def sets(self) -> tuple[Observations, ...]:
