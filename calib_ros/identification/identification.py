@@ -225,11 +225,9 @@ def identify_model(problem: Problem, model: str, progress: Notify = quiet) -> Id
         progress(f'model with {len(chosen)} effects')
         rest = share_of(progress, second, 1.0)
         richer = identify(replace(problem, effects=chosen), result, rest)
-        reasons: tuple[str, ...] = ()
+        reasons: tuple[str, ...] = richer.refusals if result.accepted else ()
         if not richer.converged:
             reasons = ('its fit has not converged',)
-        if result.accepted:
-            reasons = reasons or richer.refusals
         if reasons:
             remark = f'the richer model is not used, because {"; ".join(reasons)}'
             result = replace(result, remarks=(*result.remarks, remark))

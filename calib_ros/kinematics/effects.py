@@ -75,15 +75,13 @@ def members(chain: _Arm, group: str) -> tuple[Parameter, ...]:
     names, wrist = chain.joint_names, chain.joint_names[-3:]
     revolute = [joint.name for joint in chain.joints if joint.type == 'revolute']
     geared = [(joint.name, joint.gear_ratio) for joint in chain.joints if joint.gear_ratio]
-    behind = {name: names[i:] for i, name in enumerate(names)}
+    links = [(name, end) for k, name in enumerate(names) for end in names[k:] if name in revolute]
     found: dict[str, list[Parameter]] = {
         'ratio': [Parameter(name, group) for name in names],
         'coupling': couplings(wrist),
         'eccentricity': [wave for name in revolute for k in (1, 2) for wave in waves(name, k)],
         'gear': [wave for name, gear in geared for k in (1, 2) for wave in waves(name, k * gear)],
-        'gravity': [
-            Parameter(name, f'gravity_{other}') for name in revolute for other in behind[name]
-        ],
+        'gravity': [Parameter(name, f'gravity_{end}') for name, end in links],
         'compliance': [Parameter(name, group) for name in revolute],
         'backlash': [
             Parameter(joint.name, group if joint.type == 'revolute' else 'play')

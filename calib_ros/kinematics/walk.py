@@ -37,7 +37,6 @@ class Walk:
         self._theta = theta[:, np.newaxis]
         self.signs = signs[:, np.newaxis]
         self.turning = turning
-        self._all_turning = bool(turning.all())
         self._turns = turning[:, np.newaxis]
         self.standard = standard
         cos, sin = np.cos(alpha), np.sin(alpha)
@@ -71,8 +70,7 @@ class Walk:
         are the following frames.
         """
         values = self.signs * q
-        angles = self._theta + (values if self._all_turning else values * self._turns)
-        cos, sin = cos_sin(angles)
+        cos, sin = cos_sin(self._theta + values * self._turns)
         frame, turned = np.empty((4, *found.shape[2:])), np.empty((2, *found.shape[2:]))
         frame[:] = base[:3].T[..., np.newaxis]
         if self.standard:
