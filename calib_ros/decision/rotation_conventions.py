@@ -28,34 +28,23 @@ VECTOR = ''  # "Order" of a rotation vector
 
 def misread() -> Iterator[tuple[str, str, Turn]]:
     """Yield mistakes, remedies, and functions from rotations (N, 3, 3) as read to those meant."""
-    in_radians = '--angle rad, with --joint-angle for the joints'
+    in_radians, so = '--angle rad, with --joint-angle for the joints', ', or convert them so'
     for read in ORDERS:
         now = ', '.join(f'r{axis.lower()}' for axis in read)
+        angles = f'Euler angles {_order(read)}'
         for meant in ORDERS:
             if meant == read:
                 continue
-            what = f'the Euler angles are {_order(meant)}'
-            yield (
-                f'{what}, not {_order(read)}',
-                f'--euler {meant}, or convert them so',
-                _reinterpret(read, meant, meant),
-            )
-            yield (
-                f'{what} in the order of their columns, not {_order(read)}',
-                f'--euler {meant} with r1, r2, r3 (now {now}), or convert them so',
-                _reinterpret(read, meant, read),
-            )
-        yield (
-            f'the angles are rotation vectors, not Euler angles {_order(read)}',
-            '--rotation-vector, or convert them so',
-            _reinterpret(read, VECTOR, 'XYZ'),
-        )
+            what, turn = f'the Euler angles are {_order(meant)}', _reinterpret(read, meant, meant)
+            yield f'{what}, not {_order(read)}', f'--euler {meant}{so}', turn
+            what += f' in the order of their columns, not {_order(read)}'
+            remedy = f'--euler {meant} with r1, r2, r3 (now {now}){so}'
+            yield what, remedy, _reinterpret(read, meant, read)
+        turn = _reinterpret(read, VECTOR, 'XYZ')
+        yield f'the angles are rotation vectors, not {angles}', f'--rotation-vector{so}', turn
         for longer in (False, True):
-            yield (
-                f'the angles are Euler angles {_order(read)}, not rotation vectors',
-                f'--euler {read}, or convert them so',
-                _reinterpret(VECTOR, read, read, longer=longer),
-            )
+            turn = _reinterpret(VECTOR, read, read, longer=longer)
+            yield f'the angles are {angles}, not rotation vectors', f'--euler {read}{so}', turn
         what = 'the Euler angles are in radians, not degrees'
         yield what, in_radians, _reinterpret(read, read, read, np.degrees(1.0))
     what = 'the rotation vectors are in radians, not degrees'
