@@ -250,19 +250,16 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
     for where, places in orders.items():
         columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(places, 1))
         published = 'set the order of joint_names, start without resume'
-        change = (_joints(same[places]),)
-        what = f'the joints are {where}'
+        what, change = f'the joints are {where}', (_joints(same[places]),)
         yield Suspect(what, f'--columns {columns}', change, 2, published=published, part='order')
-    for k, stands in ((0, 'device moves'), (len(names) - 1, 'target does not move')):
-        what = f'the {stands} with {names[k]}'
-        remedy = 'leave this joint out of the chain file'
-        still = _joints(np.diag(np.arange(len(names)) != k).astype(float))
-        if len(names) > 1:
-            yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)
+    ends = ((0, 'device moves'), (len(names) - 1, 'target does not move'))
+    for k, stands in ends if len(names) > 1 else ():
+        what, remedy = f'the {stands} with {names[k]}', 'leave this joint out of the chain file'
+        still = _joints(same - np.outer(same[k], same[k]))
+        yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)
     for k in range(1, len(names)):
         for way in '+-' if revolute[k] and revolute[k - 1] else '':
-            coupled = same.copy()
-            coupled[k, k - 1] = float(f'{way}1')
+            coupled = same + float(f'{way}1') * np.outer(same[k], same[k - 1])
             what = f'{names[k]} is not given against {names[k - 1]}: they are coupled'
             remedy = f'--columns q{k + 1}=q{k + 1}{way}q{k}'
             yield Suspect(what, remedy, (_joints(coupled),), 2, part=names[k])
@@ -282,11 +279,9 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
         name, column = chain.joint_names[k], f'q{k + 1}'
         for one, others, _, size in MIXED_UP_UNITS:
             what = f'{name} is in {one}, the other joints in {others}'
-            factor = np.ones(len(chain.joints))
-            factor[k] = size
-            changes = (_joints(np.diag(factor)),)
+            change = _joints(np.diag(np.where(np.arange(len(chain.joints)) == k, size, 1.0)))
             remedy = f'--columns {column}={column}*{size:.9g}'
-            yield Suspect(what, remedy, changes, 2, part=name)
+            yield Suspect(what, remedy, (change,), 2, part=name)
 
 
 def dead(chain: Chain, sets: Sets) -> Suspect | None:
