@@ -110,7 +110,8 @@ def notes(result: Identification) -> list[str]:
     found = []
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
-        found.append(f'with {len(result.chain.effects)} effects ({", ".join(groups)})')
+        count = len(result.chain.effects)
+        found.append(f'with {count} effect{"s" if count > 1 else ""} ({", ".join(groups)})')
     given = set(result.priors) - set(result.weak) - {name for name, _ in result.chain.effects}
     if given:
         found.append(f'priors on {len(given)} parameters')
