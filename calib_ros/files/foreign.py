@@ -41,6 +41,7 @@ from calib_ros.files.layouts import (
 )
 from calib_ros.files.sheets import UNIT_SIGNS, Sheet, name_and_unit, only, places, read_sheet
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.shown import some
 from calib_ros.texts import csv_text
@@ -192,6 +193,8 @@ class _Table:
             self.notes.append(f'by the names of the joints, {", ".join(guessed)}')
         if self._chain is not None and any(re.fullmatch('q[0-9]+', ours) for ours in kept):
             names = joint_columns(len(self._chain.joints))
+            # what is reported of coupled joints does not count
+            kept = {names[k]: Expression.parse('0') for k in coupled(self._chain)} | kept
             if missing := [name for name in names if name not in kept]:
                 raise InputError(
                     f'{self._path} has no column for {", ".join(missing)}; {self.has}. '

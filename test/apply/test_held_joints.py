@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Uses of a calibration for arms with a joint that never moves, or that only couplings move."""
 
+import csv
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from calib_ros.apply.verification import _meant
 from calib_ros.errors import InputError
 from calib_ros.files.programs import program_of, read_joints
 from calib_ros.kinematics.chain import Chain, Joint
-from calib_ros.kinematics.chain_file import load_chain
+from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.kinematics.follower import mobility
 from calib_ros.kinematics.inverse import solve
 
@@ -116,6 +117,17 @@ def test_tables_need_not_have_held_joints(tmp_path, path):
     file.write_text('q1,q2,q5\n0.1,0.2,0.4\n')
     with pytest.raises(InputError, match='q3'):
         read_joints(file, PALLETISER)
+
+
+def test_tables_of_measurements_need_not_have_coupled_joints(run, tmp_path):
+    (tmp_path / 'arm.yaml').write_text(dump_chain(PALLETISER))
+    file = tmp_path / 'measured.csv'
+    for q in ('q1,q2,q3,q5', 'turn,lower,upper,wrist'):
+        file.write_text(f'{q},x,y,z\n0.1,0.2,0.3,0.4,1,2,3\n')
+        args = ('--chain', 'arm.yaml', '--out', 'read.csv', '--force')
+        assert run('import', 'measured.csv', *args)[0] == 0
+        row = next(csv.DictReader((tmp_path / 'read.csv').read_text().splitlines()))
+        assert [float(row[f'q{k}']) for k in range(1, 6)] == [0.1, 0.2, 0.3, 0.0, 0.4]
 
 
 def test_a_command_that_moves_a_locked_joint_is_refused(rng):
