@@ -51,9 +51,9 @@ history ''  folder or URL for the results of ~/identify and ~/validate, by seria
 resume False  continue the newest journal of this robot
 allowed_folders ()  folders besides data_dir that ~/save and ~/load may use; default: none
 autoload False  publish the newest saved calibration of this robot at startup
-target_filename* ''  file in data_dir that ~/save writes; default: a new one
-calibration_filename* ''  file in data_dir to publish at startup and on ~/load; default: the \
-newest, by autoload or ~/load
+target_filename* ''  file that ~/save writes, in data_dir or allowed_folders; default: a new one
+calibration_filename* ''  file to publish at startup and on ~/load, in the same folders; default: \
+the newest, by autoload or ~/load
 socket* ''  LOCATION/SOCKET, such as A/1, that holds the ball when ~/capture is called; default: \
 none, a measurement is taken
 largest_loss* {EXCEPTION}  largest share of joint states or measurements dropped because of \
