@@ -225,9 +225,11 @@ def _detected(
         names = ('base_board', 'tool_camera') if seen.on_flange else ('base_camera', 'tool_board')
         seen = replace(seen, base=names[0], tool=names[1])
     known = chain.frame(seen.camera).lens if seen.camera in chain.frame_names else None
-    lens = known if options.intrinsics is None else read_lens(options.intrinsics, found)
+    fitted, lens = options.lens == 'fitted', known
+    if options.intrinsics is not None:
+        lens = read_lens(options.intrinsics, found, fitted)
     if lens is not None:
-        chain = with_lenses(chain, {seen.camera: replace(lens, fixed=options.lens != 'fitted')})
+        chain = with_lenses(chain, {seen.camera: replace(lens, fixed=not fitted)})
     chosen = settings.for_problem() | touched
     if posed:
         chosen['fixed'] = (*chosen['fixed'], *(f'{name}.*' for name in chain.joint_names))

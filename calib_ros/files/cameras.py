@@ -47,7 +47,8 @@ class BoardCamera:
         """Take a CameraInfo; an unusable one refuses the images after it."""
         self._size = (info.height, info.width)
         try:
-            self._lens = replace(lens_in(info), fixed=self._source.lens == 'given')
+            fixed = self._source.lens == 'given'
+            self._lens = replace(lens_in(info, not fixed), fixed=fixed)
         except CalibrationError as err:
             self._lens = Flaw('whose CameraInfo cannot be used', str(err))
 
@@ -70,15 +71,16 @@ class BoardCamera:
         return View(self._board.corners[number], np.round(pixels, 4), lens)  # as in a table
 
 
-def lens_in(info: Any) -> Lens:
-    """Return the lens of a CameraInfo; refuse regions of interest and binning."""
+def lens_in(info: Any, fitted: bool = False) -> Lens:
+    """Return the lens of a CameraInfo, as `lens_of`; refuse regions of interest and binning."""
     matrix, distortion = [[float(x) for x in values] for values in (info.k, info.d)]
     if not any(matrix):
         raise ConfigError('CameraInfo: the camera is not calibrated, k is zero')
     cut = info.roi.x_offset or info.roi.y_offset
     if cut or info.binning_x > 1 or info.binning_y > 1:
         raise ConfigError('CameraInfo: give the whole image, without roi and binning')
-    return lens_of(info.distortion_model or 'plumb_bob', matrix, distortion, 'CameraInfo')
+    model = info.distortion_model or 'plumb_bob'
+    return lens_of(model, matrix, distortion, 'CameraInfo', fitted)
 
 
 def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:

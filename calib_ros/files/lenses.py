@@ -19,15 +19,15 @@ from calib_ros.values import parse_number
 DISTORTION = ('distortion_model', 'distortion_coefficients')
 DISTORTED = ('plumb_bob', 'rational_polynomial')
 DO_INSTEAD = (
-    'calibrate the camera as plumb_bob (k1 k2 p1 p2 k3), or give no distortion and fit the lens '
-    '(--lens fitted)'
+    'calibrate the camera as plumb_bob (k1 k2 p1 p2 k3), or fit the lens (--lens fitted; in '
+    'sources lens=fitted)'
 )
 
 
-def read_lens(path: Path, found: Detections | None = None) -> Lens:
+def read_lens(path: Path, found: Detections | None = None, fitted: bool = False) -> Lens:
     """Read intrinsics as written by camera_calibration or OpenCV, or as plain keys.
 
-    Refuses another image size than that of the corners `found`.
+    Refuses another image size than that of the corners `found`; `fitted` as for `lens_of`.
     """
     text = re.sub('^%YAML:1.0|!!opencv-matrix', '', read_text(path, what='intrinsics '))
     content = parse_yaml(text, str(path))
@@ -40,7 +40,8 @@ def read_lens(path: Path, found: Detections | None = None) -> Lens:
         _require_size(path, content, found)
     matrix = _numbers(content, ('camera_matrix', 'k', 'K'), path)
     distortion = _numbers(content, (DISTORTION[1], 'd', 'D'), path, required=False)
-    return lens_of(content.get('distortion_model', DISTORTED[0]), matrix, distortion, str(path))
+    model = content.get('distortion_model', DISTORTED[0])
+    return lens_of(model, matrix, distortion, str(path), fitted)
 
 
 def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> None:
@@ -60,17 +61,27 @@ def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> 
         )
 
 
-def lens_of(model: str, matrix: Sequence[float], distortion: Sequence[float], where: str) -> Lens:
-    """Return the lens of a camera matrix (9), row by row, and its distortion k1 k2 p1 p2 k3."""
-    if model not in DISTORTED:
-        raise ConfigError(f'{where}: distortion_model {model!r} is not supported: {DO_INSTEAD}')
+def lens_of(
+    model: str,
+    matrix: Sequence[float],
+    distortion: Sequence[float],
+    where: str,
+    fitted: bool = False,
+) -> Lens:
+    """Return the lens of a camera matrix (9), row by row, and its distortion k1 k2 p1 p2 k3.
+
+    Of another distortion one to be `fitted` starts at zero; else it is refused.
+    """
+    other = f'distortion_model {model!r}' * (model not in DISTORTED)
+    if other := other or 'distortion beyond k3' * any(distortion[5:]):
+        if not fitted:
+            raise ConfigError(f'{where}: {other} is not supported: {DO_INSTEAD}')
+        distortion = ()
     if len(matrix) != 9:
         raise ConfigError(f'{where}: camera_matrix must hold 9 numbers, not {len(matrix)}')
     fx, skew, cx, under, fy, cy, *last = matrix
     if skew or under or last != [0.0, 0.0, 1.0] or fx <= 0.0 or fy <= 0.0:
         raise ConfigError(f'{where}: camera_matrix must be [fx 0 cx; 0 fy cy; 0 0 1]')
-    if any(distortion[5:]):
-        raise ConfigError(f'{where}: distortion beyond k3 is not supported: {DO_INSTEAD}')
     distorted: dict[str, Any] = dict(zip(LENS_KINDS[4:], distortion, strict=False))
     return Lens(fx, fy, cx, cy, **distorted)
 
