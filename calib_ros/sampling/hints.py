@@ -211,7 +211,7 @@ def frozen(samples: Sequence[Sample]) -> Hint | None:
     return Hint(
         f'{len(repeated)} poses repeat a position: is the device frozen?',
         f'{len(repeated)} poses repeat a position to the last digit, such as {where} m (does the '
-        'device see the target and send live data?): call ~/clear and measure again',
+        'device see the target and send live data?): measure again (node: ~/clear first)',
         explains=False,
     )
 

@@ -66,7 +66,8 @@ def choose_topics(recorded: Recorded, settings: Settings) -> dict[str, Stream]:
             expected = (source.type,) if source.type else tuple(DECODERS)
             raise _no_topic(f'"{source.topic}"', expected, available)
         if source.board and available.get(source.camera_info) != CAMERA_INFO:
-            raise _no_topic(f'"{source.camera_info}"', (CAMERA_INFO,), available)
+            error = _no_topic(f'"{source.camera_info}"', (CAMERA_INFO,), available)
+            raise InputError(f'{error}; name its topic in sources (info=TOPIC), or record it too')
     if all(source.validation for source in sources):
         error = _no_topic('pose topic', tuple(DECODERS), available)
         raise InputError('; '.join([str(error), *_others(recorded)]))

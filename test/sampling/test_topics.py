@@ -23,7 +23,10 @@ from recorded import (
 )
 
 from calib_ros.errors import ConfigError, InputError
+from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
 from calib_ros.sampling.sources import RANGEFINDER
+from calib_ros.sampling.topics import Recorded, choose_topics
+from calib_ros.settings import Settings
 
 
 def table():
@@ -97,6 +100,16 @@ def test_a_source_without_a_type_has_that_of_its_topic(tmp_path):
         session_of(path, sources=('/camera/image_raw eye_in_hand=true',))
     session, _ = session_of(path, sources=('/tracker', '/wire'))
     assert {sample.device for sample in session.samples} == {'', RANGEFINDER}
+
+
+def test_images_without_their_camera_info_are_refused_with_the_key_for_it():
+    available = {'/joint_states': JOINT_STATE, '/cam/image': PICTURES[0], '/info': CAMERA_INFO}
+    recorded = Recorded(available, lambda streams: iter(()), lambda data, kind: data)
+    source = '/cam/image board=board.yaml'
+    with pytest.raises(InputError, match=r'has no "/cam/camera_info" .* sources \(info=TOPIC\)'):
+        choose_topics(recorded, Settings(sources=(source,)))
+    chosen = choose_topics(recorded, Settings(sources=(f'{source} info=/info',)))
+    assert chosen.keys() == available.keys()
 
 
 def test_a_recording_of_tags_without_their_frames_says_where_those_are(tmp_path):
