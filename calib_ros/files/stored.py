@@ -113,6 +113,10 @@ def salvage(path: Path) -> Salvage | None:
     found = Salvage(recorded_files(path))
     if path.is_dir() and not (path / 'metadata.yaml').exists():
         found.problem = NOT_CLOSED
+        ends = (re.search('_([0-9]{1,9})$', file.stem) for file in found.files)
+        numbers = [int(each[1]) for each in ends if each]
+        if numbers and len(numbers) <= max(numbers) - min(numbers):
+            found.note('a file of it is missing')
     found.count = sum(1 for _ in found.messages())
     return found if found.count else None
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded import (
+    ARM,
     MS,
     STREAMS,
     assert_equal,
@@ -26,7 +27,9 @@ from recorded import (
 from rosbags.rosbag2 import Reader
 
 from calib_ros.errors import InputError
+from calib_ros.files.bags import replay
 from calib_ros.files.recording import write_bag
+from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import STORAGES
 
 
@@ -77,6 +80,7 @@ def test_of_a_split_bag_a_missing_file_is_told(tmp_path, long_bags, storage):
 
 @storages
 def test_the_files_of_a_split_bag_that_was_not_closed_are_in_order(tmp_path, storage):
+    """Which also tell of those between."""
     for k in (0, 9, 10):
         made = recording(20)
         stamps, later = made.poses.stamps_ns, k * 10**11
@@ -88,8 +92,11 @@ def test_the_files_of_a_split_bag_that_was_not_closed_are_in_order(tmp_path, sto
         (tmp_path / 'bag').mkdir(exist_ok=True)
         file.rename(tmp_path / 'bag' / f'bag_{k}{file.suffix}')
         shutil.rmtree(tmp_path / 'part')
-    session, _ = session_of(tmp_path / 'bag')
+    session = CalibrationSession(ARM)
+    found = replay(tmp_path / 'bag', session)
     assert session.account().notes == {}
+    assert found.recorded is None  # so the result is refused
+    assert 'damaged (a file of it is missing): ' in found.warnings[0]
 
 
 @storages
