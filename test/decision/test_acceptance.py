@@ -34,8 +34,8 @@ def test_no_gain_is_claimed_where_there_is_none():
     assert by_chance
 
 
-def test_orientations_may_get_worse_by_half_a_per_cent():
-    """As those of a gantry, which turns no pose: the loss is the same in all poses."""
+def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_the_largest_error():
+    """Worse as those of a gantry, which turns no pose: the loss is the same in all poses."""
     *_, seen = measured_arm(3, 60)
     problem = Problem(UR10E, seen, **SIGMAS)
     result = identify(problem)
@@ -45,6 +45,10 @@ def test_orientations_may_get_worse_by_half_a_per_cent():
         judged = replace(result, validation=replace(held_out, after=after))
         rules = [each.rule for each in refusals(problem, judged, None, False, True)]
         assert rules == [Rule.ORIENTATION] * refused
+    for share, refused in ((1.01, False), (0.99, True)):
+        strict = replace(problem, largest_error=1e-3 * share * held_out.figures[1].rms_mm)
+        rules = [each.rule for each in refusals(strict, result, None, False, True)]
+        assert rules == [Rule.LARGEST_ERROR] * refused
 
 
 def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():

@@ -9,8 +9,11 @@ import pytest
 from test_steps import NOISE, SIGMAS, UR10E, arm, poses
 
 from calib_ros.apply.simulation import measure, random_frame
+from calib_ros.decision import rounding
 from calib_ros.decision.rounding import rounded_joints, rounding_errors
 from calib_ros.estimation.configurations import configurations
+from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.observations import numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify, identify_model
@@ -128,14 +131,15 @@ def test_rounded_joint_values_are_no_gain(design):
     assert found >= 3
 
 
-def test_what_rounding_gives_to_the_zero_of_a_joint(rng):
+@pytest.mark.parametrize('step', [5e-3, 1e-3, 5e-4, 1e-4, *np.deg2rad([0.2, 0.05, 0.01])])
+def test_what_rounding_gives_to_the_zero_of_a_joint(step, rng):
     """A value that most poses share hardly averages out."""
     q = UR10E.random_joints(40, rng)
-    q[:, 1], q[:, 2] = np.round(q[:, 1], 3), np.repeat([0.0, 1e-3, 5e-3], [20, 10, 10])
+    q[:, 1], q[:, 2] = step * np.round(q[:, 1] / step), step * np.repeat([0, 1, 3], [20, 10, 10])
     problem = Problem(UR10E, measure(UR10E, q, rng))
     steps = rounded_joints(problem)
-    assert steps == {'shoulder_lift_joint': 1e-3, 'elbow_joint': 1e-3}
-    one = 1e-3 / np.sqrt(12.0)
+    assert steps == {'shoulder_lift_joint': step, 'elbow_joint': step}
+    one = step / np.sqrt(12.0)
     assert rounding_errors(problem, steps) == pytest.approx(
         {
             'shoulder_lift_joint.theta': one / np.sqrt(40.0),
@@ -151,6 +155,32 @@ def test_levels_of_a_lattice_are_no_rounding(rng):
     q[:, :3] = levels[np.arange(3), np.indices((3, 3, 3)).reshape(3, -1).T]
     problem = Problem(UR10E, measure(UR10E, q, rng))
     assert rounded_joints(problem) == {'elbow_joint': 1e-3}
+
+
+def test_whether_rounding_explains_the_gain_is_an_f_test(rng, monkeypatch):
+    """Of rows whitened by the noise and the error that poses of equal joint value share."""
+    told = []
+    monkeypatch.setattr(rounding, 'chance_of', lambda *given: told.append(given) or 0.0)
+    true, q = arm(rng), UR10E.random_joints(40, rng)
+    level = rng.integers(5, size=40)
+    q[:, 2] = 0.3 * level
+    problem = Problem(UR10E, measure(true, q, rng, *NOISE), **SIGMAS)
+    before = replace(UR10E, base=true.base, tool=true.tool)
+    fitted = fit(problem)[2]
+    rounding.may_be_rounding(fitted, before, {'elbow_joint': 1e-3})
+    frames = [name for name in fitted.names if before.owns_frame(name)]
+    own = [name for name in fitted.names if name not in frames]
+    parts = problem.system(problem.sets).rows_of(before, [*frames, *own])
+    rows, level = stacked(parts), level[owners(parts)]
+    shared = rows[:, [[*frames, *own].index('elbow_joint.theta')]] * 1e-3 / np.sqrt(12.0)
+    covariance = np.eye(len(rows)) + shared @ shared.T * (level == level[:, np.newaxis])
+    white = np.linalg.solve(np.linalg.cholesky(covariance), rows)
+    fewer, every = (
+        np.linalg.lstsq(white[:, :count], white[:, -1])[1][0] for count in (len(frames), -1)
+    )
+    freedom = len(rows) - len(fitted.names)
+    found = (fewer - every) / every * freedom
+    assert told == [(pytest.approx(found, rel=1e-5), len(own), freedom)]
 
 
 def test_a_joint_that_moves_in_outliers_only_is_named(rng):
