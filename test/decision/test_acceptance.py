@@ -3,14 +3,17 @@
 """Nothing is accepted that does not make the arm better."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fits import SIGMAS, UR10E, measured_arm
+from scipy import stats
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision.acceptance import oddities, refusals
+from calib_ros.decision.acceptance import _loss_by_chance, oddities, refusals
 from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.levels import CERTAIN
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain
@@ -49,6 +52,15 @@ def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_t
         strict = replace(problem, largest_error=1e-3 * share * held_out.figures[1].rms_mm)
         rules = [each.rule for each in refusals(strict, result, None, False, True)]
         assert rules == [Rule.LARGEST_ERROR] * refused
+
+
+def test_the_loss_by_chance_is_that_of_a_paired_t_test(rng):
+    errors = rng.normal(size=(2, 30, 3)) * np.where(np.arange(30) == 7, 20.0, 1.0)[:, np.newaxis]
+    before, after = (SimpleNamespace(position=e, configurations=np.arange(30)) for e in errors)
+    judged = SimpleNamespace(counting=np.arange(30) > 3, before=before, after=after)
+    old, new = (errors[:, 4:] ** 2).sum(axis=2)
+    low, high = stats.ttest_rel(old, new).confidence_interval(2.0 * CERTAIN - 1.0)
+    assert _loss_by_chance(judged) == pytest.approx(0.25 * (high - low) / old.mean())
 
 
 def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():

@@ -15,6 +15,7 @@ from calib_ros.estimation.leastsquares import Prior, System, minimise, stacked, 
 from calib_ros.estimation.noise import noise_of
 from calib_ros.estimation.samples import Samples
 from calib_ros.estimation.shared_errors import Shared
+from calib_ros.estimation.unmodelled import _variances
 
 NAMES = [*(name for name in UR10E.parameter_names if UR10E.owns_frame(name)), 'elbow_joint.theta']
 
@@ -131,3 +132,15 @@ def test_a_part_with_less_than_one_degree_of_freedom_tells_its_noise():
     assert freedom[least] == pytest.approx(0.5, abs=1e-3)
     expected = tuple(np.sqrt(squares / freedom))
     assert (noise.position, noise.orientation) == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_noise_of_either_part_is_told_from_the_products_of_rows(rng):
+    """Whatever the parameters: what they explain is no noise."""
+    products = []
+    for size in (0.5, 3.0):
+        columns = rng.normal(size=(2000, 4))
+        rows = np.column_stack([columns, columns @ [9.0, -5.0, 2.0, 7.0]])
+        rows[:, -1] += rng.normal(scale=size, size=2000)
+        products.append(rows.T @ rows)
+    found = _variances(np.array(products), np.zeros(4), np.full(4, 1e-9), np.array([2000, 2000]))
+    np.testing.assert_allclose(np.sqrt(found), [0.5, 3.0], rtol=0.05)
