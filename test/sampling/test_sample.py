@@ -27,6 +27,8 @@ def test_the_first_that_comes_needs_no_name():
     assert frames.of(labelled('t', 'other', 'ball', False)) == ('base_t_other', 'tool_t')
     assert frames.of(labelled('s', 'camera', 'board', True)) == ('base_board', 'tool_camera')
     assert frames.of(labelled('s', '', '', False)) == ('base_4', 'tool_4')
+    known = Frames(frames.owners)
+    assert known.of(labelled('t', 'tracker', 'ball', False)) == ('base_t', 'tool_t')
 
 
 def test_no_socket_and_no_plane_is_the_first():
