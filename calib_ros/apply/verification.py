@@ -257,9 +257,9 @@ def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tup
         return float(lower), float(upper)
 
     squares = np.trace(moments, axis1=1, axis2=2)
-    every, before, sums = np.arange(len(squares)), np.arange(1, len(squares)), np.cumsum(squares)
-    after = before[::-1]
-    sizes = np.log(sums[:-1] / before), np.log((sums[-1] - sums[:-1]) / after)
+    every, before = np.arange(len(squares)), np.arange(1, len(squares))
+    after, sums = before[::-1], (np.cumsum(squares)[:-1], np.cumsum(squares[::-1])[-2::-1])
+    sizes = np.log(sums[0] / before), np.log(sums[1] / after)
     moment = 1 + int(np.argmin(before * sizes[0] + after * sizes[1]))
     outliers = np.flatnonzero(squares > OUTLIER**2 * np.median(squares))
     sides = [each for each in (every[:moment], every[moment:]) if limits(each)[0] > limit]

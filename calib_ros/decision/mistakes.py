@@ -29,14 +29,22 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
 from calib_ros.decision.trials import Bare, Trial, in_frames, refined, trial_of
-from calib_ros.estimation.levels import ALIKE, CONFIDENT, MOST_OUTLIERS, NEARER, SEVERAL, TRIED
+from calib_ros.estimation.levels import (
+    ALIKE,
+    CLEARLY,
+    CONFIDENT,
+    MOST_OUTLIERS,
+    NEARER,
+    SEVERAL,
+    TRIED,
+)
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import norms
+from calib_ros.kinematics.se3 import Flags, norms
 from calib_ros.settings import LEVER
 
 
@@ -132,6 +140,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         or _of_a_lost_row(problem, chain, sets, given)
         or _named(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
+        or _beyond(problem, sets)
         or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
@@ -147,8 +156,23 @@ def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
     sets = [each for each in problem.all_sets if each.pixels is None]
     errors = [norms(residuals(chain, each).position) for each in sets]
-    far = [np.flatnonzero(each > problem.largest_error) for each in errors]
-    parts = [each.select(rows) for each, rows in zip(sets, far, strict=True) if len(rows)]
+    return _alone(problem, sets, [each > problem.largest_error for each in errors])
+
+
+def _beyond(problem: Problem, sets: Sets) -> Explained | None:
+    """Return what explains the measurements clearly further away than all others."""
+    sizes = [norms(each.positions) for each in sets]
+    order = np.sort(np.concatenate(sizes))
+    gaps = order[1:] > CLEARLY * order[:-1]
+    least = order[:-1][gaps].max() if gaps.any() else np.inf
+    return _alone(problem, sets, [each > least for each in sizes])
+
+
+def _alone(
+    problem: Problem, sets: Sequence[Observations], far: Sequence[Flags]
+) -> Explained | None:
+    """Return what explains some measurements (N,) of each set."""
+    parts = [each.select(np.flatnonzero(k)) for each, k in zip(sets, far, strict=True) if k.any()]
     if not parts:
         return None
     found = explained(

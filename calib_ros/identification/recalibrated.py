@@ -16,7 +16,9 @@ from calib_ros.decision.steps import Step
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import reused_in_words
+from calib_ros.settings import Settings
 from calib_ros.shown import Shown
+from calib_ros.values import SAME
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,7 +58,8 @@ class Recalibration(Shown):
     @property
     def accepted(self) -> bool:
         """Tell whether the result may be used."""
-        agrees = self.after.rms_mm <= ALIKE * self.before.rms_mm
+        most = max(ALIKE * self.before.rms_mm, 1e3 * SAME)  # simulated without noise
+        agrees = self.after.rms_mm <= min(most, 1e3 * Settings.largest_error)
         fits = self.unexplained > changes.FALSE and agrees
         return fits and self.determined and not (self.reused or self.scale)
 

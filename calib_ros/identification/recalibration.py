@@ -44,7 +44,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
-from calib_ros.values import require
+from calib_ros.values import SAME, require
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -67,21 +67,22 @@ def recalibrate(
 
     The poses are new, between frames of the calibration; the problem has their noise. Since then
     `years` have passed. `growth` is the standard deviation [m] of the drift of lengths in a year;
-    of angles twice that [rad]. `new` are frames of moved devices and of remounted targets.
-
-    Raises InputError if the calibration has no covariance, or does not know a frame, or if a
-    mistake explains the poses.
+    of angles twice that [rad]. `new` are frames of moved devices and of remounted targets. Raises
+    InputError if the calibration has no covariance or lacks a frame, or for a mistake.
     """
     require(Calibration, previous=previous)
     if mistake := mistakes.explained(problem, far=True):
         raise InputError(f'the new poses do not fit the arm at all: {mistake}')
-    found, arm = _recalibrated(previous, problem, years, growth, new)
+    try:
+        found, arm = _recalibrated(previous, problem, years, growth, new)
+    except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
+        raise InputError('the new poses do not fit the arm at all: check their units') from error
     if found.accepted or found.reused or found.scale is not None:
         return found
     for number, pose, rest in _without_one(problem, arm):
         try:
             others, _ = _recalibrated(previous, rest, years, growth, new)
-        except (np.linalg.LinAlgError, InputError):  # too few
+        except (np.linalg.LinAlgError, FloatingPointError, InputError):  # too few
             continue
         chain = others.calibration.chain
         away = residuals(chain, problem.all_sets[number]).position[pose]
@@ -116,13 +117,13 @@ def _without_one(problem: Problem, chain: Chain) -> Iterator[tuple[int, int, Pro
         yield number, pose, without
 
 
+@np.errstate(over='raise', invalid='raise')
 def _recalibrated(
     previous: Calibration, problem: Problem, years: float, growth: float, new: Sequence[str]
 ) -> tuple[Recalibration, Chain]:
     """Return the recalibration, and the earlier arm in new frames."""
     sets = problem.all_sets
-    arm = _Arm.of(previous, sets, years, growth)
-    system = _system(problem, sets, previous)
+    arm, system = _Arm.of(previous, sets, years, growth), _system(problem, sets, previous)
     # corrected axes are never quite parallel
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
     free = (frame for frame in new if not arm.chain.frame(frame).fixed)
@@ -131,9 +132,8 @@ def _recalibrated(
     names = [name for name in arm.names if name in own or name in shown]
     anywhere = np.isin(arm.names, names) * 10.0  # m, rad
     if names:
-        kept = anywhere == 0.0
+        chain, kept = in_new_frames(problem, arm.chain, new, system), anywhere == 0.0
         square = arm.square * np.outer(kept, kept) + np.diag(anywhere**2)
-        chain = in_new_frames(problem, arm.chain, new, system)
         arm = replace(arm, chain=chain, square=square)
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
@@ -334,7 +334,8 @@ def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
             turned = noise.orientation if name == 'sigma_orientation' else None
             ratio = turned or noise.position
         lacking = then * np.sqrt(max(ratio**2 - 1.0, 0.0))
-        found[name] = np.hypot(sigma * (min(ratio, 1.0) if sigma == then else 1.0), lacking)
+        least = sigma * (min(ratio, 1.0) if sigma == then else 1.0)
+        found[name] = max(np.hypot(least, lacking), SAME)  # simulated without noise
     return found
 
 
@@ -356,8 +357,7 @@ def _judged(
         rest = Information(arm.names, matrix, products[:-1, -1] + matrix @ found.change)
         chains.append((arm.changed(*rest.mean(frames)), arm.changed(*rest.mean(arm.root))))
     before, after = left_out(chains, sets, groups, folds)
-    every = np.ones(len(before.position), dtype=bool)
-    return Comparison(before, after, every)
+    return Comparison(before, after, np.ones(len(before.position), dtype=bool))
 
 
 def _updated(

@@ -189,7 +189,8 @@ def verdict(
     """
     nominal, now = found.figures
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    text += f'{now.count} poses measured since; the nominal chain has {nominal.rms_mm:.3f} mm'
+    since = f'{now.count} pose{"s" * (now.count != 1)} measured since'
+    text += f'{since}; the nominal chain has {nominal.rms_mm:.3f} mm'
     limit = calibration.limit(sets)
     if limit is None:
         text = f'no verdict, the calibration has no former error: {text}'
@@ -199,7 +200,7 @@ def verdict(
         return 'does not hold', NO_LONGER_HOLDS.format(text, 1e3 * limit)
     text += f'; the limit is {1e3 * limit:.3f} mm'
     if warning := reused_in_words(reused):
-        text = f'RMS {now.rms_mm:.3f} mm on {now.count} poses measured since'
+        text = f'RMS {now.rms_mm:.3f} mm on {since}'
         return 'no verdict', f'no verdict: {warning}; {text}'
     if most > limit:
         text = f'too few poses to tell whether the calibration holds: {text}; measure more'

@@ -68,7 +68,9 @@ def test_a_single_pose_does_not_prove_that_it_holds(rms_mm, says):
     away = np.array([[1e-3 * rms_mm, 0.0, 0.0]])
     off = Residuals(away, np.nan * away, np.arange(1), np.nan * away)
     both = Comparison(off, off, np.ones(1, bool))
-    assert verdict(Calibration(arm, arm, residual=1e-4), both)[0] == says
+    told = verdict(Calibration(arm, arm, residual=1e-4), both)
+    assert told[0] == says
+    assert 'on 1 pose measured since' in told[1]
 
 
 @pytest.mark.parametrize(('bumped', 'verdict'), [(0.0, 'holds'), (5e-3, 'does not hold')])

@@ -1,0 +1,58 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A part of the positions in mm, and calibrations simulated without noise."""
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E
+
+from calib_ros import Calibration, Problem, identify, recalibrate
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.errors import InputError
+
+TRUE = faulty(UR10E, Cell(), np.random.default_rng(4))
+
+
+def seen(count, noise=NOISE, in_mm=0, true=TRUE, **sigmas):
+    rng = np.random.default_rng(count)
+    measured = measure(true, UR10E.random_joints(count, rng), rng, *noise)
+    positions = measured.positions.copy()
+    positions[:in_mm] *= 1e3
+    return Problem(UR10E, replace(measured, positions=positions), **sigmas)
+
+
+@pytest.fixture(scope='module')
+def earlier():
+    """Return a calibration, and one simulated without noise."""
+    first = seen(60, **SIGMAS), seen(60, (0.0, 0.0))
+    return [Calibration.of(identify(each)) for each in first]
+
+
+def test_half_a_table_in_mm_is_named():
+    """It was refused for its errors alone."""
+    found = identify(seen(40, in_mm=20, **SIGMAS))
+    assert 'in 20 of 40 measurements alone, the positions are in mm' in str(found.refusals[0])
+
+
+@pytest.mark.parametrize('without_noise', [False, True])
+def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
+    there = replace(TRUE, base=random_frame(np.random.default_rng(1), 2.0))
+    few = seen(15, in_mm=7, true=there)
+    with pytest.raises(InputError, match='in 7 of 15 measurements alone, the positions are in mm'):
+        recalibrate(earlier[without_noise], few, 0.1, new=('base',))
+
+
+@pytest.mark.parametrize('new', [(), ('base', 'tool')])
+@pytest.mark.parametrize('without_noise', [False, True])
+def test_two_positions_in_mm_update_nothing(earlier, without_noise, new):
+    """Between new frames the arm was moved by kilometres, or a traceback came."""
+    few = seen(10, in_mm=2)
+    with suppress(InputError):  # check their units
+        assert not recalibrate(earlier[without_noise], few, 0.1, new=new).accepted
+
+
+def test_a_calibration_simulated_without_noise_is_updated(earlier):
+    assert recalibrate(earlier[1], seen(8, (0.0, 0.0)), 0.1).accepted
