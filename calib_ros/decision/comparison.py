@@ -182,7 +182,7 @@ def joined(
 
 def mean_squares(before: FloatArray, after: FloatArray, configurations: Index) -> FloatArray:
     """Return the mean squared errors (2, K) of K configurations, for errors (N, 3) of pairs."""
-    squares = np.stack([(before**2).sum(axis=1), (after**2).sum(axis=1)])
+    squares = np.stack([norms(before), norms(after)]) ** 2
     known = ~np.isnan(squares).any(axis=0)
     group = successive(configurations[known])
     return np.stack([np.bincount(group, row) for row in squares[:, known]]) / np.bincount(group)

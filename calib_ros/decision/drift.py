@@ -25,7 +25,7 @@ from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.samples import summed
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index, norms
 
 SLOW = SEVERAL
 """Cosines removed from a series at most, one per ten stops (benchmarks/drift.py)."""
@@ -50,15 +50,18 @@ class Shifts:
             begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
             self._stops.append((begins, _weights(seen, begins)))
         count = min(SHIFTS, 2 * max(len(begins) for begins, _ in self._stops))
-        windows = []
+        windows, self._energy = [], np.zeros(count)
         for stops, residual in zip(self._stops, residuals, strict=True):
             series = _by_stop(residual, *stops)
+            length = series.shape[1]
             circle = np.concatenate([series, series[:, ::-1], series], axis=1)
-            every = sliding_window_view(circle, series.shape[1], axis=1).swapaxes(0, 1)
-            starts = (np.arange(count) / count * 2 * series.shape[1]).astype(int)
-            windows.append(_detrended(every[starts]).reshape(count, -1))
-        self._shifted = np.concatenate(windows, axis=1)
-        self._energy = (self._shifted**2).sum(axis=1)
+            every = sliding_window_view(circle, length, axis=1).swapaxes(0, 1)
+            starts = (np.arange(count) / count * 2 * length).astype(int)
+            moved = every[starts].reshape(-1, length)
+            slow = moved @ slow_cosines(length).T
+            windows.append(moved := moved.reshape(count, -1))
+            self._energy += norms(moved) ** 2 - norms(slow.reshape(count, -1)) ** 2
+        self._shifted = np.concatenate(windows, axis=1)  # columns lack the slowest part
 
     def columns(self, columns: Iterable[Sequence[FloatArray]]) -> ShiftProducts:
         """Return the products of weighted columns, (P, c, N) for each set, in one or more lots."""
@@ -66,11 +69,12 @@ class Shifts:
         for lot in columns:
             parts = []
             for stops, column in zip(self._stops, lot, strict=True):
-                whole = _by_stop(column, *stops)
-                series = _detrended(whole)
-                size, left = (np.linalg.norm(each, axis=(1, 2)) for each in (whole, series))
-                series[left <= HALF_THE_DIGITS * size] = 0.0  # rounding
-                parts.append(series.reshape(len(series), -1))
+                series = _by_stop(column, *stops)
+                flat, slow = series.reshape(-1, series.shape[-1]), slow_cosines(series.shape[-1])
+                whole = norms(series.reshape(len(series), -1))
+                rest = (flat - flat @ slow.T @ slow).reshape(len(series), -1)
+                rest[norms(rest) <= HALF_THE_DIGITS * whole] = 0.0  # rounding
+                parts.append(rest)
             rows.append(np.concatenate(parts, axis=1))
         every = np.concatenate(rows)
         return every @ every.T, every @ self._shifted.T
@@ -132,12 +136,6 @@ def slow_cosines(length: int) -> FloatArray:
     order = np.arange(1 + min(SLOW, length // 10))
     waves = np.cos(np.pi * np.outer(order, (np.arange(length) + 0.5) / length))
     return np.asarray(waves / np.linalg.norm(waves, axis=1, keepdims=True))
-
-
-def _detrended(series: FloatArray) -> FloatArray:
-    """Return series (..., n) without their constant and slowest cosines."""
-    slow, flat = slow_cosines(series.shape[-1]), series.reshape(-1, series.shape[-1])
-    return np.asarray((flat - flat @ slow.T @ slow).reshape(series.shape))
 
 
 def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:

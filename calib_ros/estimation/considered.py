@@ -25,7 +25,7 @@ from calib_ros.estimation.joint_errors import NOTHING, Unmodelled, moving
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import LARGEST_SCALE, OUT_OF_SCALE, PRINTED, SCALE
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.samples import Samples, gram
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_PIXELS, Parameter, parameters_of
@@ -166,8 +166,7 @@ def _products(chain: Chain, columns: Sequence[str], system: System, doubts: Doub
             for number, rows in enumerate(parts):
                 more = [unmodelled.columns(chain, columns, joints, rows)[-waves:]] if waves else []
                 bent = [bend[:, :, block]] if number == 0 else []  # distortion does not turn
-                flat = [each.reshape(len(each), rows[0].size) for each in (rows, *more, *bent)]
-                products = np.block([[one @ other.T for other in flat] for one in flat])
+                products = gram(np.concatenate([rows, *more, *bent]))
                 found[: len(products), : len(products)] += products
     return found
 

@@ -243,9 +243,9 @@ def csv_blocks(
             line = reader.line_num
             if any(row):
                 block.append((above + line, row))
-            if len(row) > MOST_ENTRIES:
-                raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
             if len(block) * len(row) >= MOST_ENTRIES:  # cells that fit the caches
+                if len(row) > MOST_ENTRIES:
+                    raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
                 yield block
                 block = []
     except csv.Error as err:
@@ -260,8 +260,8 @@ def csv_blocks(
 def _numbers(text: str, decimal: str = '.') -> FloatArray:
     """Return the numbers (N,) in joined cells, NaN if blank, infinity if there is none.
 
-    They are read in parts: numpy takes four bytes for a character. Points between thousands are
-    no decimals: 1.554 beside decimal commas is no number.
+    They are read in parts that fit the caches: numpy takes four bytes for a character. Points
+    between thousands are no decimals: 1.554 beside decimal commas is no number.
     """
     if decimal == ',' and '.' in text:
         cells = text.split(BETWEEN)
@@ -272,7 +272,7 @@ def _numbers(text: str, decimal: str = '.') -> FloatArray:
         return np.full(text.count(BETWEEN) + 1, np.nan)
     found, begin = [], 0
     while begin <= len(text):
-        end = text.find(BETWEEN, begin + MOST_ENTRIES**2)
+        end = text.find(BETWEEN, begin + 100 * MOST_ENTRIES)
         part = text[begin : end if end >= 0 else None]
         begin += len(part) + 1
         try:  # a line of numbers, behind one because no line may be empty

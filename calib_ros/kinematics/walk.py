@@ -19,8 +19,9 @@ import numpy as np
 
 from calib_ros.kinematics.se3 import Flags, FloatArray, cos_sin
 
-BLOCK = 2048
-"""Samples per operation: their arrays fit the caches (benchmarks/peers.py)."""
+BLOCK = 2000
+"""Samples per operation: their arrays fit the caches (benchmarks/peers.py), where rows a power of
+two apart would compete for the same places."""
 
 
 class Walk:
