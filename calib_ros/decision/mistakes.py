@@ -6,8 +6,8 @@ If the nominal arm misses the measurements by more than faulty arms do, each sus
 undone in some samples or in the chain, and base and tool are refitted in closed form (`start.py`);
 the best few are refined by least squares. A mistake is named if undoing it reduces the typical
 error below NEARER times the original and to that of a faulty arm; so are those that explain nearly
-as much. If none does, the positions are tried without the orientations, then several mistakes at
-once.
+as much. If none does, the positions are tried without the orientations, then parts of the rows
+alone, then several mistakes at once.
 
 The typical error is the median over the samples of the distance plus the angle times LEVER.
 Mistakes without effect cannot be detected: the zero of the first joint is a rotation of the base,
@@ -178,8 +178,18 @@ def _alone(
     found = explained(
         replace(problem, observations=parts[0], more=tuple(parts[1:]), held_out=None), far=True
     )
-    where = f'in {sum(map(len, parts))} of {sum(map(len, sets))} measurements alone, '
-    return found and replace(found, where=found.where or where)
+    few, every = (sum(map(len, some)) for some in (parts, sets))
+    if found is None or few == every:
+        return found
+    return _of_a_part(problem, found, found.where or f'in {few} of {every} measurements alone, ')
+
+
+def _of_a_part(problem: Problem, found: Explained, where: str) -> Explained:
+    if problem.of_messages:
+        return replace(found, where=where)
+    alike = 'write them as the others ({} reads them)'
+    named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
+    return replace(found, suspects=tuple(named), where=where)
 
 
 def _unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
@@ -264,10 +274,11 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
         return None
     ends = {'first third of the rows': rows < third, 'last third of the rows': rows >= 2 * third}
     turns = {'odd rows': rows % 2 == 0, 'even rows': rows % 2 == 1}
+    largest = min(_largest(problem), NEARER * given.error)
     for halves in (ends, turns):
         parts = [whole.select(part) for part in halves.values()]
         trials = [in_frames(problem, chain, (part,)) for part in parts]
-        fits = [each is not None and each.error <= _largest(problem) for each in trials]
+        fits = [each is not None and each.error <= largest for each in trials]
         if all(fits) and halves is turns:
             remedy = 'name them in a column session, and identify each alone (--session)'
             two = Suspect(
@@ -278,11 +289,7 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
             return Explained((two,), given.error, np.nan)
         for fit, name, part, trial in zip(fits[::-1], halves, parts, trials, strict=True):
             if fit and trial is not None and (found := _named(problem, chain, (part,), trial)):
-                these = [
-                    replace(each, remedy=f'write them as the others ({each.remedy} reads them)')
-                    for each in found.suspects
-                ]
-                return replace(found, suspects=(*these,), where=f'in the {name} alone, ')
+                return _of_a_part(problem, found, f'in the {name} alone, ')
     return None
 
 

@@ -53,11 +53,14 @@ def test_rows_that_are_not_like_the_others_are_named():
     one, other = (measure(faulty(arm, Cell(), rng), q, rng, 5e-5, oriented=False) for _ in '12')
     rows = np.arange(50)[:, np.newaxis]
     mixed = replace(one, positions=np.where(rows % 2, one.positions, other.positions))
+    assert explained(Problem(arm, one)) is None
     found = explained(Problem(arm, mixed))
     assert str(found).startswith('odd and even rows are of two arms, or of two devices or targets')
     for part, where in ((rows < 22, 'first'), (rows >= 27, 'last')):
-        spoilt = replace(one, positions=np.where(part, 1e3 * one.positions, one.positions))
+        spoilt = replace(one, joints=np.where(part, np.rad2deg(q), q))
         found = explained(Problem(arm, spoilt))
         assert found.where == f'in the {where} third of the rows alone, '
-        assert found.suspects[0].remedy == 'write them as the others (--length mm reads them)'
+        assert (
+            found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
+        )
         assert found.corrected < 0.01

@@ -35,6 +35,7 @@ def test_half_a_table_in_mm_is_named():
     """It was refused for its errors alone."""
     found = identify(seen(40, in_mm=20, **SIGMAS))
     assert 'in 20 of 40 measurements alone, the positions are in mm' in str(found.refusals[0])
+    assert 'write them as the others (--length mm reads them)' in str(found.refusals[0])
 
 
 @pytest.mark.parametrize('without_noise', [False, True])

@@ -250,7 +250,7 @@ def test_other_joints_and_names_of_the_robot(tmp_path):
 def test_nothing_is_corrected_without_a_calibration(cell, corrected):
     logged = cell.log()
     said = send(cell, trajectory(path(5)[0]))
-    assert 'refused: there is no accepted calibration' in said
+    assert 'refused: no accepted calibration' in said
     cell.spin_until(lambda: any(f'trajectory {said}' == each.msg for each in logged))
     assert not corrected
 

@@ -213,7 +213,7 @@ def test_a_saved_calibration_is_loaded_and_judged_on_new_samples(tmp_path, recor
     with Cell(**parameters) as cell:
         cell.play(topics(recording))
         cell.done('identify')
-        assert 'measure some new poses' in cell.refused('validate').message
+        assert 'measure some new ones' in cell.refused('validate').message
         cell.done('save')
         chain = cell.node.session.calibration.chain
     with Cell(**parameters) as cell:
