@@ -229,8 +229,10 @@ def likelier(
         return changed
     given = [reasons[0].names for reasons in changed]
     single = [(name,) for name in columns.zeros]
-    tried = [given, [columns.zeros]]
+    tried = [given]
     tried += [list(some) for k in range(2, SEVERAL + 1) for some in combinations(single, k)]
+    if len(single) > SEVERAL:  # of fewer all are among these
+        tried.append([columns.zeros])
 
     def likely(causes: Sequence[Sequence[Parameter]]) -> float:
         count = SEVERAL + 1 if causes == [columns.zeros] else len(causes)

@@ -11,6 +11,7 @@ from fits import NOISE, SCARA, SIGMAS, UR10E, rms
 from calib_ros import Calibration, Problem, difference, identify, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
+from calib_ros.kinematics.chain import Chain, Joint
 
 ALL = np.radians([0.1, -0.15, 0.08, 0.2, -0.12, 0.05])
 
@@ -82,6 +83,15 @@ def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show():
         for k, arm in enumerate((true, slipped(true, [1e-3, 2e-3, 1e-3, -2e-3])))
     )
     assert owners(difference(first, second).changed) == [{'elbow'}]
+
+
+def test_two_calibrations_of_an_arm_without_a_zero_of_its_own():
+    """Beside free frames an arm of two joints has none."""
+    arm = Chain('two', 'standard', (Joint('j1', a=0.4, alpha=1.5, d=0.2), Joint('j2', a=0.3)))
+    true = faulty(arm, Cell(), np.random.default_rng(3))
+    pair = enumerate((true, true.with_offsets({'j1.a': 2e-3})))
+    first, second = (Calibration.of(identify(seen(now, 50, k, chain=arm))) for k, now in pair)
+    assert owners(difference(first, second).changed) == [{'j1'}]
 
 
 @pytest.mark.parametrize('count', [6, 8])
