@@ -30,8 +30,9 @@ class Recalibration(Shown):
     new poses by the earlier calibration, and predicted from the other poses; both in new frames by
     the others. `known_before` and `known_after` are the RMS uncertainty [m] of positions over the
     joint range, `moved` is their change. `reused` is the share of poses that the earlier
-    calibration was fitted to: they would count twice. `odd` names a pose without which the others
-    would be accepted, `step` tells what moved while they were measured.
+    calibration was fitted to: they would count twice. `fitted_mm` is the RMS error of the new
+    poses by the updated one. `odd` names a pose without which the others would be accepted, `step`
+    tells what moved while they were measured.
     """
 
     calibration: Calibration
@@ -42,6 +43,7 @@ class Recalibration(Shown):
     known_after: float
     moved: float
     reused: float = 0.0
+    fitted_mm: float = 0.0
     odd: str = ''
     step: Step | None = None
 
@@ -69,9 +71,8 @@ class Recalibration(Shown):
 
         About as well as before, or far better than it changed.
         """
-        after, residual = self.after.rms_mm, 1e3 * (self.calibration.residual or np.inf)
-        most = self.before.rms_mm if self.changed else CLEARLY * residual
-        confirmed = after < most
+        usual = max(1e3 * (self.calibration.residual or np.inf), self.fitted_mm)
+        confirmed = self.after.rms_mm < (self.before.rms_mm if self.changed else CLEARLY * usual)
         known = self.known_after <= max(ALIKE * self.known_before, self.moved / CLEARLY)
         return confirmed and known
 

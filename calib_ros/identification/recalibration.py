@@ -24,7 +24,7 @@ import numpy as np
 
 from calib_ros.decision import changes, mistakes
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Effects, Explanation, Information, root_of
-from calib_ros.decision.comparison import Comparison, residuals
+from calib_ros.decision.comparison import Comparison, compare, residuals
 from calib_ros.decision.validation import left_out
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
@@ -155,13 +155,15 @@ def _recalibrated(
         found = arm.solved(system)
     expected, _ = found.information.mean(root_of(arm.doubted))
     left = found.squares - float(found.information.vector @ expected)
+    updated = _updated(arm, found, problem, changed)
     result = Recalibration(
-        _updated(arm, found, problem, changed),
+        updated,
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
         _judged(arm, np.diag(anywhere), found, system, sets),
         *_known(arm, then.square, found),
         previous.reused(sets),
+        compare(earlier, updated.chain, sets).figures[1].rms_mm,
     )
     return result, earlier
 
@@ -183,11 +185,8 @@ def _may_be_scaled(chain: Chain, sets: Sequence[Observations]) -> bool:
     No parameter stretches the travel of prismatic joints.
     """
     base, *others = {each.base for each in sets}
-    if (
-        others
-        or chain.frame(base).fixed
-        or any(joint.type != 'revolute' for joint in chain.joints)
-    ):
+    linear = any(joint.type != 'revolute' for joint in chain.joints)
+    if others or linear or chain.frame(base).fixed:
         return False
     return all(
         each.distances is None and each.pixels is None and not (each.socket or each.inverse)

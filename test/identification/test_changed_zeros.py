@@ -16,10 +16,11 @@ from calib_ros.kinematics.chain import Chain, Joint
 ALL = np.radians([0.1, -0.15, 0.08, 0.2, -0.12, 0.05])
 
 
-def seen(true, count, seed, oriented=True, chain=UR10E):
+def seen(true, count, seed, oriented=True, chain=UR10E, worse=1.0):
     rng = np.random.default_rng(seed)
-    measured = measure(true, chain.random_joints(count, rng), rng, *NOISE, oriented)
-    return Problem(chain, measured, **SIGMAS)
+    noise = (worse * sigma for sigma in NOISE)
+    measured = measure(true, chain.random_joints(count, rng), rng, *noise, oriented)
+    return Problem(chain, measured, **{name: worse * sigma for name, sigma in SIGMAS.items()})
 
 
 @pytest.fixture(scope='module', params=[True, False])
@@ -92,6 +93,17 @@ def test_two_calibrations_of_an_arm_without_a_zero_of_its_own():
     pair = enumerate((true, true.with_offsets({'j1.a': 2e-3})))
     first, second = (Calibration.of(identify(seen(now, 50, k, chain=arm))) for k, now in pair)
     assert owners(difference(first, second).changed) == [{'j1'}]
+
+
+@pytest.mark.parametrize('new', [(), ('base',)])
+@pytest.mark.parametrize('count', [8, 20])
+def test_a_device_of_ten_times_the_noise_shows_where_frames_are(earlier, new, count):
+    """The others predict a pose as well as it fits, if not as well as earlier ones did."""
+    true, previous, oriented = earlier
+    found = recalibrate(previous, seen(true, count, 7, oriented, worse=10.0), 0.1, new=new)
+    assert found.after.rms_mm > 5e3 * previous.residual
+    assert found.accepted
+    assert not found.changed
 
 
 @pytest.mark.parametrize('count', [6, 8])
