@@ -34,7 +34,7 @@ from scipy.spatial.distance import cdist
 from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
-from calib_ros.estimation.samples import gram, summed
+from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, cos_sin
 from calib_ros.values import LARGEST
@@ -281,10 +281,11 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
         count = np.diff([*begins, len(numbers)]).astype(float)
         for part, width in zip(parts, widths, strict=True):
             part.append(np.zeros((len(names) + 1, width, len(begins))))
-        blocks = zip(*few.parts(chain, names), strict=True)
-        for (*_, rows), whole in zip(parts, blocks, strict=False):  # one part if whitened
-            added = summed(np.concatenate(whole, axis=2), begins)
-            rows[:, : added.shape[1]] = added / np.sqrt(count)
+        for index, block in few.sums(chain, names, numbers):
+            first = int(np.searchsorted(numbers[begins], index[0]))  # one stop may span blocks
+            stops = slice(first, first + len(index))
+            for (*_, rows), added in zip(parts, block, strict=False):  # one part if whitened
+                rows[:, : added.shape[1], stops] += added / np.sqrt(count[stops])
         q = few.observations.joints[begins]
         turned = [*cos_sin(q[:, circular]), q[:, ~circular]]
         places.append(np.column_stack([*turned, np.full(len(q), ELSEWHERE * number)]))

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -199,9 +200,11 @@ def test_neighbours_are_the_next_stop_and_the_three_nearest():
         np.testing.assert_allclose(units.kernel(kind, 0.7), root * np.exp(-distance / 0.7))
 
 
+@pytest.mark.parametrize('block', [5, samples_module.BLOCK])
 @pytest.mark.parametrize(('share', 'run'), [(1, 1), (2, 3)])
-def test_stops_have_the_sums_of_their_samples(share, run):
+def test_stops_have_the_sums_of_their_samples(share, run, block, monkeypatch):
     """Over the root of their number, of all sets; weightless samples are none."""
+    monkeypatch.setattr(samples_module, 'BLOCK', block)
     rng = np.random.default_rng(1)
     repeats = rng.integers(1, 4, size=14)
     stops = np.repeat(np.arange(14), repeats)
@@ -239,6 +242,19 @@ def test_stops_have_the_sums_of_their_samples(share, run):
     np.testing.assert_array_equal(units.count, counts)
     np.testing.assert_allclose(units.place, places, atol=1e-12)
     np.testing.assert_array_equal(units.time, times)
+
+
+def test_the_rows_of_long_stops_are_never_all_in_memory():
+    rng = np.random.default_rng(1)
+    seen = measure(UR10E, np.repeat(UR10E.random_joints(8, rng), 5000, axis=0), rng, *NOISE)
+    system = System((samples_module.Samples(seen, *NOISE),))
+    names = UR10E.parameter_names
+    tracemalloc.start()
+    units = shared_errors._gather(UR10E, names, system, 1, 20)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert units.count.tolist() == 8 * [5000]
+    assert most < 0.5 * 8 * len(seen) * 6 * len(names)
 
 
 def test_errors_near_in_joint_space_have_the_kernel_of_their_distance():
