@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fits import NOISE, SIGMAS
 
-from calib_ros import load_chain
+from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import explained
 from calib_ros.estimation.problem import Problem
@@ -64,3 +65,16 @@ def test_rows_that_are_not_like_the_others_are_named():
             found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
         )
         assert found.corrected < 0.01
+
+
+@pytest.mark.parametrize('rows', [slice(5, 6), slice(5, 12)])
+@pytest.mark.parametrize('oriented', [True, False])
+def test_rows_of_a_lost_target_are_gross_errors_only(rows, oriented):
+    """Odd and even rows fit alone, but so do all but these: no two arms."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
+    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(60, rng), rng, *NOISE, oriented)
+    positions = seen.positions.copy()
+    positions[rows] = 0.0
+    result = identify(Problem(arm, replace(seen, positions=positions), **SIGMAS))
+    assert result.accepted
+    assert len(result.outliers) == rows.stop - rows.start
