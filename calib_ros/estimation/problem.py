@@ -172,8 +172,8 @@ class Problem(Shown):
             of_lens = fnmatch.filter(LENS_KINDS, Parameter(pattern).kind)
             if self.model.owns_frame(pattern) and not of_lens:
                 raise ConfigError(
-                    'a frame is either known or unknown, and takes no prior: if it is known, give '
-                    f'it in the chain file with "fixed: true" instead of "{pattern}"'
+                    'a frame is known or unknown as a whole, without a prior: if it is known, '
+                    f'give it in the chain file with "fixed: true" instead of "{pattern}"'
                 )
 
     def _check_effects(self) -> None:

@@ -172,8 +172,9 @@ def test_a_prior_holds_a_lens():
     )
     assert held.priors == {'base.fx': 1e-3, 'base.fy': 1e-3}
     assert held.chain.value('base.fx') == pytest.approx(wrong.fx, abs=0.1)
-    with pytest.raises(ConfigError, match='a frame is either known or unknown'):
-        Problem(known(False), seen, priors={'base.x': 1.0})
+    for held_so in ({'priors': {'base.x': 1.0}}, {'fixed': ('base.x',)}):
+        with pytest.raises(ConfigError, match='a frame is known or unknown as a whole'):
+            Problem(known(False), seen, **held_so)
 
 
 def test_gross_errors_of_corners_and_images_are_named(rng):
