@@ -131,9 +131,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
         text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
     text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
     separator = layout.cut or _separator(path, text, notes)
-    if separator == ' ':
-        text = re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text)
-        text = re.sub(r'[ \t]+', ' ', text)
+    text = _narrow(text, separator)
     rows = _cells(path, text[: _after(text, HEAD_LINES)], separator)
     return _Content(rows, notes, text, separator)
 
@@ -169,8 +167,20 @@ def text_and_signs(path: Path) -> tuple[str, str, str]:
     """Return the text of a table, and the signs between its cells and in its numbers."""
     text, _ = _text(path)
     separator = _separator(path, text, [])
+    narrow = _narrow(text, separator)
+    if separator in narrow.lstrip().partition('\n')[0]:
+        text = narrow
+    else:  # the header lacks it: it is in the words below
+        separator = ','
     head = _cells(path, text[: _after(text, HEAD_LINES)], separator)
     return text, separator, _decimal(head, separator)
+
+
+def _narrow(text: str, separator: str) -> str:
+    """Return a text with single blanks between cells that blanks separate."""
+    if separator != ' ':
+        return text
+    return re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
 
 
 def _decimal(rows: Sequence[Cells], separator: str) -> str:

@@ -114,6 +114,18 @@ def test_cells_separated_otherwise_are_read_and_written(run, tmp_path, mark):
     assert (tmp_path / 'out.csv').read_text() == plain.replace(',', mark)
 
 
+def test_signs_in_the_words_of_a_program_separate_nothing(tmp_path):
+    path, arm = tmp_path / 'program.csv', Chain('arm', 'standard', (Joint('a'), Joint('b')))
+    for words in ('MOVE;fast', 'MOVE\tfast', 'MOVE fast', 'MOVE; fast;x'):
+        given = 'word,q1,q2\n' + ''.join(f'{words},0.{k},0.5\n' for k in range(1, 10))
+        path.write_text(given)
+        source = read_program(path, arm)
+        assert source.text_with(source.program) == given
+    path.write_text('q1   q2\n0.1  0.2\n 0.3\t0.4\n')
+    source = read_program(path, arm)
+    assert source.text_with(source.program) == 'q1 q2\n0.1 0.2\n0.3 0.4\n'
+
+
 @pytest.mark.parametrize('names', [UR.joint_names, [f'Q{k}' for k in range(1, 7)]])
 def test_columns_may_have_the_names_of_the_joints(run, tmp_path, names):
     """In any order, as drivers write them."""
