@@ -24,8 +24,8 @@ from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, as_text, csv_lines, from_cell, read_bytes
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
-DECIMAL_COMMA = re.compile(r'\s*[+-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
-THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
+DECIMAL_COMMA = re.compile(r'\s*[+\u2212-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
+THOUSANDS = re.compile(r"[+\u2212-]?[1-9][0-9]{0,2}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
 MISSING = frozenset(('', 'nan', '-nan', 'na', 'n/a', '#n/a', '#nv', 'null', 'none', '-', '--'))
 """Cells without a value, in small letters."""
 Cells = tuple[int, list[str]]  # line number and cells
@@ -108,7 +108,7 @@ class Columns:
                 return np.array(list(map(int, texts)), dtype=np.int64)
         numbers = [
             int(blank[row])
-            if blank is not None and not text
+            if blank is not None and text.lower() in MISSING
             else cell_integer(text, self.where(row, name))
             for row, text in enumerate(texts)
         ]

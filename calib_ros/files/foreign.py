@@ -110,6 +110,8 @@ def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
     if not blank or not (empty := np.logical_and.reduce(blank)).any():
         return made, ()
     left = lines_in_words(made.lines[empty].tolist())
+    if empty.all():
+        raise InputError(f'{made.path}: nothing measured in {left}: rows need x, y, z or distance')
     return made.select(~empty), (f'{made.path}: nothing measured in {left}: skipped',)
 
 
@@ -184,8 +186,8 @@ class _Table:
             bare, _ = name_and_unit(self._sheet.header[column])
             if ours[0] in 'sva' and ours[1:].isdigit() and bare != name:
                 continue  # the axes of KUKA are A1, A2, ...: no accelerations
-            if ours == 'time' and math.isinf(cell_number(self.cells(f'#{column + 1}')[0])):
-                continue  # a date
+            if ours == 'time' and self._has_dates(column):
+                continue
             kept[ours] = Expression.parse(f'#{column + 1}')
             if name != ours:
                 guessed.append(f'{ours} = {name}')
@@ -201,6 +203,10 @@ class _Table:
                     f'{named_by_option(self.names, missing, len(names))}'
                 )
         return kept
+
+    def _has_dates(self, column: int) -> bool:
+        first = self.cells(f'#{column + 1}')[0].replace(self._sheet.columns.decimal, '.')
+        return math.isinf(cell_number(first))
 
     def _there(self, expressions: dict[str, Expression]) -> dict[str, Expression]:
         """Return the expressions whose columns are there; others must be optional."""

@@ -62,11 +62,15 @@ def test_points_between_thousands_are_no_decimals(tmp_path):
     text = path.read_text()
     for cell, said in (
         ('1.554', "not '1.554': write it without the marks between thousands"),
+        ('\u22121.554', 'write it without the marks between thousands'),
         ('1.554,25', "not '1.554,25': write it without the marks between thousands"),
     ):
         path.write_text(text.replace('1554', cell))
         with pytest.raises(InputError, match=said):
             read_table(path, 2, foreign=Foreign(Layout()))
+    path.write_text('q1;q2;x;y;z\n\u22121,5;2,125;1;2;3\n')
+    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    np.testing.assert_allclose(found.joints, [[-1.5, 2.125]])
     path.write_text('q1;q2;x;y;z\n1,554;2,125;1;2;3\n')
     with pytest.raises(InputError, match='give --decimal comma; if these are thousands, write it'):
         read_table(path, 2, foreign=Foreign(Layout()))
@@ -82,6 +86,22 @@ def test_stamps_in_seconds_are_told_what_to_give(tmp_path):
     columns = {'time': 'stamp_ns'}
     (found,) = read_table(path, 2, foreign=Foreign(Layout(columns=columns))).fitted
     np.testing.assert_allclose(found.stamps_ns, 1_700_000_000_250_000_000, rtol=1e-15)
+
+
+def test_a_time_with_decimal_commas_is_no_date(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text('Time;q1;q2;x;y;z\n0,25;1;2;3;4;5\n0,5;1;2;3;4;5\n')
+    (found,) = loading.table(path, ARM, Settings()).fitted
+    assert found.stamps_ns.tolist() == [250_000_000, 500_000_000]
+
+
+def test_empty_stamps_are_lines_and_rows_without_any_measurement_are_told(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text('stamp_ns,q1,q2,x,y,z\n-,1,2,3,4,5\n7,1,2,3,4,5\n')
+    assert read_table(path, 2).fitted[0].stamps_ns.tolist() == [2_000_000_000, 7]
+    path.write_text('q1,q2,x,y,z\n1,2,-,-,-\n1,2,nan,nan,nan\n')
+    with pytest.raises(InputError, match='nothing measured in lines 2, 3: rows need x, y, z'):
+        read_table(path, 2)
 
 
 def test_rotation_matrices(tmp_path):
