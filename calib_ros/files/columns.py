@@ -30,6 +30,7 @@ MISSING = frozenset(('', 'nan', '-nan', 'na', 'n/a', '#n/a', '#nv', 'null', 'non
 """Cells without a value, in small letters."""
 Cells = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
+MAYBE_MISSING = (f'{BETWEEN} ', *(f'{BETWEEN}{each}{BETWEEN}' for each in MISSING))
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 
@@ -59,13 +60,13 @@ class Columns:
         return f'{self.path}, line {self.lines[row]}: {name}'
 
     def _no_number(self, row: int, name: str, text: str = '') -> InputError:
-        remedy = 'correct that row or leave it out'
-        if THOUSANDS.fullmatch(text):
+        bare, remedy = text.strip(), 'correct that row or leave it out'
+        if THOUSANDS.fullmatch(bare):
             remedy = 'write it without the marks between thousands'
-        if DECIMAL_COMMA.fullmatch(text):
-            told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(text))
+        if DECIMAL_COMMA.fullmatch(bare):
+            told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
             remedy = f'write a point, or give --decimal comma{told}'
-        of_units = row == 0 and text.lower() not in MISSING and not re.search('[0-9]', text)
+        of_units = row == 0 and bare.lower() not in MISSING and not re.search('[0-9]', bare)
         if of_units:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'
         return (ColumnsError if of_units else InputError)(
@@ -108,7 +109,7 @@ class Columns:
                 return np.array(list(map(int, texts)), dtype=np.int64)
         numbers = [
             int(blank[row])
-            if blank is not None and text.lower() in MISSING
+            if blank is not None and text.strip().lower() in MISSING
             else cell_integer(text, self.where(row, name))
             for row, text in enumerate(texts)
         ]
@@ -127,9 +128,9 @@ class Columns:
         if name in self.values:
             return np.isnan(self.values[name])
         cells = f'{BETWEEN}{self.words[name].lower()}{BETWEEN}'
-        if not any(f'{BETWEEN}{each}{BETWEEN}' in cells for each in MISSING):
+        if not any(each in cells for each in MAYBE_MISSING):
             return np.zeros(len(self.lines), dtype=bool)
-        return np.array([text.lower() in MISSING for text in self.texts(name)], dtype=bool)
+        return np.array([text.strip().lower() in MISSING for text in self.texts(name)], dtype=bool)
 
     def texts(self, name: str) -> list[str]:
         """Return the cells of a column."""
@@ -265,7 +266,8 @@ def _numbers(text: str, decimal: str = '.') -> FloatArray:
     """
     if decimal == ',' and '.' in text:
         cells = text.split(BETWEEN)
-        text = BETWEEN.join([f'{c}?' if '.' in c and THOUSANDS.fullmatch(c) else c for c in cells])
+        thousands = ('.' in c and THOUSANDS.fullmatch(c.strip()) for c in cells)
+        text = BETWEEN.join([f'{c}?' if t else c for c, t in zip(cells, thousands, strict=True)])
     if decimal == ',':
         text = text.replace(',', '.')
     if not text.strip(BETWEEN):
@@ -284,7 +286,7 @@ def _numbers(text: str, decimal: str = '.') -> FloatArray:
 
 def cell_number(text: str) -> float:
     """Return the number in a cell (1.5D-3 as Fortran writes), NaN if blank, else infinity."""
-    low = text.lower().replace('\u2212', '-')  # the minus of typesetting
+    low = text.strip().lower().replace('\u2212', '-')  # the minus of typesetting
     with suppress(ValueError):
         return math.nan if low in MISSING else float(low.replace('d', 'e'))
     return math.inf

@@ -15,7 +15,7 @@ from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
 FORMS = {
-    'no values': PLAIN + '0.2,0.3,n/a,#N/A,-\n0,0,nan,null,\n',
+    'no values': PLAIN + '0.2,0.3,n/a,#N/A,-\n0,0,nan,null,\n0, 0, nan, -, \n',
     'a header of numpy': '# ' + PLAIN,
     'a header of numpy with blanks': '# two joints\n# ' + PLAIN.replace(',', ' '),
     'a date': 'Time;' + PLAIN.replace('\n', '\n2026-11-24 10:00:00;', 3).replace(',', ';'),
