@@ -27,7 +27,7 @@ from calib_ros.files.columns import (
     with_rows,
 )
 from calib_ros.files.layouts import ANGLES, LENGTHS, POSITION, QUATERNION, joint_columns
-from calib_ros.files.sheets import name_and_unit, places, text_and_signs
+from calib_ros.files.sheets import decimal_sign, name_and_unit, places, text_and_separator
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
@@ -46,8 +46,7 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
     Columns of held joints may be missing.
     """
-    found, _, _ = _columns(path)
-    names, _, program = _program(found, chain)
+    found, names, _, program = _program(*_columns(path)[:2], chain)
     values, _ = joint_values(chain, program)
 
     def remedy(i: int) -> str:
@@ -58,10 +57,14 @@ def read_joints(path: Path, chain: Chain) -> FloatArray:
 
 
 def _columns(path: Path) -> tuple[Columns, str, str]:
-    """Return the columns of a table, its text, and the sign between its cells."""
-    text, separator, decimal = text_and_signs(path)
-    found = columns_of(path, text.encode(), separator=separator)
-    return with_rows(replace(found, decimal=decimal), ()), text, separator
+    """Return the columns of a table, the sign between its cells, and its text."""
+    text, separator = text_and_separator(path)
+    return with_rows(columns_of(path, text.encode(), separator=separator), ()), separator, text
+
+
+def _with_decimals(found: Columns, names: Sequence[str], separator: str) -> Columns:
+    cells = (cell for name in names for cell in found.texts(name))
+    return replace(found, decimal=decimal_sign(cells, separator))
 
 
 def check_limits(
@@ -98,8 +101,10 @@ def check_turns(values: FloatArray, chain: Chain, where: Callable[[int, int], st
         )
 
 
-def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], FloatArray, Program]:
-    """Return the columns (n) of all joints, their units [rad or m], and the program in rad or m.
+def _program(
+    found: Columns, separator: str, chain: Chain
+) -> tuple[Columns, tuple[str, ...], FloatArray, Program]:
+    """Return the table, the columns (n) of all joints with their units, and the program [rad, m].
 
     Columns of held joints may be missing.
     """
@@ -127,8 +132,10 @@ def _program(found: Columns, chain: Chain) -> tuple[tuple[str, ...], FloatArray,
             f'{found.path} has a column {more}, but the arm has {len(joints)} joints only'
         )
     given = [k for k, column in enumerate(columns) if column in found.header]
-    values = found.block([columns[k] for k in given]) * units[given]
-    return tuple(columns), units, Program(tuple(joints[k] for k in given), values)
+    named = [columns[k] for k in given]
+    found = _with_decimals(found, named, separator)
+    values = found.block(named) * units[given]
+    return found, tuple(columns), units, Program(tuple(joints[k] for k in given), values)
 
 
 def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
@@ -151,7 +158,8 @@ def _units(found: Columns, chain: Chain, columns: Sequence[str]) -> FloatArray:
 
 def read_poses(path: Path) -> FloatArray:
     """Read poses (N, 4, 4) from the columns x y z [m] and qx qy qz qw of a CSV."""
-    found = with_rows(_columns(path)[0], POSE_COLUMNS)
+    table, separator, _ = _columns(path)
+    found = _with_decimals(with_rows(table, POSE_COLUMNS), POSE_COLUMNS, separator)
     numbers = found.block(POSE_COLUMNS)
     check_quaternions(found, numbers[:, 3:])
     return se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
@@ -201,8 +209,8 @@ def read_program(path: Path, chain: Chain) -> ProgramFile:
 
 
 def _read_csv(path: Path, chain: Chain) -> ProgramFile:
-    found, text, separator = _columns(path)
-    names, units, program = _program(found, chain)
+    table, separator, text = _columns(path)
+    found, names, units, program = _program(table, separator, chain)
     signs = joint_columns(len(names), 's')
     known = [k for k, sign in enumerate(signs) if sign in found.header]
     if len({*known, *chain.held}) == len(signs):

@@ -140,14 +140,15 @@ def _sheet(
     path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
-    decimal = layout.decimal or _decimal(rows, content.separator)
-    if decimal == ',' and not layout.decimal:
-        notes.append('numbers have decimal commas (--decimal)')
     at, header = _header(path, rows, names, known)
     used = [k for name in names if not name.startswith('#') for k in places(header, name)]
     used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
     low = {name.lower() for name in known}
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
+    cells = (row[k] for _, row in rows[at + 1 :] for k in used if k < len(row))
+    decimal = layout.decimal or decimal_sign(cells, content.separator)
+    if decimal == ',' and not layout.decimal:
+        notes.append('numbers have decimal commas (--decimal)')
     first = _first(path, rows, at, used, decimal, notes)
     if at < 0 and first:  # columns by their numbers
         header = tuple(f'#{k + 1}' for k in range(len(rows[first][1])))
@@ -163,17 +164,14 @@ def _sheet(
     return Sheet(header, above, columns, tuple(notes))
 
 
-def text_and_signs(path: Path) -> tuple[str, str, str]:
-    """Return the text of a table, and the signs between its cells and in its numbers."""
+def text_and_separator(path: Path) -> tuple[str, str]:
+    """Return the text of a table, and the sign between its cells."""
     text, _ = _text(path)
     separator = _separator(path, text, [])
     narrow = _narrow(text, separator)
     if separator in narrow.lstrip().partition('\n')[0]:
-        text = narrow
-    else:  # the header lacks it: it is in the words below
-        separator = ','
-    head = _cells(path, text[: _after(text, HEAD_LINES)], separator)
-    return text, separator, _decimal(head, separator)
+        return narrow, separator
+    return text, ','  # the header lacks it: it is in the words below
 
 
 def _narrow(text: str, separator: str) -> str:
@@ -183,8 +181,8 @@ def _narrow(text: str, separator: str) -> str:
     return re.sub(r'[ \t]+', ' ', re.sub(r'(?m)^[ \t]+|[ \t]+$', '', text))
 
 
-def _decimal(rows: Sequence[Cells], separator: str) -> str:
-    cells = (cell for _, cells in rows for cell in cells)
+def decimal_sign(cells: Iterable[str], separator: str) -> str:
+    """Return the decimal sign in cells of numbers."""
     commas = any(DECIMAL_COMMA.fullmatch(c) and not THOUSANDS.fullmatch(c) for c in cells)
     return ',' if commas and separator != ',' else '.'
 

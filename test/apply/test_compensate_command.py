@@ -121,6 +121,12 @@ def test_signs_in_the_words_of_a_program_separate_nothing(tmp_path):
         path.write_text(given)
         source = read_program(path, arm)
         assert source.text_with(source.program) == given
+    path.write_text('q1;q2;speed\n1.25;0.5;1,5\n1.554;0.5;2,5\n')
+    source = read_program(path, arm)
+    assert source.text_with(source.program) == path.read_text()
+    path.write_text('q1; q2\n0,25; 1.554\n')
+    with pytest.raises(InputError, match=r'q2 .* without the marks between thousands'):
+        read_program(path, arm)
     path.write_text('q1   q2\n0.1  0.2\n 0.3\t0.4\n')
     source = read_program(path, arm)
     assert source.text_with(source.program) == 'q1 q2\n0.1 0.2\n0.3 0.4\n'

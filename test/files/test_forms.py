@@ -68,6 +68,9 @@ def test_points_between_thousands_are_no_decimals(tmp_path):
         path.write_text(text.replace('1554', cell))
         with pytest.raises(InputError, match=said):
             read_table(path, 2, foreign=Foreign(Layout()))
+    path.write_text('q1;q2;x;y;z;note\n0.25;0.5;1.554;1;2;21,5\n')
+    (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
+    np.testing.assert_allclose(found.positions, [[1.554, 1, 2]])
     path.write_text('q1;q2;x;y;z\n\u22121,5;2,125;1;2;3\n')
     (found,) = read_table(path, 2, foreign=Foreign(Layout())).fitted
     np.testing.assert_allclose(found.joints, [[-1.5, 2.125]])
