@@ -44,7 +44,9 @@ def _compensate(options: argparse.Namespace, screen: Screen) -> int:
     refuse_others(options.program, 'compensate', 'program', 'chain', 'table')
     common.refuse_existing(options, options.out)
     if options.out.exists() and options.out.samefile(options.program):
-        raise InputError('--out is the program: keep it, since compensating it twice is wrong')
+        raise InputError(
+            '--out would overwrite the program: keep it, since compensating it twice is wrong'
+        )
     nominal = load_chain(options.chain)
     arm = calibration_of(options.calibration, 'compensate --calibration', nominal)
     limits = {item.name: getattr(options, item.name) for item in fields(Limits)}

@@ -171,7 +171,8 @@ def _chosen(
     for topic, stream in streams.items():
         if stream.type in BODIES and stream.type not in defined:
             raise InputError(
-                f'the bag does not define {stream.type} of {topic}: record it where its package is'
+                f'the bag does not define {stream.type} of {topic}: record it on a computer with '
+                'that package'
             )
     joints = {topic: stream for topic, stream in streams.items() if stream.type == JOINT_STATE}
     if len(joints) > 1 and not session.settings.joint_topics:

@@ -212,7 +212,8 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     missing = [name for name in columns if name not in found.header]
     if missing:
         raise InputError(
-            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or x y z qx ... qw'
+            f'{path} has no column {", ".join(missing)}: give q1 ... q{joints}, or x y z qx qy qz '
+            'qw of the flange'
         )
     values = found.block(columns)
     if posed:

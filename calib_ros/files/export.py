@@ -272,7 +272,8 @@ def checked(name: str, text: str, again: FloatArray, wanted: FloatArray, lost: f
     difference = float(np.abs(again - wanted).max())
     if not difference <= SAME:
         raise ExportError(
-            f'{name}, read back, differs from the calibration by {difference:.3g} [m, rad or more]'
+            f'{name}, read back, differs from the calibration by {difference:.3g} (m or rad): '
+            'it is not written'
         )
     return Export(name, text, lost)
 

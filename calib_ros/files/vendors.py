@@ -113,7 +113,8 @@ def vendor_files(
     """
     if checksum and not re.fullmatch(r'calib_\d+', checksum):
         raise ConfigError(
-            f'"{checksum}" is not a Universal Robots checksum: calib_ and digits, by its driver'
+            f'"{checksum}" is not a Universal Robots checksum: give calib_ and digits, as its '
+            'driver prints them at the start'
         )
     found = []
     for vendor in (UR, FRANKA):

@@ -115,7 +115,7 @@ class Pictures:
         middle = len(sample.images) // 2
         kept = [k for k, number in enumerate(sample.images) if number in self._kept]
         if not kept:
-            self.dropped['measurements: image beyond the memory for them'] += sample.count
+            self.dropped['measurements: image dropped, memory for images full'] += sample.count
             return None
         nearest = min(kept, key=lambda k: abs(k - middle))
         return self._pool.submit(self._look, sample, *self._kept[sample.images[nearest]])
