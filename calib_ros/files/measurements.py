@@ -27,6 +27,7 @@ from calib_ros.files.columns import (
 from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.sample import socket_place
 from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults
 
@@ -202,7 +203,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         columns.labels('session'),
         _devices(columns, kind),
         columns.labels('target'),
-        columns.labels('frame_id'),
+        _frames(columns),
         columns.labels('view'),
         choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
         split == 'test',
@@ -271,6 +272,12 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
         return columns.integers('stamp_ns', lines)
     except InputError as err:
         raise InputError(f'{err}; if it is in seconds, give --columns time=stamp_ns') from err
+
+
+def _frames(columns: Columns) -> Codes:
+    numbers, names = columns.labels('frame_id')
+    place, found = codes_of([*map(frame_name, names)])
+    return place[numbers], found
 
 
 def _devices(columns: Columns, kind: Index) -> Codes:

@@ -241,6 +241,17 @@ def test_a_journal_read_with_the_unit_of_another_system_keeps_stamps_and_removal
     np.testing.assert_allclose(found.positions, 1e-3 * known.positions, rtol=1e-12)
 
 
+def test_a_leading_slash_makes_no_other_frame(tmp_path):
+    """Journals of earlier versions have it, the messages that continue them no longer do."""
+    path = tmp_path / 'cell.csv'
+    with closing(Journal(path, JOINTS)) as journal:
+        for number, frame in enumerate(('/tracker', 'tracker', ''), 1):
+            journal.add(plain(number, rotation=np.eye(3), frame_id=frame))
+    found = [each.frame_id for each in read_journal(path, JOINTS)[0]]
+    assert found == ['tracker', 'tracker', '']
+    assert read_table(path, JOINTS).world_frame == 'tracker'
+
+
 def test_a_header_that_was_cut_off_is_written_anew(tmp_path):
     path = tmp_path / 'cell.csv'
     written(path, [])
