@@ -63,6 +63,7 @@ class Columns:
         bare, remedy = text.strip(), 'correct that row or leave it out'
         if THOUSANDS.fullmatch(bare):
             remedy = 'write it without the marks between thousands'
+            remedy += ', or its decimal point as a comma' * (self.decimal == ',')
         if DECIMAL_COMMA.fullmatch(bare):
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
             remedy = f'write a point, or give --decimal comma{told}'

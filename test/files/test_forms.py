@@ -61,7 +61,7 @@ def test_points_between_thousands_are_no_decimals(tmp_path):
     np.testing.assert_allclose(found.positions, [[0.9995, 0.356, 1.554]])
     text = path.read_text()
     for cell, said in (
-        ('1.554', "not '1.554': write it without the marks between thousands"),
+        ('1.554', 'without the marks between thousands, or its decimal point as a comma'),
         ('\u22121.554', 'write it without the marks between thousands'),
         ('1.554,25', "not '1.554,25': write it without the marks between thousands"),
     ):
