@@ -111,8 +111,8 @@ class CalibrationNode(Node):  # type: ignore[misc]  # see pyproject.toml
         )
         self._working = self._serve()
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # ROS time may stop and jump
-        timed = {DIAGNOSTICS_PERIOD: self._on_second, TAKING_PERIOD: self._on_tick}
-        for period, work in timed.items():
+        timed = (DIAGNOSTICS_PERIOD, self._on_second), (TAKING_PERIOD, self._on_tick)
+        for period, work in timed:
             self.create_timer(period, self._boundary.guarded(work), clock=steady)
         self._load_at_start()
 
