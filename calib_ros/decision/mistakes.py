@@ -161,6 +161,8 @@ def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
 
 def _beyond(problem: Problem, sets: Sets) -> Explained | None:
     """Return what explains the measurements clearly further away than all others."""
+    if _of_images(problem):
+        return None
     sizes = [norms(each.positions) for each in sets]
     order = np.sort(np.concatenate(sizes))
     gaps = order[1:] > CLEARLY * order[:-1]
@@ -287,8 +289,10 @@ def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> E
                 published='give each its own device in sources',
             )
             return Explained((two,), given.error, np.nan)
-        for fit, name, part, trial in zip(fits[::-1], halves, parts, trials, strict=True):
-            if fit and trial is not None and (found := _named(problem, chain, (part,), trial)):
+        for name, part, trial, fit in zip(halves, parts, trials, fits, strict=True):
+            if fit or trial is None or not any(fits):
+                continue
+            if found := _named(problem, chain, (part,), trial):
                 return _of_a_part(problem, found, f'in the {name} alone, ')
     return None
 
