@@ -62,7 +62,7 @@ def samples(draw):
         session=draw(names),
         device=draw(names.filter(bool)),
         target=draw(names),
-        frame_id=draw(names),
+        frame_id=draw(names).lstrip('/'),  # as messages give it
         eye_in_hand=eye,
         validation=draw(st.booleans()),
         delay=draw(floats),
