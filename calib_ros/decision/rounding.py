@@ -24,7 +24,7 @@ from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import Flags, FloatArray
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.values import ROUNDED
 
 STEPS = (5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, *np.deg2rad([0.2, 0.1, 0.05, 0.02, 0.01]).tolist())
@@ -55,18 +55,15 @@ def rounding_errors(problem: Problem, coarse: Mapping[str, float]) -> dict[str, 
 
 
 def _step(values: FloatArray) -> float:
-    """Return the step [rad or m] of values; zero for less than three, or if wider: intended."""
     few = values[:3, np.newaxis] / STEPS
-    likely = np.compress(_are_whole(few), STEPS).tolist()
-    step = next((s for s in sorted(likely, reverse=True) if _are_whole(values / s)), 0.0)
-    if not step or len(np.unique(values)) < 3:
-        return 0.0
-    shared = np.gcd.reduce(np.round(values / step).astype(np.int64))  # levels at 30 degrees: 150
-    return 0.0 if shared >= CLEARLY else step
+    likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
+    step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
+    wider = _are_multiples(values, CLEARLY * step) if step else True
+    return 0.0 if wider or len(np.unique(values)) < 3 else step
 
 
-def _are_whole(values: FloatArray) -> Flags:
-    return np.asarray(np.abs(values - np.round(values)).max(axis=0) < ROUNDED)
+def _are_multiples(values: FloatArray, step: float) -> bool:
+    return bool(np.abs(values / step - np.round(values / step)).max() < ROUNDED)
 
 
 def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -> bool:
