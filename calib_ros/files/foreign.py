@@ -94,7 +94,13 @@ class Foreign:
             how = f'by the column "{matched}"' if matched else 'row by row'
             notes += [f'{self.log}: {note}' for note in log.notes]
             notes.append(f'{self.log}: holds the joint values of {path}, matched {how}')
-            values = {ours: each[partners] for ours, each in joints.items()} | values
+            joints = {ours: each[partners] for ours, each in joints.items()}
+            for ours in filter(re.compile('q[0-9]+').fullmatch, joints):
+                for line in log.lines[partners][np.isnan(joints[ours])][:1].tolist():
+                    raise InputError(
+                        f'{self.log}, line {line}: {ours} is blank: correct or leave out that row'
+                    )
+            values = joints | values
         if not self.layout.source:  # a preset is known to leave some out
             notes += not_read(path, [name for name in table.unread() if name != matched])
         made = Columns(path, lines, table.words(), values, table.names)
@@ -358,10 +364,10 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
 
     It may have other capitals in the log.
     """
-    others = {name.lower(): name for name in log.header}
+    others = {name.lower(): name for name in log.header} | {name: name for name in log.header}
     for name in table.header:
-        if name.lower() in others:
-            named, logged = table.cells(name), log.cells(others[name.lower()])
+        if theirs := others.get(name, others.get(name.lower())):
+            named, logged = table.cells(name), log.cells(theirs)
             rows = {cell: row for row, cell in enumerate(logged)}
             if len(rows) == len(logged) and len({*named}) == len(named) and {*named} <= {*rows}:
                 return name, np.array([rows[cell] for cell in named])

@@ -133,3 +133,16 @@ def test_rotation_matrices(tmp_path):
     ):
         with pytest.raises((InputError, ConfigError), match=said):
             read_table(path, 2, foreign=Foreign(layout_of('', [columns], {})))
+
+
+def test_a_blank_in_a_log_of_joint_values_is_told_with_its_line(tmp_path):
+    """It was told as one of the other table. Of columns P and p that of its name counts."""
+    path, log = tmp_path / 'p.csv', tmp_path / 'js.csv'
+    path.write_text('P,x,y,z\n' + ''.join(f'{k},{k},0,1\n' for k in (2, 1)))
+    log.write_text('P,p,q1,q2\n1,2,0.1,0.2\n2,1,0.3,nan\n3,3,nan,0\n')
+    foreign = Foreign(Layout(), None, log)
+    with pytest.raises(InputError, match='line 3: q2 is blank: correct or leave out that row'):
+        read_table(path, 2, foreign=foreign)
+    log.write_text(log.read_text().replace('0.3,nan', '0.3,0.4'))
+    (found,) = read_table(path, 2, foreign=foreign).fitted
+    assert found.joints.tolist() == [[0.3, 0.4], [0.1, 0.2]]
