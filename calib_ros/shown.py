@@ -35,6 +35,11 @@ def rounded(value: float) -> str:
     return f'{value:.{max(3, digits)}f}'
 
 
+def counted(count: int, what: str) -> str:
+    """Return a number of things: 1 pose, 2 poses."""
+    return f'{count} {what}{"s" * (count != 1)}'
+
+
 def of_them(count: int, what: str) -> str:
     """Return how many of several are outliers or effects."""
     return f'1 of them an {what}' if count == 1 else f'{count} of them {what}s'

@@ -15,6 +15,7 @@ from calib_ros.cli import common
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError, UnknownNameError
 from calib_ros.files.history import History
+from calib_ros.shown import counted
 
 
 def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
@@ -29,7 +30,7 @@ def _run_fleet(options: argparse.Namespace, screen: Screen) -> int:
     robots = read_plant(options.plant)
     history = History(options.history)
     cluster = Cluster(options.scheduler, options.workers, options.memory)
-    with screen.work(f'{len(robots)} robot{"s" * (len(robots) > 1)}') as work, _tidied_up(screen):
+    with screen.work(counted(len(robots), 'robot')) as work, _tidied_up(screen):
         done = run(robots, history, cluster, options.out, work)
         work('comparing nights')
         found = statuses(robots, history, done, options.years)

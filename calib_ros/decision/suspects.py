@@ -19,6 +19,7 @@ from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention
 from calib_ros.kinematics.chain_file import shipped_chains
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.shown import counted
 
 Sets: TypeAlias = tuple[Observations, ...]
 DataChange: TypeAlias = Callable[[Observations], Observations]
@@ -108,8 +109,8 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
 
 def rows_away(rows: int) -> str:
     """Return that joint values stand some rows below their measurement, or above it."""
-    count = f'{abs(rows)} row{"s" if abs(rows) > 1 else ""}'
-    return f'the joint values stand {count} {"below" if rows > 0 else "above"} their measurement'
+    count, where = counted(abs(rows), 'row'), 'below' if rows > 0 else 'above'
+    return f'the joint values stand {count} {where} their measurement'
 
 
 def _of_boards(chain: Chain, seen: Observations) -> Iterator[Suspect]:

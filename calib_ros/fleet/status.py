@@ -16,7 +16,7 @@ from calib_ros.fleet.plant import Robot
 from calib_ros.fleet.run import Run, results, too_late, verifications
 from calib_ros.fleet.watch import Watched, watch
 from calib_ros.report.page import State
-from calib_ros.shown import some
+from calib_ros.shown import counted, some
 
 STATES: Mapping[str, tuple[State, str]] = {
     'changed': ('bad', 'the arm differs from earlier nights'),
@@ -123,7 +123,7 @@ def _clocks(rows: Sequence[Row], own: Sequence[Row]) -> Iterator[str]:
     if ahead := [row for row in rows if too_late(row)]:
         row = max(ahead, key=lambda each: each.filed)
         yield (
-            f'{len(ahead)} result{"s" * (len(ahead) > 1)} with stamps later than the filing, on '
+            f'{counted(len(ahead), "result")} with stamps later than the filing, on '
             f'{row.filed:%Y-%m-%d} of {row.time:%Y-%m-%d} ({row.source or row.kind}): set the '
             'clock of the recorder'
         )

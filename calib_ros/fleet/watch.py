@@ -46,7 +46,7 @@ from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
 from calib_ros.files.rows import Row
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.shown import some
+from calib_ros.shown import counted, some
 
 LAGS = tuple(2**k for k in range(TELLING.bit_length()))
 """Nights, 1 to TELLING, in which a change is sought: large ones show at once, small ones later."""
@@ -113,7 +113,7 @@ def watch(rows: Sequence[Row], years: float) -> Watched:
         remarks += found.remarks
         if names != newest:
             number, last = len(fitted), fitted[-1][0].time
-            these = f'{number} night{"s" * (number > 1)}, the last of {last:%Y-%m-%d}'
+            these = f'{counted(number, "night")}, the last of {last:%Y-%m-%d}'
             why = _other(names, newest)
             remarks.append(f'{these}, cannot be compared with the newest: {why}')
     nights.sort(key=lambda night: night.row.time)

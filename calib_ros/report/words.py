@@ -25,7 +25,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter
 from calib_ros.kinematics.se3 import to_quat
 from calib_ros.settings import Settings
-from calib_ros.shown import rounded, some
+from calib_ros.shown import counted, rounded, some
 
 WEAK = Settings.largest_error
 """Standard deviation [m or rad] beyond which a parameter is named as weakly determined: an arm
@@ -111,10 +111,10 @@ def notes(result: Identification) -> list[str]:
     if result.chain.effects:
         groups = dict.fromkeys(effects.group_of(name) for name, _ in result.chain.effects)
         count = len(result.chain.effects)
-        found.append(f'with {count} effect{"s" if count > 1 else ""} ({", ".join(groups)})')
+        found.append(f'with {counted(count, "effect")} ({", ".join(groups)})')
     given = set(result.priors) - set(result.weak) - {name for name, _ in result.chain.effects}
     if given:
-        found.append(f'priors on {len(given)} parameters')
+        found.append(f'priors on {counted(len(given), "parameter")}')
     if partly := in_part(result):
         found.append(partly)
     if result.weak:
@@ -189,7 +189,7 @@ def verdict(
     """
     nominal, now = found.figures
     text = f'RMS {now.rms_mm:.3f} mm (mean {now.mean_mm:.3f}, max {now.max_mm:.3f}) on '
-    since = f'{now.count} pose{"s" * (now.count != 1)} measured since'
+    since = f'{counted(now.count, "pose")} measured since'
     text += f'{since}; the nominal chain has {nominal.rms_mm:.3f} mm'
     limit = calibration.limit(sets)
     if limit is None:

@@ -18,6 +18,7 @@ from calib_ros.sampling.live import START, Estimate, barely_moved
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
 from calib_ros.settings import EXCEPTION, Settings
+from calib_ros.shown import counted
 
 
 class Hint(NamedTuple):
@@ -223,14 +224,14 @@ def progress(
 
     `fitted` holds the joint values (n,) of each.
     """
-    counted = f'{len(fitted)} pose{"s" * (len(fitted) != 1)}'
+    told = counted(len(fitted), 'pose')
     if estimate is not None and estimate.excess and estimate.rms > settings.largest_error:
         apart = f'{1e3 * estimate.rms:.0f} mm from where the joints are'
-        counted += f', {apart}: check units, clocks and chain'
+        told += f', {apart}: check units, clocks and chain'
     elif estimate is not None:
-        counted += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
+        told += f', {1e3 * estimate.sigma:.3f} mm expected, {_forecast(estimate, settings)}'
     still = barely_moved(chain, np.array(fitted)) if fitted else ()
-    return [counted, f'hardly moved so far: {", ".join(still)}' if still else '']
+    return [told, f'hardly moved so far: {", ".join(still)}' if still else '']
 
 
 def _forecast(estimate: Estimate, settings: Settings) -> str:
