@@ -38,6 +38,7 @@ from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXCEPTION, Settings
+from calib_ros.shown import counted
 
 
 def start_frames(problem: Problem) -> Chain:
@@ -86,8 +87,8 @@ def in_new_frames(problem: Problem, arm: Chain, new: Sequence[str], system: Syst
     if hidden := set(structurally_independent(known, own, problem.kinds)).difference(seen):
         frames = ' and '.join(dict.fromkeys(name.owner for name in own if name in hidden))
         raise InputError(
-            f'{system.count} poses do not show where the new {frames} is: measure more, all over '
-            'the joint range'
+            f'{counted(system.count, "pose")} cannot place the new {frames}: measure more, all '
+            'over the joint range'
         )
     placed = minimise(found, seen, system).chain
     for name in new:

@@ -87,9 +87,12 @@ def load_robot(node: Node, given: Given) -> tuple[Chain, str]:
         topic = node.resolve_topic_name('robot_description')
         node.get_logger().info(f'waiting up to {DESCRIPTION_WAIT:g} s for {topic}')
         for _ in range(10):  # between them a signal is heard
-            which = String, node, 'robot_description'
             found, message = wait_for_message(
-                *which, qos_profile=qos, time_to_wait=DESCRIPTION_WAIT / 10
+                String,
+                node,
+                'robot_description',
+                qos_profile=qos,
+                time_to_wait=DESCRIPTION_WAIT / 10,
             )
             if found:
                 break
