@@ -36,7 +36,7 @@ from calib_ros.estimation.levels import CERTAIN, SEVERAL, TELLING
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.samples import gram
 from calib_ros.kinematics.chain import Chain
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, cos_sin
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index, cos_sin
 from calib_ros.values import LARGEST
 
 DECAYS = {'successive': (1.0, 3.0, 10.0, 30.0, 100.0), 'near': (0.3, 1.0, 3.0)}
@@ -135,16 +135,16 @@ def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
     alike = {part: found for part, found in alike.items() if sizes[part].any()}
     even = few if share == 1 else _gather(fit.chain, names, system, share, 1)
     middles: dict[int, FloatArray] = {}
-    by_time: dict[int, list[tuple[float, float]]] = {}
+    by_kind: dict[str, dict[int, list[tuple[float, float]]]] = {kind: {} for kind in kinds}
     for part in alike:
         white, *rest = sizes[part]
         middles[part] = white * fit.normal.parts[part]
         for (kind, length), size in zip(kernels[part], rest, strict=True):
-            if size and kind == 'near':
-                middles[part] += size * _near(even, part, length, share)
-            elif size:
-                by_time.setdefault(part, []).append((length, size))
-    for part, middle in _successive(fit.chain, names, system, by_time).items():
+            if size:
+                by_kind[kind].setdefault(part, []).append((length, size))
+    for part, own in by_kind['near'].items():
+        middles[part] += _near(even, part, own, share)
+    for part, middle in _successive(fit.chain, names, system, by_kind['successive']).items():
         middles[part] += middle
     found = tuple(kind for kind in kinds if any(kind in each for each in alike.values()))
     return Shared(**correlations, found=found, middles=middles)
@@ -300,9 +300,14 @@ def _gather(chain: Chain, names: Sequence[str], system: System, share: int, run:
     )
 
 
-def _near(units: Stops, part: int, length: float, share: int) -> FloatArray:
-    """Return J^T K J of errors fading in joint space, by every `share`-th stop: pairs are many."""
-    kernel = units.kernel('near', length)
+def _near(
+    units: Stops, part: int, kernels: Sequence[tuple[float, float]], share: int
+) -> FloatArray:
+    """Return J^T K J of errors fading in joint space, for (length, size) each.
+
+    By every `share`-th stop: pairs are many.
+    """
+    kernel = sum(size * units.kernel('near', length) for length, size in kernels)
     own = np.diag(kernel) * (share - share**2)
     kernel = share**2 * kernel + np.diag(own)
     rows = units.parts[part][:-1]
@@ -315,28 +320,46 @@ def _successive(
     system: System,
     kernels: Mapping[int, Sequence[tuple[float, float]]],
 ) -> dict[int, FloatArray]:
-    """Return by part J^T K J of errors fading in succession, for (length, size) each.
-
-    Each stop is multiplied with the sum of all before it, faded until then: a recursive filter.
-    """
-    from scipy.signal import lfilter  # slow to import, rarely needed
-
+    """Return by part J^T K J of errors fading in succession, for (length, size) each."""
     size = len(names)
     found = {part: np.zeros((size, size)) for part in kernels}
     for samples in system.sets if kernels else ():
-        states: dict[tuple[int, float], FloatArray] = {}
-        last = -1
+        ends: dict[int, tuple[int, FloatArray]] = {}
         for numbers, sums in samples.sums(chain, names, samples.observations.stops):
             for part in kernels.keys() & range(len(sums)):
                 rows = sums[part][:-1].reshape(-1, len(numbers))
-                flat = rows.reshape(size, -1)
-                for length, weight in kernels[part]:
-                    fade, key = np.exp(-1.0 / length), (part, length)
-                    state = states.get(key, np.zeros((len(rows), 1)))
-                    if numbers[0] == last:  # one stop may span blocks
-                        state = state / fade
-                    before, states[key] = lfilter([0.0, fade], [1.0, -fade], rows, zi=state)
-                    cross = flat @ before.reshape(size, -1).T
-                    found[part] += weight * (gram(flat) + cross + cross.T)
-            last = numbers[-1]
+                none = numbers[0], np.zeros((len(rows), len(kernels[part])))
+                ends[part] = _fading(
+                    found[part], rows, numbers, kernels[part], ends.get(part, none)
+                )
     return found
+
+
+def _fading(
+    found: FloatArray,
+    rows: FloatArray,
+    time: Index,
+    kernels: Sequence[tuple[float, float]],
+    end: tuple[int, FloatArray],
+) -> tuple[int, FloatArray]:
+    """Add to `found` (P, P) the J^T K J of rows (P c, n) of stops at times (n,), all distances.
+
+    Of K kernels, the rows of a run of stops are multiplied with a root of their sum, and with the
+    sums (P c, K) of all before it, faded until its `end`, a time. Return that of the last.
+    """
+    lengths, sizes = np.transpose(kernels)
+    last, before = end
+    turned, here, past = np.empty_like(rows), [], []
+    for first in range(0, len(time), SOME_POSES // 2):
+        run = np.s_[first : first + SOME_POSES // 2]
+        then, own = time[run, np.newaxis], rows[:, run]
+        fade = np.exp(-np.abs(then - time[run])[..., np.newaxis] / lengths)
+        turned[:, run] = own @ np.linalg.cholesky(fade @ sizes)
+        here.append(own @ (np.exp((last - then) / lengths) * sizes))
+        past.append(before)
+        before = before * np.exp((last - then[-1]) / lengths) + own @ fade[-1]
+        last = int(then[-1, 0])
+    one, other = (np.concatenate(each, axis=1).reshape(len(found), -1) for each in (here, past))
+    cross = one @ other.T
+    found += gram(turned.reshape(len(found), -1)) + cross + cross.T
+    return last, before

@@ -267,7 +267,7 @@ def test_errors_near_in_joint_space_have_the_kernel_of_their_distance():
             whole = share**2 * kernel
             np.fill_diagonal(whole, share)
             expected = np.einsum('pcn,nm,rcm->pr', own, whole, own)
-            found = shared_errors._near(units, part, 0.8, share)
+            found = shared_errors._near(units, part, [(0.8, 1.0)], share)
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
