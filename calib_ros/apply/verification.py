@@ -36,18 +36,16 @@ from calib_ros.decision.comparison import Comparison, compare
 from calib_ros.decision.steps import Step
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError
 from calib_ros.estimation.configurations import configurations
-from calib_ros.estimation.identifiability import excited
-from calib_ros.estimation.leastsquares import System, minimise, triangular_factor
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
-from calib_ros.estimation.samples import Samples
+from calib_ros.estimation.start import in_new_frames
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
-from calib_ros.kinematics.parameter import parameters_of
+from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import Settings
@@ -164,40 +162,42 @@ def verify(
     `commanded` (M, n) are joint values [rad or m] of the uncorrected program: the nominal arm
     defines the wanted poses there. Each measurement belongs to one of them, as it is or corrected.
 
-    Raises InputError for too few poses, distances, unknown devices or targets, or poses far from
-    all commands.
+    Raises InputError for too few poses, distances, unknown frames, or poses far from all commands.
     """
     fitted = ('base',) * new_base + ('tool',) * new_tool
-    require(Calibration, arm=arm)
-    _check(arm.chain, sets, tolerance, confidence, fitted)
-    comparison, left, uncorrected = _compared(arm, sets, commanded, fitted)
-    progress(2 / 3)
+    _check(arm, sets, tolerance, confidence, fitted)
     group = configurations(np.concatenate([each.joints for each in sets]))
-    moments = moments_of(comparison.after.position, group)
-    moments += SAME**2 * np.eye(3)  # simulated without noise
-    in_base = 6 // 3  # freedoms; the turn of a tool does not move the target
-    lost = new_base * in_base + new_tool
-    rms, count = _rms(moments, lost), len(moments)
-    numbers = np.unique(np.geomspace(count, max(count, DECIDING), 200).round().astype(int))
-    freedom = freedom_of(moments) * (numbers - lost)
-    lower, upper = rms_limits(rms, freedom, confidence)
+    comparison, left, uncorrected = _compared(arm, sets, commanded, fitted, group)
+    progress(2 / 3)
+    moments = moments_of(comparison.after.position, group) + SAME**2 * np.eye(3)  # without noise
+    lost = IN_A_FRAME // 3 * new_base + new_tool  # the turn of a tool does not move the target
+    rms, numbers, freedom, lower, upper = _interval(moments, lost, confidence, DECIDING)
     mistake = _mistake(arm, sets) if rms > Settings.largest_error else None
-    reused, common = arm.reused(sets), 1.0
-    verdict: tuple[Verdict, int | None] = ('no verdict', None)
-    limit = tolerance or arm.limit(sets)
-    odd = () if limit is None else _odd(moments, lost, limit, confidence)
-    if limit is not None:
-        verdict = _decided(limit, lower, upper, numbers)
-    if mistake or (reused and verdict[0] != 'FAIL'):
-        verdict = ('no verdict', None)
-    if tolerance is None:
-        verdict = (STANDS.get(verdict[0], verdict[0]), verdict[1])
-    if not new_base and all(each.pixels is None for each in sets):  # pixels have no positions
-        common = _rms(moments_of(left, group), in_base, least=0) / rms
-    found = (rms, float(lower[0]), float(upper[0]), float(freedom[0]), *verdict, common)
-    step = arm.step(sets) if verdict[0] in ('FAIL', 'does not hold') else None
-    known = (commanded is not None, fitted, reused, uncorrected, odd, mistake, step)
-    return Verification(comparison, tolerance, limit, confidence, group, *found, *known)
+    reused, limit = arm.reused(sets), tolerance or arm.limit(sets)
+    verdict, needed = _decided(limit, lower, upper, numbers)
+    if mistake or (reused and verdict != 'FAIL'):
+        verdict, needed = 'no verdict', None
+    return Verification(
+        comparison=comparison,
+        tolerance=tolerance,
+        limit=limit,
+        confidence=confidence,
+        group=group,
+        rms=rms,
+        lower=float(lower[0]),
+        upper=float(upper[0]),
+        freedom=float(freedom[0]),
+        verdict=STANDS.get(verdict, verdict) if tolerance is None else verdict,
+        needed=needed,
+        common=left / rms if left and not new_base else 1.0,
+        by_program=commanded is not None,
+        fitted=fitted,
+        reused=reused,
+        uncorrected=uncorrected,
+        odd=() if limit is None else _odd(moments, lost, limit, confidence),
+        mistake=mistake,
+        step=arm.step(sets) if verdict == 'FAIL' else None,
+    )
 
 
 def _compared(
@@ -205,10 +205,12 @@ def _compared(
     sets: Sequence[Observations],
     commanded: FloatArray | None,
     fitted: tuple[str, ...],
-) -> tuple[Comparison, FloatArray, bool]:
-    """Return the residuals, and those of position (N, 3) [m] without one common motion.
+    group: Index,
+) -> tuple[Comparison, float, bool]:
+    """Return the residuals, and their RMS [m] over configurations (N,) without a common motion.
 
-    And whether all were measured at the commanded joint values, not at corrected ones.
+    The latter is 0 for pixels, which have no positions. And whether all were measured at the
+    commanded joint values, not at corrected ones.
     """
     before, after = arm.before, arm.chain
     wanted, uncorrected = sets, False
@@ -223,8 +225,11 @@ def _compared(
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
     reached = compare(before, after, wanted).after
-    shaped = compare(before, _rebased(after, wanted), wanted).after
-    return replace(compare(before, after, sets), after=reached), shaped.position, uncorrected
+    left = 0.0
+    if all(each.pixels is None for each in sets):
+        shaped = compare(before, _rebased(after, wanted), wanted).after
+        left = _rms(moments_of(shaped.position, group), IN_A_FRAME // 3)
+    return replace(compare(before, after, sets), after=reached), left, uncorrected
 
 
 def _mistake(arm: Calibration, sets: Sequence[Observations]) -> mistakes.Explained | None:
@@ -232,15 +237,23 @@ def _mistake(arm: Calibration, sets: Sequence[Observations]) -> mistakes.Explain
     return mistakes.explained(problem, far=True) or mistakes.explained_alone(problem, arm.chain)
 
 
-def _rms(moments: FloatArray, lost: int, least: int = NEEDED) -> float:
+def _rms(moments: FloatArray, lost: int) -> float:
     """Return the RMS error [m] of configurations, some of them absorbed by fitted frames."""
-    count = len(moments)
-    if count - lost < least:
-        raise InputError(
-            f'{count} {"pose was" if count == 1 else "poses were"} measured; at least '
-            f'{least + lost} are needed' + f', {lost} of them for the refitted frames' * (lost > 0)
-        )
-    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(count - lost, 1)))
+    return float(np.sqrt(np.trace(moments.sum(axis=0)) / max(len(moments) - lost, 1)))
+
+
+def _interval(
+    moments: FloatArray, lost: int, confidence: float, most: int = 0
+) -> tuple[float, Index, FloatArray, FloatArray, FloatArray]:
+    """Return the RMS error [m], up to so many configurations (K,), and its freedom and limits."""
+    rms, count = _rms(moments, lost), len(moments)
+    if count - lost < NEEDED:
+        were, more = 'pose was' if count == 1 else 'poses were', NEEDED + lost
+        of_frames = f', {lost} of them for the refitted frames' if lost else ''
+        raise InputError(f'{count} {were} measured; at least {more} are needed{of_frames}')
+    numbers = np.unique(np.geomspace(count, max(count, most), 200).round().astype(int))
+    freedom = freedom_of(moments) * (numbers - lost)
+    return rms, numbers, freedom, *rms_limits(rms, freedom, confidence)
 
 
 def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tuple[int, ...]:
@@ -250,10 +263,9 @@ def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tup
     """
 
     def limits(which: Index) -> tuple[float, float]:
-        if (count := len(which) - lost) < NEEDED:
+        if len(which) - lost < NEEDED:
             return 0.0, np.inf
-        freedom = freedom_of(moments[which]) * np.array([count])
-        (lower,), (upper,) = rms_limits(_rms(moments[which], lost), freedom, confidence)
+        *_, (lower,), (upper,) = _interval(moments[which], lost, confidence)
         return float(lower), float(upper)
 
     squares = np.trace(moments, axis1=1, axis2=2)
@@ -270,9 +282,11 @@ def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tup
 
 
 def _decided(
-    tolerance: float, lower: FloatArray, upper: FloatArray, numbers: Index
+    tolerance: float | None, lower: FloatArray, upper: FloatArray, numbers: Index
 ) -> tuple[Verdict, int | None]:
     """Return the verdict by the first limits, and the least of the numbers that decides."""
+    if tolerance is None:
+        return 'no verdict', None
     decided = np.flatnonzero((upper <= tolerance) | (lower > tolerance))
     needed = int(numbers[decided[0]]) if decided.size else None
     if lower[0] <= tolerance < upper[0]:
@@ -281,12 +295,14 @@ def _decided(
 
 
 def _check(
-    chain: Chain,
+    arm: Calibration,
     sets: Sequence[Observations],
     tolerance: float | None,
     confidence: float,
     fitted: tuple[str, ...],
 ) -> None:
+    require(Calibration, arm=arm)
+    chain = arm.chain
     if isinstance(sets, Observations) or not sets:
         raise ConfigError('sets must be a list of Observations, at least one')
     if tolerance is not None and not 0.0 < tolerance < np.inf:
@@ -315,20 +331,15 @@ def _in_new_frames(chain: Chain, sets: Sequence[Observations], fitted: tuple[str
     A new tool gets its rotation from the orientations, if measured. If these hardly vary, the tool
     keeps its translation: the base absorbs the change.
     """
-    if 'base' in fitted:
-        chain = _rebased(chain, sets)
-    if 'tool' not in fitted:
+    new = [*dict.fromkeys(getattr(each, end) for end in fitted for each in sets)]
+    if not new:
         return chain
-    names = [name for each in sets for name in parameters_of(each.tool)[:3]]
-    if 'base' in fitted:
-        names = [name for each in sets for name in parameters_of(each.base)] + names
-    names = [*dict.fromkeys(names)]
+    for name in new:
+        chain = chain.with_frame(name, replace(chain.frame(name), fixed=False))
     plain = [replace(s, oriented=np.zeros_like(s.oriented), covariance=None) for s in sets]
-    sigmas = Settings.sigma_position, Settings.sigma_orientation  # alike for all
-    system = System(tuple(Samples(each, *sigmas) for each in plain))
-    known = excited(triangular_factor(chain, names, system), names)
-    chain = minimise(chain, known, system).chain
-    for tool in dict.fromkeys(each.tool for each in sets):
+    problem = Problem(chain, plain[0], more=plain[1:], loss='none')
+    chain = in_new_frames(problem, chain, new, problem.system(plain), needed=False)
+    for tool in (name for name in new if name in {each.tool for each in sets}):
         turns = np.zeros((3, 3))
         for each in (each for each in sets if each.tool == tool):
             now = chain.forward(each.joints, each.approach, each.base, tool)[each.oriented]

@@ -72,10 +72,12 @@ def start_frames(problem: Problem) -> Chain:
     return chain
 
 
-def in_new_frames(problem: Problem, arm: Chain, new: Sequence[str], system: System) -> Chain:
+def in_new_frames(
+    problem: Problem, arm: Chain, new: Sequence[str], system: System, needed: bool = True
+) -> Chain:
     """Return a known arm in `new` frames fitted to the system of all measurements.
 
-    Raises InputError if these do not show where the frames are.
+    Raises InputError if these do not show where the frames are, if that is `needed`.
     """
     known = arm
     for name in arm.frame_names:
@@ -84,7 +86,8 @@ def in_new_frames(problem: Problem, arm: Chain, new: Sequence[str], system: Syst
     own = movable(known, new)
     found = start_frames(replace(problem, chain=known))
     seen = excited(triangular_factor(found, own, system), own)
-    if hidden := set(structurally_independent(known, own, problem.kinds)).difference(seen):
+    hidden = set(structurally_independent(known, own, problem.kinds)).difference(seen)
+    if hidden and needed:
         frames = ' and '.join(dict.fromkeys(name.owner for name in own if name in hidden))
         raise InputError(
             f'{counted(system.count, "pose")} cannot place the new {frames}: measure more, all '

@@ -271,11 +271,17 @@ class LiveEstimate:
         chain, _, covariance, noise = self._estimate()
         jacobian = ErrorModel(chain, self._names).jacobian(self._joints)[:, :3]
         variance = ((jacobian @ covariance) * jacobian).sum(axis=(1, 2))
-        sigma = float(np.sqrt(variance.mean()))
         rms, ratio = self._left(chain)
-        excess = ratio if self._enough(self._rows) else None
-        arm = chain, self._names, covariance
-        return Estimate(*arm, len(self._added), sigma, float(np.sqrt(noise)), rms, excess)
+        return Estimate(
+            chain=chain,
+            names=self._names,
+            covariance=covariance,
+            samples=len(self._added),
+            sigma=float(np.sqrt(variance.mean())),
+            noise=float(np.sqrt(noise)),
+            rms=rms,
+            excess=ratio if self._enough(self._rows) else None,
+        )
 
     def _left(self, chain: Chain) -> tuple[float, float]:
         """Return the RMS position residual [m], and in units of the measurement scatter."""

@@ -237,5 +237,12 @@ def _sigmas(values: FloatArray, begins: Index, sigma: float) -> FloatArray:
 
 
 def _key(sample: Sample) -> StreamKey:
-    kind = sample.validation, sample.distance is not None, sample.eye_in_hand
-    return StreamKey(sample.device, sample.target, *kind, sample.frame_id, sample.view is not None)
+    return StreamKey(
+        device=sample.device,
+        target=sample.target,
+        validation=sample.validation,
+        distance=sample.distance is not None,
+        eye_in_hand=sample.eye_in_hand,
+        frame_id=sample.frame_id,
+        images=sample.view is not None,
+    )

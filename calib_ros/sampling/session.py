@@ -206,13 +206,19 @@ class CalibrationSession:
         notes = collector.notes.copy()
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
-        waiting = collector.waiting.count + self._pipeline.gate.held(POSES)
-        received = self.received[JOINTS], self.received[POSES], waiting
-        made = len(fitted), len(self.samples) - len(fitted), distinct
-        causes = self._filter.unused + collector.unused, self._dropped, notes
-        unused, dropped, noted = (dict(sorted(each.items())) for each in causes)
-        names = self._names.foreign, self._names.never
-        return Account(*received, *made, unused, dropped, noted, *names)
+        return Account(
+            joint_states=self.received[JOINTS],
+            poses=self.received[POSES],
+            waiting=collector.waiting.count + self._pipeline.gate.held(POSES),
+            samples=len(fitted),
+            held_out=len(self.samples) - len(fitted),
+            configurations=distinct,
+            unused=dict(sorted((self._filter.unused + collector.unused).items())),
+            dropped=dict(sorted(self._dropped.items())),
+            notes=dict(sorted(notes.items())),
+            foreign_names=self._names.foreign,
+            never_named=self._names.never,
+        )
 
     @property
     def _dropped(self) -> Counter[str]:

@@ -303,6 +303,15 @@ def test_a_target_that_was_mounted_anew(cell, arm, oriented):
         verify(arm, [seen[0].select(np.arange(7))], 3e-4, new_base=True, new_tool=True)
 
 
+@pytest.mark.parametrize(('seed', 'count'), [(2, 8), (10, 10)])
+def test_a_target_is_found_wherever_it_is_now(cell, arm, seed, count):
+    """Metres from where it was; from there the fit ended in another valley."""
+    rng = np.random.default_rng(seed)
+    frames = {'base': simulation.random_frame(rng, 2.0), 'tool': simulation.random_frame(rng, 3.0)}
+    seen = measured(replace(cell[0], **frames), UR.random_joints(count, rng))
+    assert verify(arm, [seen], 3e-3, new_base=True, new_tool=True).verdict == 'PASS'
+
+
 def test_limits_hold_where_some_places_are_worse_than_others():
     """As compliance leaves them: squares that scatter more than those of Gaussian noise."""
     rng = np.random.default_rng(0)
