@@ -118,25 +118,22 @@ class LiveEstimate:
         self._begun = 0  # samples at the start
         self._seen: list[Sample] = []
         self._pending: list[Sample] = []
-        self._latest: Estimate | None = None
         self.suspicious: list[Sample] = []
-        self.refused = ''
 
     def update(self, samples: Sequence[Sample]) -> Estimate | None:
         """Add the samples that are new since the last call, or restart with another list.
 
         Returns None while there are too few. An update takes at most MOST_AT_ONCE samples.
         """
-        estimate = self._updated(samples)
-        self.known = Update(estimate, self.refused, tuple(self.suspicious))
-        return estimate
+        self.known = self._updated(samples)
+        return self.known.estimate
 
-    def _updated(self, samples: Sequence[Sample]) -> Estimate | None:
+    def _updated(self, samples: Sequence[Sample]) -> Update:
         known = len(self._seen)
         if self._seen != list(samples[:known]):
             self.restart()
-        elif self._latest is not None and len(samples) == known and not self._pending:
-            return self._latest
+        elif self._chain is not None and len(samples) == known and not self._pending:
+            return self.known
         self._pending += [each for each in samples[len(self._seen) :] if not each.validation]
         self._seen = list(samples)
         fresh = self._pending[:MOST_AT_ONCE]
@@ -147,8 +144,10 @@ class LiveEstimate:
             fitted = [sample for sample in samples if not sample.validation]
             first = _spread(fitted)
             joints = np.array([sample.joints for sample in first])
-            if distinct(configurations(joints)) < START or not self._begin(first):
-                return None
+            if distinct(configurations(joints)) < START:
+                return Update()
+            if failed := self._begin(first):
+                return failed
             chosen = set(first)
             self._begun = len(fitted)
             self._seen = list(samples)
@@ -157,24 +156,25 @@ class LiveEstimate:
             del self._pending[: len(fresh)]
             self._add(fresh)
             self._settle()
-        self._latest = self._result()
-        return self._latest
+        return Update(self._result(), suspicious=tuple(self.suspicious))
 
-    def _begin(self, fitted: Sequence[Sample]) -> bool:
-        """Choose the parameters, fit robustly, and add rejected samples within the sigmas."""
+    def _begin(self, fitted: Sequence[Sample]) -> Update | None:
+        """Choose the parameters, fit robustly, and add rejected samples within the sigmas.
+
+        Returns an update if that is not possible.
+        """
         self.restart()
         try:
             problem = self._problem_of(fitted)
         except CalibrationError as err:
-            self.refused = str(err)
-            return False
+            return Update(refused=str(err))
         model = problem.model
         self._sigmas = (problem.sigma_position, problem.sigma_orientation)
         try:
             self._names = structurally_independent(model, problem.free, problem.kinds)
             chain = start_frames(problem)
         except (CalibrationError, np.linalg.LinAlgError):
-            return False
+            return Update()
         wide: dict[str, float] = {
             name: 1.0 if name.kind == DELAY else WIDE[name.kind in DH_ANGLES]
             for name in map(Parameter, self._names)
@@ -193,7 +193,7 @@ class LiveEstimate:
         self._linearise(robust.fit.chain)
         self._add([sample for sample, gross in judged if gross])
         self._settle()
-        return True
+        return None
 
     def _settle(self) -> None:
         for _ in range(ROUNDS):

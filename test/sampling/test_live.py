@@ -167,11 +167,11 @@ def test_samples_that_make_no_problem_yet_are_told_or_waited_for(rng, monkeypatc
     samples = seen(faulty(UR10E, Cell(), rng), 20, rng)
     live = LiveEstimate(session().problem_of)
     assert live.update([*samples, *by_wire(samples, 1e3)]) is None
-    assert 'are they in metres' in live.refused
+    assert 'are they in metres' in live.known.refused
     with monkeypatch.context() as failing:
         failing.setattr(live_module, 'start_frames', lambda *_: np.linalg.inv(np.zeros((1, 1))))
         assert live.update(samples) is None
-    assert live.refused == ''
+    assert live.known.refused == ''
     assert live.update(samples).samples == 20
 
 
