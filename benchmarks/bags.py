@@ -131,6 +131,9 @@ class Nobody:
     pictures = Pictures(lambda: Settings.sigma_pixel)
     warnings = ()
 
+    def miss(self, kind, count, cause):
+        """Do nothing."""
+
     def take(self, parts):
         """Do nothing."""
 

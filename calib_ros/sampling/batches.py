@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -23,17 +22,16 @@ from calib_ros.sampling.cdr import alike, read_header
 from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
+    JOINT_STATE,
     LINKS,
     PICTURES,
-    TRANSFORM,
     TRANSFORMS,
     MessageError,
+    Reading,
     Readings,
     frame_name,
     head_of,
-    reading,
-    transforms_in,
-    usable,
+    readings_of,
 )
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
@@ -47,11 +45,6 @@ OF_CAMERAS = (*PICTURES, CAMERA_INFO)
 Deserialise: TypeAlias = Callable[[Any, str], Any]  # converts bytes and a type to a message
 Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
 """Streams and their messages, serialised or not, in order of arrival."""
-MessageRow: TypeAlias = tuple[int, int, FloatArray]  # place, stamp [ns] and numbers of one message
-Decoded: TypeAlias = (
-    'tuple[Stream, Index, tuple[str, ...], tuple[int, int], Callable[[], Readings]]'
-)
-"""Messages with the same names: places (N,), names, first and last stamp, reader."""
 
 
 @dataclass(frozen=True)
@@ -123,117 +116,98 @@ def feed(session: CalibrationSession, batch: Batch, deserialise: Deserialise) ->
 
     Batching makes no difference. `deserialise` decodes messages without a known layout.
     """
-    found = DecodedBatch(batch, deserialise, session.pictures)
-    for kind, causes in found.faults.items():
-        for cause, count in causes.items():
-            session.miss(kind, count, cause)
+    parts, problems = decode(batch, deserialise, session.pictures, session.miss)
     try:
-        session.take(found.parts)
+        session.take(parts)
     except Exception:
-        found.problems.append(f'internal error: {traceback.format_exc()}')
-    return found.problems
+        problems.append(f'internal error: {traceback.format_exc()}')
+    return problems
 
 
-class DecodedBatch:
-    """The content of a batch of messages.
+def decode(
+    batch: Batch,
+    deserialise: Deserialise,
+    pictures: Pictures | None = None,
+    miss: Callable[[str, int, str], None] = lambda kind, count, cause: None,
+) -> tuple[list[Part], list[str]]:
+    """Return the content of messages, and texts about those that cannot be decoded.
 
-    Usable `parts`, counts of others by kind and cause (`faults`), and texts about messages that
-    cannot be decoded (`problems`).
+    Images are kept in `pictures`. `miss` is called with kind, number and cause of unusable ones.
     """
-
-    def __init__(
-        self, batch: Batch, deserialise: Deserialise, pictures: Pictures | None = None
-    ) -> None:
-        self._batch, self._deserialise, self._pictures = batch, deserialise, pictures
-        self.parts: list[Part] = []
-        self.faults: dict[str, Counter[str]] = {JOINTS: Counter(), POSES: Counter()}
-        self.problems: list[str] = []
-        groups: dict[tuple[str, int], list[int]] = {}
-        for place, (stream, data) in enumerate(batch):
-            if stream.type in OF_CAMERAS:
-                self._keep(place, stream, data)
-                continue
-            size = len(data) if isinstance(data, bytes) else 0
-            groups.setdefault((stream.topic, size), []).append(place)
-        linked: dict[Links, list[Linked]] = {}
-        for stream, where, strings, span, read in self._read(groups):
-            if stream.links is None:
-                self._add(stream.source, stream.type, where, read())
-                continue
-            link = frame_name(strings[0]), frame_name(strings[1])
-            one = Linked(where, stream.still, link, span, read)
-            linked.setdefault(stream.links, []).append(one)
-        for links, come in linked.items():
-            measured, causes = links.take(come)
-            self.faults[POSES] += causes
-            for each in measured:
-                self._add(each.source, TRANSFORM, each.places, each.readings)
-
-    def _read(self, groups: Mapping[tuple[str, int], Sequence[int]]) -> Iterator[Decoded]:
-        single: list[int] = []
-        for (_, size), group in groups.items():
-            stream, places = self._batch[group[0]][0], np.array(group)
-            left = np.ones(len(places), dtype=bool)
-            known = {} if stream.links is None else stream.links.layouts
-            blobs = [self._batch[place][1] for place in group]
-            for some in alike(stream.type, blobs, known) if size else ():
-                left[some.which] = False
-                where = places[some.which]
-                for k, item in enumerate(some.layout.items):
-                    yield stream, where, item.strings, some.span(k), partial(some.of, k)
-            single += places[left].tolist()
-        yield from self._decode(sorted(single))
-
-    def _add(self, source: Source | None, kind: str, places: Index, found: Readings) -> None:
-        if source is not None:  # some joint states may be those of another robot
+    parts: list[Part] = []
+    problems: list[str] = []
+    linked: dict[Links, list[Linked]] = {}
+    for stream, places, found in _read(batch, deserialise, pictures, miss, problems):
+        if stream.type != JOINT_STATE:
             found = found._replace(strings=tuple(map(frame_name, found.strings)))
-            good, causes = usable(kind, found)
-            self.faults[POSES] += causes
-            if not good.all():
-                places, found = places[good], found.rows(good)
-        if len(places):
-            self.parts.append(Part(places, source, found))
+        if stream.links is None:
+            parts.append(Part(places, stream.source, found))
+        else:
+            linked.setdefault(stream.links, []).append(Linked(places, stream.still, found))
+    for links, come in linked.items():
+        measured, faults = links.take(come)
+        parts += measured
+        for cause, count in faults.items():
+            miss(POSES, count, cause)
+    return parts, problems
 
-    def _keep(self, place: int, stream: Stream, data: Any) -> None:
-        source, pictures = stream.source, self._pictures
-        if source is None or pictures is None:
-            return
-        message = partial(self._deserialise, data, stream.type)
+
+def _read(
+    batch: Batch,
+    deserialise: Deserialise,
+    pictures: Pictures | None,
+    miss: Callable[[str, int, str], None],
+    problems: list[str],
+) -> Iterator[tuple[Stream, Index, Readings]]:
+    """Yield readings with the same names, and the places (N,) of their messages."""
+    single: list[int] = []
+    groups: dict[tuple[str, int], list[int]] = {}
+    for place, (stream, data) in enumerate(batch):
+        whole = stream.type in OF_CAMERAS or not isinstance(data, bytes)
+        group = single if whole else groups.setdefault((stream.topic, len(data)), [])
+        group.append(place)
+    for group in groups.values():
+        stream, places = batch[group[0]][0], np.array(group)
+        left = np.ones(len(places), dtype=bool)
+        known = {} if stream.links is None else stream.links.layouts
+        for some in alike(stream.type, [batch[place][1] for place in group], known):
+            left[some.which] = False
+            for k in range(len(some.layout.items)):
+                yield stream, places[some.which], some.of(k)
+        single += places[left].tolist()
+    rows: dict[tuple[Stream, tuple[str, ...], int], list[tuple[int, int, FloatArray]]] = {}
+    for place in sorted(single):
+        stream, data = batch[place]
+        message = partial(deserialise, data, stream.type)
         try:
-            if stream.type == CAMERA_INFO:
-                pictures.cameras[source.topic].learn(message())
-                return
-            serialised = isinstance(data, bytes)
-            stamp_ns, frame_id = read_header(data) if serialised else head_of(message())
+            if stream.type in OF_CAMERAS:
+                found = _kept(stream, data, message, pictures)
+            else:
+                found = readings_of(stream.type, message())
+            held = [(stamp, names, np.array(row, dtype=float)) for stamp, names, row in found]
+        except MessageError as err:
+            miss(JOINTS, 1, str(err))
         except Exception as err:  # damaged bytes fail in many ways
-            self.problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
-            return
-        number = pictures.keep(source.topic, len(data) if serialised else 0, message)
-        stamps = np.array([stamp_ns], dtype=np.int64)
-        found = Readings(stamps, (frame_id,), np.array([[float(number)]]))
-        self._add(source, stream.type, np.array([place]), found)
+            problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
+        else:
+            for stamp, names, row in held:
+                rows.setdefault((stream, names, len(row)), []).append((place, stamp, row))
+    for (stream, names, _), same in rows.items():
+        where, stamps, numbers = zip(*same, strict=True)
+        readings = Readings(np.array(stamps, dtype=np.int64), names, np.array(numbers))
+        yield stream, np.array(where), readings
 
-    def _decode(self, places: Sequence[int]) -> Iterator[Decoded]:
-        alike: dict[tuple[Stream, tuple[str, ...], int], list[MessageRow]] = {}
-        for place in places:
-            stream, data = self._batch[place]
-            try:
-                message = self._deserialise(data, stream.type)
-                if stream.links is None:
-                    found = [reading(stream.type, message)]
-                else:
-                    found = [reading(TRANSFORM, e) for e in transforms_in(message, stream.type)]
-                rows = [(t, (place, s, np.array(n, dtype=np.float64))) for s, t, n in found]
-            except MessageError as err:
-                self.faults[JOINTS][str(err)] += 1
-                continue
-            except Exception as err:  # damaged bytes fail in many ways
-                self.problems.append(f'a message on {stream.topic} cannot be decoded: {err!r}')
-                continue
-            for strings, row in rows:
-                alike.setdefault((stream, strings, len(row[2])), []).append(row)
-        for (stream, strings, _), some in alike.items():
-            where, stamps, numbers = zip(*some, strict=True)
-            stamps_ns = np.array(stamps, dtype=np.int64)
-            read = partial(Readings, stamps_ns, strings, np.array(numbers))
-            yield stream, np.array(where), strings, (stamps[0], stamps[-1]), read
+
+def _kept(
+    stream: Stream, data: Any, message: Callable[[], Any], pictures: Pictures | None
+) -> list[Reading]:
+    """Keep an image, or learn from a CameraInfo; return the stamp and number of an image."""
+    if stream.source is None or pictures is None:
+        return []
+    if stream.type == CAMERA_INFO:
+        pictures.cameras[stream.source.topic].learn(message())
+        return []
+    serialised = isinstance(data, bytes)
+    stamp_ns, frame_id = read_header(data) if serialised else head_of(message())
+    number = pictures.keep(stream.source.topic, len(data) if serialised else 0, message)
+    return [(stamp_ns, (frame_id,), (float(number),))]

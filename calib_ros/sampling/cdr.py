@@ -83,12 +83,6 @@ class Alike:
         stamps = seconds * 1_000_000_000 + _numbers(self.rows, stamp + 4, '<u4', 1)[:, 0]
         return Readings(stamps, strings, _numbers(self.rows, begin, kind, width).astype(float))
 
-    def span(self, k: int) -> tuple[int, int]:
-        """Return the first and last stamp of item k."""
-        at = self.layout.items[k].stamp
-        (s, ns), (t, nt) = (struct.unpack_from('<iI', self.rows[end], at) for end in (0, -1))
-        return s * 1_000_000_000 + ns, t * 1_000_000_000 + nt
-
 
 def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]) -> list[Alike]:
     """Return messages of one type and length grouped by layout, without those that have none.

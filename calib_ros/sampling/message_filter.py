@@ -10,8 +10,8 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from calib_ros.kinematics.se3 import Index
-from calib_ros.sampling.messages import JOINT_STATE, Readings, usable
+from calib_ros.kinematics.se3 import Flags, Index
+from calib_ros.sampling.messages import JOINT_STATE, PICTURES, Readings, usable
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, JointIndices, Piece, StreamKey
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
@@ -133,6 +133,17 @@ class Part(NamedTuple):
     source: Source | None
     readings: Readings
 
+    @property
+    def type(self) -> str:
+        """Return what tells kinds of numbers apart (`usable`)."""
+        if self.source is None:
+            return JOINT_STATE
+        return PICTURES[0] if self.source.board else ''
+
+    def rows(self, which: Flags | slice) -> Part:
+        """Return some readings, by a mask (N,) or a slice."""
+        return Part(self.places[which], self.source, self.readings.rows(which))
+
 
 class MessageFilter:
     """Admission of usable messages; others are counted by cause."""
@@ -148,7 +159,8 @@ class MessageFilter:
     def pieces(self, parts: Sequence[Part], recording: bool) -> list[Piece]:
         """Return the messages to keep."""
         joints = [each for each in parts if each.source is None]
-        measured = [each for each in parts if each.source is not None]
+        measured = [self._usable(each) for each in parts if each.source is not None]
+        measured = [each for each in measured if len(each.places)]
         return [*self._joints(joints, recording), *self._measured(measured, recording)]
 
     def miss(self, kind: str, count: int, cause: str) -> None:
@@ -157,6 +169,12 @@ class MessageFilter:
         self.dropped[f'{kind}: {cause}'] += count
         if cause != OTHERS:
             self.refused[kind] = cause
+
+    def _usable(self, part: Part) -> Part:
+        good, causes = usable(part.type, part.readings)
+        for cause, count in causes.items():
+            self.miss(POSES if part.source else JOINTS, count, cause)
+        return part if good.all() else part.rows(good)
 
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
         latest = -1
@@ -168,11 +186,8 @@ class MessageFilter:
             values = numbers[:, index]
             for place in np.flatnonzero(index == NOWHERE):
                 values[:, place] = self._names.held[columns[place]]
-            good, causes = usable(JOINT_STATE, Readings(stamps, (), values))
-            for cause, count in causes.items():
-                self.miss(JOINTS, count, cause)
-            if not good.all():
-                places, stamps, values = places[good], stamps[good], values[good]
+            part = self._usable(Part(places, None, Readings(stamps, (), values)))
+            places, _, (stamps, _, values) = part
             if not len(stamps):
                 continue
             self.received[JOINTS] += len(stamps)
@@ -217,9 +232,5 @@ class MessageFilter:
             if device not in self._frames.usual:
                 frames.setdefault(device, set()).add(frame_id)
         if deciding or any(len(some) > 1 for some in frames.values()):
-            parts = [
-                Part(part.places[k : k + 1], part.source, part.readings.rows(slice(k, k + 1)))
-                for part in parts
-                for k in range(len(part.places))
-            ]
+            parts = [part.rows(slice(k, k + 1)) for part in parts for k in range(len(part.places))]
         return sorted(parts, key=lambda part: int(part.places[0]))

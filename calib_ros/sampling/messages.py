@@ -8,12 +8,9 @@ are counted by cause.
 
 from __future__ import annotations
 
-import functools
-import itertools
 from collections import Counter
 from collections.abc import Callable, Sequence
-from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +32,10 @@ PICTURES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
 NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
+
+
+Reading: TypeAlias = tuple[int, tuple[str, ...], Sequence[float]]
+"""Stamp [ns], strings and numbers of one reading, as in `Readings`."""
 
 
 class MessageError(InputError):
@@ -84,16 +85,25 @@ DECODERS: dict[str, Callable[[Any], Sequence[float]]] = {
 """Measurement types, and functions from messages to numbers."""
 
 
-def reading(kind: str, message: Any) -> tuple[int, tuple[str, ...], Sequence[float]]:
-    """Return stamp [ns], strings and numbers of a message, as in `Readings`."""
+def readings_of(kind: str, message: Any) -> list[Reading]:
+    """Return what a message holds: one row, or one for each of its transforms or bodies."""
+    if kind == TRANSFORMS:
+        return [row for each in message.transforms for row in readings_of(TRANSFORM, each)]
     stamp_ns, frame_id = head_of(message)
     if kind == JOINT_STATE:
         if len(message.name) != len(message.position):
             raise MessageError('names and positions differ in number')
-        return stamp_ns, (frame_id, *message.name), message.position
+        return [(stamp_ns, (frame_id, *message.name), message.position)]
+    if kind in BODIES:
+        bodies, name = BODIES[kind]
+        return [
+            (stamp_ns, (frame_id, getattr(body, name)), _pose(at.position, at.orientation))
+            for body in getattr(message, bodies)
+            for at in (body.pose,)
+        ]
     child = getattr(message, 'child_frame_id', None)
     strings = (frame_id,) if child is None else (frame_id, child)
-    return stamp_ns, strings, DECODERS[kind](message)
+    return [(stamp_ns, strings, DECODERS[kind](message))]
 
 
 def head_of(message: Any) -> tuple[int, str]:
@@ -136,39 +146,14 @@ def usable(kind: str, found: Readings) -> tuple[Flags, Counter[str]]:
         refuse(~(np.abs(length - 1.0) <= ROUNDED), NOT_UNIT)
     if width > 7:
         rows = numbers[:, 7:]
-        changes = np.flatnonzero((rows[1:] != rows[:-1]).any(axis=1)) + 1
-        for begin, end in itertools.pairwise((0, *changes.tolist(), len(rows))):
-            if fault := _fault(rows[begin].tobytes()):
-                faulty = np.zeros(len(rows), dtype=bool)
-                faulty[begin:end] = True
-                refuse(faulty, fault)
+        fresh = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))  # most devices repeat one
+        faults = covariance_faults(rows[fresh].reshape(-1, 6, 6))[np.cumsum(fresh) - 1]
+        for fault in dict.fromkeys(faults.tolist()):
+            if fault:
+                refuse(faults == fault, f'{fault} (leave it zero if it is not known)')
     if not found.child.isprintable():  # it is written to tables
         refuse(good.copy(), 'child frame whose name cannot be printed')
     return good, causes
-
-
-@functools.lru_cache(maxsize=16)  # most devices repeat one
-def _fault(covariance: bytes) -> str:
-    fault = str(covariance_faults(np.frombuffer(covariance).reshape(1, 6, 6))[0])
-    return fault and f'{fault} (leave it zero if it is not known)'
-
-
-def transforms_in(message: Any, kind: str) -> Sequence[Any]:
-    """Return the links in a message, each like a TransformStamped."""
-    if kind == TRANSFORMS:
-        found: Sequence[Any] = message.transforms
-        return found
-    bodies, name = BODIES[kind]
-    return [
-        SimpleNamespace(
-            header=message.header,
-            child_frame_id=getattr(body, name),
-            transform=SimpleNamespace(
-                translation=body.pose.position, rotation=body.pose.orientation
-            ),
-        )
-        for body in getattr(message, bodies)
-    ]
 
 
 def frame_name(name: str) -> str:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from calib_ros.errors import InputError
-from calib_ros.sampling.batches import DecodedBatch, Deserialise, Stream, batches, source_streams
+from calib_ros.sampling.batches import Deserialise, Stream, batches, decode, source_streams
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
     DECODERS,
@@ -99,7 +99,7 @@ def _others(recorded: Recorded) -> list[str]:
 
 def _learn(recorded: Recorded, streams: Mapping[str, Stream]) -> None:
     for batch, _ in batches(recorded.messages_on(streams)):
-        DecodedBatch(batch, recorded.deserialise)
+        decode(batch, recorded.deserialise)
 
 
 def outputs(available: Mapping[str, str]) -> set[str]:
@@ -114,11 +114,10 @@ def check_joints(
 ) -> None:
     """Refuse joint states with an InputError if several topics name the same joints."""
     topics: dict[str, set[str]] = {name: set() for name in joint_names}
-    for topic, stream in streams.items():
-        for batch, _ in batches(recorded.messages_on({topic: stream})):
-            for part in DecodedBatch(batch, recorded.deserialise).parts:
-                for name in topics.keys() & part.readings.strings[1:]:
-                    topics[name].add(topic)
+    for batch, _ in batches(recorded.messages_on(streams)):
+        for part in decode(batch, recorded.deserialise)[0]:
+            for name in topics.keys() & part.readings.strings[1:]:
+                topics[name].add(batch[part.places[0]][0].topic)
     twice = {name: found for name, found in topics.items() if len(found) > 1}
     if twice:
         raise InputError(

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
@@ -35,16 +35,17 @@ STATIC = '_static'  # suffix of the topic of static links
 
 
 class Linked(NamedTuple):
-    """Transforms between two frames, from messages at `places` (N,) in the batch.
-
-    Numbers are read on demand; first and last stamp are known.
-    """
+    """Transforms between two frames, from messages at `places` (N,) in the batch."""
 
     places: Index
     still: bool
-    link: Pair
-    span: tuple[int, int]
-    read: Callable[[], Readings]
+    readings: Readings
+
+    @property
+    def link(self) -> Pair:
+        """Return the parent and child frame."""
+        parent, child = self.readings.strings
+        return parent, child
 
 
 class Route(NamedTuple):
@@ -113,9 +114,8 @@ class Links:
         for each in come:
             if each.still or not (self._open or each.link in self._wanted):
                 continue
-            read = each.read()
-            good, causes = usable(TRANSFORM, read)
-            read, measured = read.rows(good), self._of(each.link)
+            good, causes = usable(TRANSFORM, each.readings)
+            read, measured = each.readings.rows(good), self._of(each.link)
             faults += Counter({cause: n * len(measured) for cause, n in causes.items()})
             self._held.append((each.link, read))
             places = each.places[good]
@@ -131,9 +131,9 @@ class Links:
         return found, faults
 
     def _fix(self, come: Linked) -> None:
-        found = come.read()
-        good, _ = usable(TRANSFORM, found._replace(stamps_ns=np.ones_like(come.places)))
-        for numbers in found.numbers[good]:
+        stamped = come.readings._replace(stamps_ns=np.ones_like(come.places))  # they need none
+        good, _ = usable(TRANSFORM, stamped)
+        for numbers in stamped.numbers[good]:
             matrix = se3.transform(se3.from_quat(numbers[3:]), numbers[:3])
             before = self._fixed.setdefault(come.link, matrix)
             if not np.allclose(before, matrix, rtol=0.0, atol=SAME):
@@ -141,7 +141,7 @@ class Links:
             self._known = False
 
     def _move(self, come: Linked) -> None:
-        link, (first_ns, last_ns) = come.link, come.span
+        link, (first_ns, last_ns) = come.link, come.readings.stamps_ns[[0, -1]].tolist()
         if link not in self._moving:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()

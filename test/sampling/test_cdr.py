@@ -16,7 +16,7 @@ from recorded import (
 )
 
 from calib_ros.sampling.cdr import alike, trajectory_size
-from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Readings, reading, usable
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Readings, readings_of, usable
 
 NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 NUMBERS = st.floats(-1e6, 1e6)
@@ -33,7 +33,7 @@ def assert_decoded(kind, blobs):
     """At once as one by one."""
     found = decode(kind, blobs)
     for k, blob in enumerate(blobs):
-        stamp_ns, strings, numbers = reading(kind, TYPESTORE.deserialize_cdr(blob, kind))
+        ((stamp_ns, strings, numbers),) = readings_of(kind, TYPESTORE.deserialize_cdr(blob, kind))
         assert (stamp_ns, strings) == (found.stamps_ns[k], found.strings)
         np.testing.assert_array_equal(numbers, found.numbers[k])
 

@@ -24,7 +24,7 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.cdr import alike
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, Readings
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
 from calib_ros.sampling.transforms import Linked, Links
@@ -241,8 +241,9 @@ def test_frames_without_end_are_not_remembered(rng):
     session = session_fed([*come, tf(link('tracker', 'tool', 701 * MS, frame(rng)))])
     assert session.account().samples == 5
     links = Links('/tf')
+    at, numbers = np.zeros(1, int), np.array([[0.0] * 6 + [1.0]])
     for k in range(1500):
-        links.take([Linked(np.zeros(1, int), False, ('tracker', f'marker {k}'), (k, k), None)])
+        links.take([Linked(at, False, Readings(at + k, ('tracker', f'marker {k}'), numbers))])
     assert 'and 980 more' in str(links)
 
 
