@@ -5,7 +5,7 @@
 from dataclasses import fields
 
 import numpy as np
-from streams import START, stamps, stops
+from streams import stamps, stops
 
 from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.sample import Sample
@@ -75,8 +75,9 @@ def give(made, come):
     ]
     left = Slice.of(pieces, round(1e9 * made.settings.delay)) if pieces else ()
     while len(left):
-        count = made.reach(left, (0, 2 * START))
-        if rounds := made.take(left.between(0, count)):
+        count, rounds = made.reach(left, lambda stamp: False)
+        made.take(left.between(0, count))
+        if rounds:
             made.round(rounds)
         left = left.between(count, len(left))
 

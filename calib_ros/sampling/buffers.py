@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.kinematics.se3 import FloatArray
-from calib_ros.sampling.slices import NO_ACCIDENT, Slice, Stamps, StreamKey
+from calib_ros.sampling.slices import NO_ACCIDENT, Stamps, StreamKey
 from calib_ros.values import MOST_NAMES
 
 AS_FLOATS = 8.0 * float(np.finfo(np.float32).eps)
@@ -168,15 +168,3 @@ class Waiting(dict[StreamKey, Rows]):
             self._dropped['measurements: pose buffer full'] += len(due) - len(taken)
         rows.extend(stamps[taken], numbers[taken])
         return True
-
-    def room(self, given: Slice) -> int:
-        """Return up to where messages fit; 0 if room must be made."""
-        streams = [each for each in given.pieces if isinstance(each.key, StreamKey)]
-        if len(self.keys() | {each.key for each in streams}) > MOST_NAMES:
-            return 0
-        end = len(given)
-        for key, places, *_ in streams:
-            assert isinstance(key, StreamKey)
-            room = self._capacity - (self[key].count if key in self else 0)
-            end = int(min([end, *(places[room : room + 1] - given.begin).tolist()]))
-        return end

@@ -16,7 +16,7 @@ from calib_ros.sampling.collector import Collector
 from calib_ros.sampling.delay import LEAST_MOTION, SMOOTHING, STEP, Delay, find_delay
 from calib_ros.sampling.hints import Hint, ambiguous, clocks_moved, disagreement, stuck
 from calib_ros.sampling.sampler import POSITION_SLICE, QUAT_SLICE
-from calib_ros.sampling.slices import JOINTS, Piece, Series, Slice, StreamKey
+from calib_ros.sampling.slices import Piece, Series, StreamKey
 from calib_ros.settings import Settings
 from calib_ros.shown import NAMED
 from calib_ros.values import MOST_NAMES
@@ -42,7 +42,7 @@ class Clocks:
         self._chain = chain
         self._continuous = settings.mode == 'continuous'
         self._found: Delay | None = None  # in the motion that is sampled
-        self._looked_ns = 0
+        self._searched_ns = self._looked_ns = 0  # when it last did; 0 to begin with the next round
         self._joints = Rows(len(chain.joints), settings.pose_buffer)
         self._poses: dict[StreamKey, Rows] = {}
         self._unrest = self._taken = self._agreed = 0
@@ -67,7 +67,7 @@ class Clocks:
         There were `calm` samples before the first of these, and `taken` by now.
         """
         if unrest > self._unrest and not self._awake:
-            self._awake, self._agreed = True, calm
+            self._awake, self._agreed, self._looked_ns = True, calm, 0
         self._unrest, self._taken = unrest, taken
 
     def take(self, pieces: Sequence[Piece]) -> None:
@@ -85,21 +85,21 @@ class Clocks:
             fresh = fresh[: rows.capacity - rows.count]
             rows.extend(stamps[fresh], numbers[fresh, : rows.width])
 
-    @property
-    def _begun_ns(self) -> int | None:
-        return int(self._joints.stamps[0]) if self._joints.count else None
-
-    def calm(self, given: Slice) -> tuple[int, int]:
-        """Return joint stamps between which nothing needs to be evaluated."""
-        begun = self._begun_ns
-        if begun is None:
-            begun = int(given.times[given.where(JOINTS)[:1]].sum())
-        return begun - WATCH_NS, begun + WATCH_NS
+    def due(self, now_ns: int) -> bool:
+        """Tell whether it is time to evaluate the motion."""
+        return not 0 <= now_ns - self._looked_ns <= WATCH_NS
 
     def look(self, now_ns: int) -> None:
-        """Evaluate the motion if it is time to, and start again."""
-        if not (self._awake and self._begun_ns and abs(now_ns - self._begun_ns) > WATCH_NS):
+        """Evaluate the motion if it is due, and start again."""
+        if not self.due(now_ns):
             return
+        if self._looked_ns and self._joints.count:
+            self._evaluate()
+        self._looked_ns = now_ns
+        self._joints.keep(slice(0))
+        self._poses.clear()
+
+    def _evaluate(self) -> None:
         joints, poses = self._joints, self._poses.values()
         for rows in (joints, *poses):
             rows.sort()
@@ -109,8 +109,6 @@ class Clocks:
         self._deaf += deaf
         self._stuck = deaf or (stand and self._stuck)
         found = self._delay_of((joints.stamps, joints.values), measured)
-        joints.release(joints.count)
-        self._poses.clear()
         if found is None:
             return
         known = self._seen
@@ -139,9 +137,9 @@ class Clocks:
         """
         if not collector.holding:
             return
-        if now_ns is not None and 0 <= now_ns - self._looked_ns < 1e9 * LEAST_MOTION:
+        if now_ns is not None and 0 <= now_ns - self._searched_ns < 1e9 * LEAST_MOTION:
             return
-        self._looked_ns = now_ns or 0
+        self._searched_ns = now_ns or 0
         self._found = self._delay_of(*collector.known(now_ns))
         if self.delay is not None:
             collector.delay_ns = round(self.delay.seconds * 1e9)

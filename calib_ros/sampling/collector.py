@@ -12,7 +12,7 @@ cause.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -21,10 +21,11 @@ from calib_ros.sampling.buffers import Rows, Waiting
 from calib_ros.sampling.hints import Hint, apart, ended, restless, sparse
 from calib_ros.sampling.sample import Sample
 from calib_ros.sampling.sampler import ROW_WIDTH, Found, Numbered, Sampler
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, Stamps, StreamKey
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Series, Slice, StreamKey
 from calib_ros.sampling.stops import SAMPLED, Known, Rests, Schedule, seen_stops
 from calib_ros.sampling.track import APART, CAUSES, Track
 from calib_ros.settings import Settings
+from calib_ros.values import MOST_NAMES
 
 REST_S = 0.5 * Settings.shortest_stop  # time [s] without motion after which joints stand
 TWICE = 'same stamp twice'
@@ -72,75 +73,62 @@ class Collector:
         joints, *positions = [(t[t <= until], values[t <= until]) for t, values in every]
         return joints, positions
 
-    def reach(self, given: Slice, calm: tuple[int, int]) -> int:
-        """Return how many messages to take up to the next that requires work.
+    def reach(self, given: Slice, due: Callable[[int], bool]) -> tuple[int, list[int]]:
+        """Return how many messages to take up to the next that requires work, and its rounds.
 
-        Rounds due before it are made up for with the last one if no message can tell the
-        difference: none is late for them, and there is room. It is the first joint sample beyond
-        the two stamps `calm`, between which nobody else has work.
+        These are stamps of joint samples. All but the last are made up for with it, unless others
+        have work at one of them (`due`), a message is late for them, or there is no room.
         """
         if self.track.full:  # sample before the older half is dropped
             self._round(self._complete_ns)
         if self.track.full:
             self.notes['joint states dropped, the joint buffer was full'] += self.track.halve()
-        count = len(given)
-        joints = given.where(JOINTS)
-        stamps = given.times[joints]
-        late = joints[stamps < self.track.horizon_ns]
-        if len(late):  # handled one by one
-            count = max(int(late[0]), 1)
+        times, joints = given.times, given.where(JOINTS)
+        late = joints[times[joints] < self.track.horizon_ns][:1]  # handled one by one
+        ends: list[int] = [len(given), *np.maximum(late, 1).tolist()]
         for columns in {each.key for each in given.pieces if not isinstance(each.key, StreamKey)}:
-            room = self.track.room(columns)
-            if room <= len(joints):
-                places = [each.places for each in given.pieces if each.key == columns]
-                full = np.sort(np.concatenate(places))[room - 1 : room] - given.begin
-                count = int(min([count, *(full + 1).tolist()]))
-        rounds = joints[self._rounds(stamps, calm)]
-        if not len(rounds) or rounds[0] >= count:
-            return count
-        if len(rounds) > 1:
-            rounds = rounds[rounds < max(self._alike(given, int(rounds[0]) + 1, count), rounds[1])]
-        return int(rounds[-1]) + 1
-
-    def _rounds(self, stamps: Stamps, calm: tuple[int, int]) -> list[int]:
-        """Return the joint samples at which a round is due, up to the first that is not calm."""
-        found, last = [], self._advanced_ns
-        first, end = (0, 0) if self.holding else calm
-        for k, stamp in enumerate(stamps.tolist()):
+            places = [each.places for each in given.pieces if each.key == columns]
+            full = np.sort(np.concatenate(places))[self.track.room(columns) - 1 :][:1]
+            ends += (full - given.begin + 1).tolist()
+        rounds, last = [], self._advanced_ns
+        joints = joints[joints < min(ends)]
+        for k, stamp in zip(joints.tolist(), times[joints].tolist(), strict=True):
             if stamp - last >= ADVANCE_NS:
-                found.append(k)
+                rounds.append(k)
                 last = stamp
-                if not first <= stamp <= end:
+                if self.holding or due(stamp):
                     break
-        return found
+        if len(rounds) > 1:
+            alike = self._alike(given, rounds[0] + 1)
+            rounds = [k for k in rounds if k < max(alike, rounds[1])]
+        return (rounds[-1] + 1 if rounds else min(ends)), times[rounds].tolist()
 
-    def _alike(self, given: Slice, begin: int, end: int) -> int:
+    def _alike(self, given: Slice, begin: int) -> int:
         """Return the end of the messages that give the same before or after a round."""
-        times, joints = given.times[:end], given.joints[:end]
-        newest = np.maximum.accumulate(np.where(joints, times, self._newest_ns))
+        fullest = max((rows.count for rows in self.waiting.values()), default=0)
+        streams = len(self.waiting) + len(given.pieces)
+        if fullest + len(given) > self.settings.pose_buffer or streams > MOST_NAMES:
+            return begin
+        newest = np.maximum.accumulate(np.where(given.joints, given.times, self._newest_ns))
         delay_ns = self.delay_ns - round(self.settings.delay * 1e9)  # beyond that of the slice
-        late = times - np.where(joints, 0, delay_ns) <= newest - self._late_ns
-        end = begin + int(np.argmax(np.append(late[begin:], True)))
-        return min(end, self.waiting.room(given))
+        late = given.times - np.where(given.joints, 0, delay_ns) <= newest - self._late_ns
+        return begin + int(np.argmax(np.append(late[begin:], True)))
 
-    def take(self, given: Slice) -> list[int]:
-        """Take messages up to one that gives something to do; return the stamps of its rounds."""
+    def take(self, given: Slice) -> None:
+        """Take messages that need no work before the last one."""
         joints = given.where(JOINTS)
-        rounds: list[int] = []
         last = np.maximum.accumulate(np.where(given.joints, np.arange(len(given)), -1))
         before = np.where(last < 0, self._newest_ns, given.times[last])
         if len(joints):
-            stamps = given.times[joints]
-            newest = int(stamps[-1])
+            newest = int(given.times[joints[-1]])
             if newest < self.track.horizon_ns:
                 self._backwards += 1
                 if self._backwards < NO_ACCIDENT:
                     self.dropped['joints: later than lateness allows'] += 1
-                    return []
+                    return
                 self.start_anew()
             self._backwards = 0
             self._newest_ns = newest
-            rounds = stamps[self._rounds(stamps, (0, newest))].tolist()
         for key, places, stamps, numbers in given.pieces:
             if isinstance(key, StreamKey):
                 after, at = self._settled_ns + self.delay_ns, before[places - given.begin]
@@ -148,7 +136,6 @@ class Collector:
                     self.waiting.apart[key].note(stamps - self.delay_ns, at, self._lateness_ns)
             else:
                 self.track.extend(key, stamps, numbers)
-        return rounds
 
     def round(self, rounds: Sequence[int]) -> None:
         """Make samples of what is complete, for rounds at joint stamps."""

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -40,24 +40,12 @@ class Pipeline:
 
     def take(self, pieces: Sequence[Piece]) -> None:
         """Take messages; an error loses only the slice that causes it."""
-        error: Exception | None = None
-        come = self.gate.through(Slice.of(pieces, self._delay_ns)) if pieces else ()
-        for passed, moved in come:
-            if moved and passed.times[0] < self.collector.track.horizon_ns:
-                self.collector.start_anew()
-            for given in self._up_to_work(passed):
-                try:
-                    self._keep(given)
-                except Exception as err:
-                    error = error or err
-        if error is not None:
-            raise error
+        if pieces:
+            self._pass(self.gate.through(Slice.of(pieces, self._delay_ns)))
 
     def finish(self) -> None:
         """Make samples of all waiting messages; no more will arrive."""
-        for held in self.gate.release():
-            for given in self._up_to_work(held):
-                self._keep(given)
+        self._pass((held, False) for held in self.gate.release())
         self.clocks.find(self.collector, None)
         self.collector.finish()
         self.hand_over()
@@ -85,15 +73,22 @@ class Pipeline:
         between = 0 if sampler.rested else self.collector.unused[f'{POSES}: {MOVING}']
         return found + (unmeasured(missed, between) if sampler.rested or between else [])
 
-    def _up_to_work(self, given: Slice) -> Iterator[Slice]:
-        begin = 0
-        while begin < len(given):
-            left = given.between(begin, len(given))
-            count = self.collector.reach(left, self.clocks.calm(left))
-            yield left.between(0, count)
-            begin += count
+    def _pass(self, come: Iterable[tuple[Slice, bool]]) -> None:
+        error: Exception | None = None
+        for left, moved in come:
+            if moved and left.times[0] < self.collector.track.horizon_ns:
+                self.collector.start_anew()
+            while len(left):
+                count, rounds = self.collector.reach(left, self.clocks.due)
+                try:
+                    self._keep(left.between(0, count), rounds)
+                except Exception as err:
+                    error = error or err
+                left = left.between(count, len(left))
+        if error is not None:
+            raise error
 
-    def _keep(self, given: Slice) -> None:
+    def _keep(self, given: Slice, rounds: Sequence[int]) -> None:
         for kind in (JOINTS, POSES):
             times = given.times[given.where(kind)]
             if len(times):
@@ -103,7 +98,7 @@ class Pipeline:
                     note = f'{kind} with a stamp older than the one before'
                     self.collector.notes[note] += back
         self.clocks.take(given.pieces)
-        rounds = self.collector.take(given)
+        self.collector.take(given)
         if rounds:
             self.clocks.find(self.collector, rounds[-1])
             self.collector.round(rounds)

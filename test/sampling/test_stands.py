@@ -1,12 +1,8 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-from collections import Counter
-
 import numpy as np
 import pytest
 
-from calib_ros.sampling.buffers import Waiting
-from calib_ros.sampling.slices import Piece, Slice, StreamKey
 from calib_ros.sampling.stops import SAMPLED, SPIKE, Known, Rests, Schedule, seen_stops
 from calib_ros.settings import Settings
 
@@ -76,17 +72,3 @@ def test_a_stop_shows_from_its_shortest_time_on_until_it_is_dealt_with():
     assert found == [False, True, True, True, True, False]
     assert seen_stops(stands, [15], 20, 4, 4) == [False]
     assert seen_stops(stands, [15], 19, 4, 4) == [True]
-
-
-def test_there_is_room_up_to_the_first_message_that_does_not_fit():
-    key = StreamKey('', '', False, False, False)
-    joints = Piece(('j',), np.array([0]), np.array([0]), np.zeros((1, 1)))
-    poses = Piece(key, np.array([1, 3, 4]), np.array([5, 6, 7]), np.zeros((3, 1)))
-    dropped = Counter()
-    waiting, given = Waiting(1, 3, dropped, lambda key: False), Slice.of([joints, poses])
-    assert waiting.room(given) == len(given) == 4
-    waiting.extend(key, np.array([1, 2]), np.zeros((2, 1)), 1)
-    assert (waiting.count, dropped.total()) == (1, 1)
-    assert waiting.room(given) == 3
-    waiting.extend(key, np.array([2, 3]), np.zeros((2, 1)), 1)
-    assert (waiting.count, waiting.room(given)) == (3, 1)
