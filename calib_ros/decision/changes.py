@@ -15,13 +15,15 @@ degrees of freedom as z, by
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
 A change is claimed if chance gains as much, over all explanations tried, with probability FALSE at
-most (Bonferroni). Explanations are compared by their evidence with z ~ N(0, S), S the typical size
-of changes, which penalises additional parameters (MacKay 1992). Those with a share above
-1 - CONFIDENT are indistinguishable from the best.
+most (Bonferroni). Explanations are compared by their evidence with z ~ N(0, s^2 S), S the typical
+size of changes, which penalises additional parameters (MacKay 1992). A motor that is a turn off,
+or a belt a tooth, changes far more: s is the likeliest of 1, SPREAD and SPREAD^2. Those with a
+share above 1 - CONFIDENT are indistinguishable from the best.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -61,7 +63,7 @@ class Explanation(Shown):
     The k parameters `names` of a joint or frame (`owner`) change by `change` (k,) with standard
     deviations `sigma` (k,) [m, rad], which reduces chi-squared by `gain`. `chance` is the
     probability of such a gain for any explanation if nothing has changed, `share` the share of the
-    evidence of all explanations.
+    evidence of all explanations, and `times` the size of such changes in typical ones.
     """
 
     owner: str
@@ -71,6 +73,7 @@ class Explanation(Shown):
     share: float
     change: FloatArray
     sigma: FloatArray
+    times: float = 1.0
 
     def in_words(self) -> str:
         """Return the changed parameter and its size, or the changed parameters."""
@@ -158,13 +161,17 @@ class Information(Shown):
         rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
         return float(seen @ values), values, covariance, rank
 
-    def evidence(self, columns: FloatArray, sizes: FloatArray) -> float:
-        """Return the log evidence of changes along columns (P, k) of sizes (k,)."""
+    def evidence(self, columns: FloatArray, sizes: FloatArray) -> tuple[float, float]:
+        """Return the log evidence of changes along columns (P, k), and how many `sizes` (k,)."""
         scaled = columns * sizes
-        inner = np.eye(len(sizes)) + scaled.T @ self.matrix @ scaled
-        seen = scaled.T @ self.vector
-        gain = float(seen @ np.linalg.solve(inner, seen))
-        return 0.5 * (gain - float(np.linalg.slogdet(inner)[1]))
+        inner, seen = scaled.T @ self.matrix @ scaled, scaled.T @ self.vector
+        found = []
+        for k in range(SEVERAL):
+            times = SPREAD**k
+            whole = np.eye(len(sizes)) + times**2 * inner
+            gain = times**2 * float(seen @ np.linalg.solve(whole, seen))
+            found.append((0.5 * (gain - float(np.linalg.slogdet(whole)[1]) - k**2), times))
+        return max(found)
 
 
 def root_of(square: FloatArray) -> FloatArray:
@@ -183,7 +190,7 @@ def explanations(
     """
     if not columns.sets:
         return ()
-    logs = [columns.evidence(information, names) for _, names in columns.sets]
+    logs = [columns.evidence(information, names)[0] for _, names in columns.sets]
     shares = special.softmax(logs).tolist()
     found = [
         _explanation(information, columns, freedom, *each, share)
@@ -203,7 +210,8 @@ def _explanation(
     gain, change, covariance, rank = information.explained(columns.of(names))
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     chance = min(1.0, len(columns.sets) * chance_of(gain, rank, freedom))
-    return Explanation(owner, names, gain, chance, share, change, sigma)
+    times = columns.evidence(information, names)[1]
+    return Explanation(owner, names, gain, chance, share, change, sigma, times)
 
 
 def reasons_of(
@@ -237,17 +245,19 @@ def likelier(
     def likely(causes: Sequence[Sequence[Parameter]]) -> float:
         count = SEVERAL + 1 if causes == [columns.zeros] else len(causes)
         names = [name for each in causes for name in each]
-        return columns.evidence(information, names) - count * float(np.log(len(columns.sets)))
+        return columns.evidence(information, names)[0] - count * float(np.log(len(columns.sets)))
 
     best = max(tried, key=likely)
     if best is given:
         return changed
+    owners = [names[0].owner if len(names) == 1 else 'all joints' for names in best]
+    pairs = [*zip(owners, best, strict=True)]
+    rough = [(_explanation(information, columns, freedom, *pair),) for pair in pairs]
     found: list[tuple[Explanation, ...]] = []
-    for names in best:
-        others = columns.spread([other for other in best if other is not names])
-        owner = names[0].owner if len(names) == 1 else 'all joints'
+    for reasons, pair in zip(rough, pairs, strict=True):
+        others = columns.spread([each for each in rough if each is not reasons])
         alone = information.marginalised(others)
-        found.append((_explanation(alone, columns, freedom, owner, names),))
+        found.append((_explanation(alone, columns, freedom, *pair),))
     return found
 
 
@@ -310,19 +320,27 @@ class Effects:
                     units[name] = unit
         return tuple(units)
 
+    def unscaled(self) -> Effects:
+        """Return the effects without another scale of the device."""
+        found = copy.copy(self)
+        found.sets = tuple(each for each in self.sets if each[1] != (SCALE_OF_DEVICE,))
+        return found
+
     def of(self, names: Sequence[Parameter]) -> FloatArray:
         """Return the columns (P, k) of k parameters."""
         return np.array([self._columns[name] for name in names]).T
 
-    def evidence(self, information: Information, names: Sequence[Parameter]) -> float:
-        """Return the log evidence of changes of typical size of k parameters."""
+    def evidence(
+        self, information: Information, names: Sequence[Parameter]
+    ) -> tuple[float, float]:
+        """Return the log evidence of changes of k parameters, and how many typical ones."""
         return information.evidence(self.of(names), _sizes(names))
 
-    def spread(self, changed: Sequence[Sequence[Parameter]]) -> FloatArray:
+    def spread(self, changed: Sequence[Sequence[Explanation]]) -> FloatArray:
         """Return the prior covariance (P, P) of changes whose sizes the data determine."""
         found = np.zeros((self._count, self._count))
-        for names in changed:
-            root = self.of(names) * (SPREAD * _sizes(names))
+        for each in (each for reasons in changed for each in reasons):
+            root = self.of(each.names) * (max(SPREAD, each.times) * _sizes(each.names))
             found += root @ root.T
         return found
 

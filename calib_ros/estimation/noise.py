@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -14,10 +15,12 @@ from calib_ros.estimation import identifiability
 from calib_ros.estimation.identifiability import Uncertainty
 from calib_ros.estimation.leastsquares import Fit, System
 from calib_ros.estimation.levels import SURE
+from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import SUSPICIOUS
 from calib_ros.estimation.shared_errors import shared_errors
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.values import SAME
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,26 @@ class Noise:
     widened: float = 1.0
     size: float = 1.0
     given: Mapping[str, float] = field(default_factory=dict)
+
+    def expected_in(self, problem: Problem) -> Problem:
+        """Return a problem of new poses with their sigmas by the stated ones and this noise.
+
+        A default sigma becomes the earlier one. Residuals larger than the earlier sigma need not
+        come from the device: the excess is added to a new sigma too.
+        """
+        found: dict[str, Any] = {}
+        for name, sigma in problem.sigmas.items():
+            then = self.given.get(name, sigma)
+            if sigma == getattr(Problem, name):
+                sigma = then
+            ratio = 1.0
+            if not self.consistent:
+                turned = self.orientation if name == 'sigma_orientation' else None
+                ratio = turned or self.position
+            lacking = then * np.sqrt(max(ratio**2 - 1.0, 0.0))
+            least = sigma * (min(ratio, 1.0) if sigma == then else 1.0)
+            found[name] = max(float(np.hypot(least, lacking)), SAME)  # simulated without noise
+        return replace(problem, **found)
 
 
 def noise_of(

@@ -141,9 +141,9 @@ def difference(first: Calibration, second: Calibration) -> Difference:
     changed: list[tuple[Explanation, ...]] = []
     while len(changed) < SEVERAL and (reasons := changes.reasons_of(left_over, columns, freedom)):
         changed.append(reasons)
-        left_over = every.marginalised(columns.spread(changes.names_of(changed)))
+        left_over = every.marginalised(columns.spread(changed))
     changed = changes.likelier(every, columns, freedom, changed)
-    left_over = every.marginalised(columns.spread(changes.names_of(changed)))
+    left_over = every.marginalised(columns.spread(changed))
     predicted = changes.mean_square_change(chain, names)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(change, square, 10 * SOME_POSES, method='eigh')

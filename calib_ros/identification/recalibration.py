@@ -7,7 +7,8 @@ by a growth g per root of a year (a random walk). The residuals r of the new pos
 arm determine the change dx by A = J^T W J and b = J^T W r, with the prior dx ~ N(0, C + g^2 t). A
 larger change must have a cause that affects few parameters (`changes.py`). These become free (of
 both causes if indistinguishable), and the estimate is the mean of dx given A and b, relinearised
-until it converges. Smooth device errors (`considered.py`), then and now, are no change of the arm.
+until it converges. From there the cause of a large change is searched again. Smooth device errors
+(`considered.py`), then and now, are no change of the arm.
 The result is used if the arm is then known about as well as before, or far better than it changed:
 few or similar poses let one cause imitate another.
 """
@@ -31,7 +32,6 @@ from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.considered import Doubts, doubted_products
 from calib_ros.estimation.leastsquares import System, products_of
 from calib_ros.estimation.levels import SCALE, SEVERAL, TRIED, chance_of
-from calib_ros.estimation.noise import Noise
 from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER
@@ -44,7 +44,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
-from calib_ros.values import SAME, require
+from calib_ros.values import require
 
 
 def years_since(record: Mapping[str, Any]) -> float:
@@ -138,21 +138,16 @@ def _recalibrated(
     ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
     movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
     columns = Effects(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
-    changed: list[tuple[Explanation, ...]] = []
+    named: list[tuple[Parameter, ...]] = []
     then, earlier = arm, arm.changed(np.zeros(len(arm.names)), arm.square)
     found = arm.solved(system)
-    while len(changed) < SEVERAL and (reasons := arm.reasons(found.information, columns)):
-        if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
-            columns = Effects(nominal, arm.names, movable)  # as much is usual
-            continue
-        changed.append(reasons)
+    for _ in range(SEVERAL):  # after a large change the model is linear elsewhere
+        changed = then.changes(found.information, columns)
         arm = then.widened(columns, changed)
         found = arm.solved(system)
-    left_over = found.information.marginalised(then.doubted)
-    likelier = changes.likelier(left_over, columns, previous.freedom, changed)
-    if likelier is not changed:
-        changed, arm = likelier, then.widened(columns, likelier)
-        found = arm.solved(system)
+        told, named = named, changes.names_of(changed)
+        if told == named:
+            break
     expected, _ = found.information.mean(root_of(arm.doubted))
     left = found.squares - float(found.information.vector @ expected)
     updated = _updated(arm, found, problem, changed)
@@ -228,8 +223,8 @@ class _Arm:
         """Return the arm of a calibration with covariance and the frames of the sets."""
         if previous.covariance is None:
             raise InputError(
-                'the earlier calibration has no parameter covariance: identify it again with '
-                'this version, from its own poses'
+                'the earlier calibration has no parameter covariance: identify it again with this '
+                'version, from its own poses'
             )
         known = previous.chain.frame_names
         for each in sets:
@@ -261,7 +256,20 @@ class _Arm:
 
     def widened(self, columns: Effects, changed: Sequence[Sequence[Explanation]]) -> _Arm:
         """Return the arm with changes of unknown size."""
-        return replace(self, square=self.square + columns.spread(changes.names_of(changed)))
+        return replace(self, square=self.square + columns.spread(changed))
+
+    def changes(self, information: Information, columns: Effects) -> list[tuple[Explanation, ...]]:
+        """Return what has changed, each with its likely explanations."""
+        found: list[tuple[Explanation, ...]] = []
+        while reasons := self.widened(columns, found).reasons(information, columns):
+            if reasons[0].names == (SCALE_OF_DEVICE,) and abs(reasons[0].change[0]) < SCALE:
+                columns = columns.unscaled()  # as much is usual
+            elif len(found) < SEVERAL:
+                found.append(reasons)
+            else:
+                break
+        left_over = information.marginalised(self.doubted)
+        return changes.likelier(left_over, columns, self.previous.freedom, found)
 
     def reasons(self, information: Information, columns: Effects) -> tuple[Explanation, ...]:
         """Return what has changed; of possible device errors only another scale."""
@@ -313,29 +321,8 @@ class _Arm:
 
 def _system(problem: Problem, sets: Sequence[Observations], previous: Calibration) -> System:
     if previous.noise is not None:
-        problem = replace(problem, **_sigmas(problem.sigmas, previous.noise))
+        problem = previous.noise.expected_in(problem)
     return System(problem.system(sets).sets)
-
-
-def _sigmas(stated: Mapping[str, float], noise: Noise) -> dict[str, Any]:
-    """Return the sigmas of new poses from the stated ones and the earlier noise.
-
-    A default sigma becomes the earlier one. Residuals larger than the earlier sigma need not come
-    from the device: the excess is added to a new sigma too.
-    """
-    found = {}
-    for name, sigma in stated.items():
-        then = noise.given.get(name, sigma)
-        if sigma == getattr(Problem, name):
-            sigma = then
-        ratio = 1.0
-        if not noise.consistent:
-            turned = noise.orientation if name == 'sigma_orientation' else None
-            ratio = turned or noise.position
-        lacking = then * np.sqrt(max(ratio**2 - 1.0, 0.0))
-        least = sigma * (min(ratio, 1.0) if sigma == then else 1.0)
-        found[name] = max(np.hypot(least, lacking), SAME)  # simulated without noise
-    return found
 
 
 def _judged(

@@ -64,6 +64,20 @@ def test_two_changed_zeros_are_told_by_name(earlier, joints):
     assert all('all joints' not in each for each in told)
 
 
+@pytest.mark.parametrize('turn', [-3.6, 7.2])
+@pytest.mark.parametrize('joint', UR10E.joint_names[:5])
+def test_a_zero_that_is_off_by_a_turn_of_the_motor_is_the_only_change(earlier, joint, turn):
+    """It is far larger than usual changes: other joints, or the whole link, shared it."""
+    true, previous, oriented = earlier
+    now = true.with_offsets({f'{joint}.theta': np.radians(turn)})
+    found = recalibrate(previous, seen(now, 8, 1, oriented), 0.1)
+    assert found.accepted
+    ((reason,),) = found.changed
+    assert reason.names == (f'{joint}.theta',)
+    assert reason.change[0] == pytest.approx(np.radians(turn), abs=4.0 * reason.sigma[0])
+    assert reason.sigma[0] < 2e-4
+
+
 def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):
     """There it moves the target only: a turn of it does not show."""
     true, previous, oriented = earlier
@@ -84,6 +98,13 @@ def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show():
         for k, arm in enumerate((true, slipped(true, [1e-3, 2e-3, 1e-3, -2e-3])))
     )
     assert owners(difference(first, second).changed) == [{'elbow'}]
+
+
+def test_two_calibrations_differ_by_the_turn_of_one_motor():
+    true = faulty(UR10E, Cell(), np.random.default_rng(4))
+    pair = enumerate((true, slipped(true, np.radians([0.0, 0.0, 7.2, 0.0, 0.0, 0.0]))))
+    first, second = (Calibration.of(identify(seen(arm, 50, k))) for k, arm in pair)
+    assert owners(difference(first, second).changed) == [{'elbow_joint'}]
 
 
 def test_two_calibrations_of_an_arm_without_a_zero_of_its_own():
