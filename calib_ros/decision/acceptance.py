@@ -143,7 +143,8 @@ def _of_the_gain(
             f'{100.0 * result.chance:.0f} % of cases (limit {100.0 * (1.0 - CONFIDENT):.0f} %)',
         )
     elif scaled:
-        yield Reason(Rule.SCALE, out_of_scale(scaled))
+        printed = all(each.pixels is not None for each in problem.sets)
+        yield Reason(Rule.SCALE, out_of_scale(scaled, printed))
     elif result.region is None:
         text = 'the correction is not larger than its own uncertainty, even at the poses measured'
         if not sized:
@@ -154,13 +155,18 @@ def _of_the_gain(
         yield Reason(Rule.REGION, text)
 
 
-def out_of_scale(scale: float) -> str:
-    """Return that a scale of the device, given minus one, may make the calibrated arm worse."""
-    way = 'grow' if scale > 0.0 else 'shrink'
+def out_of_scale(scale: float, printed: bool = False) -> str:
+    """Return that a scale of the device, given minus one, may make the calibrated arm worse.
+
+    Of a `printed` board it is that of its stated size.
+    """
+    way, size = ('grow', 'large') if scale > 0.0 else ('shrink', 'small')
+    cause, check = 'the measuring device were out of scale', 'If a known length shows that its'
+    if printed:
+        cause, check = f'the board were stated too {size}', 'Measure the print; if its'
     return (
-        f'all lengths of the arm {way} alike, by {percent(abs(scale))} %, as if the measuring '
-        'device were out of scale; then the correction would make the arm worse. If a known '
-        'length shows that its scale is right, set sigma_scale'
+        f'all lengths of the arm {way} alike, by {percent(abs(scale))} %, as if {cause}; then the '
+        f'correction would make the arm worse. {check} scale is right, set sigma_scale'
     )
 
 

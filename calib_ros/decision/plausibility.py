@@ -97,9 +97,9 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 
 def _scale(result: Identification) -> Iterator[Reason]:
     """Yield that harm by a device out of scale is too likely, if nothing else refuses."""
-    rival, region = result.posterior.rival, result.region
-    if not result.refusals and rival and region and region.by_scale >= HARMFUL:
-        yield Reason(Rule.SCALE, out_of_scale(rival[1]))
+    region = result.region
+    if not result.refusals and region and region.by_scale >= HARMFUL:
+        yield Reason(Rule.SCALE, out_of_scale(result.posterior.scale))
 
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:

@@ -212,7 +212,7 @@ def region_of(posterior: Posterior, sets: Sequence[Observations], freedom: float
         inner, limit = inner + added, float(far[shell[-1]])
     by_scale = 0.0
     if posterior.rival is not None:
-        more, _, mean, covariance = posterior.rival
+        more, mean, covariance = posterior.rival
         out = float(special.expit(special.logit(UNUSUAL) + more))
         doubts = judge.of_the_arm([(1.0, mean, covariance)])
         by_scale = out * max(judge.risk(own, own, doubts), judge.risk(inner, inner, doubts))

@@ -71,8 +71,10 @@ class Posterior(Shown):
     doubted: tuple[Mixed, ...]
     """The posterior of the offsets for each plausible set of sizes, if the device may have a
     scale error and rounded joint values may be off."""
-    rival: tuple[float, float, FloatArray, FloatArray] | None = None
-    """The same for a device out of scale: log odds, scale minus one, mean (P,) and covariance."""
+    rival: Mixed | None = None
+    """The same with log odds for a device out of scale; None of a printed board, which may be."""
+    scale: float = 0.0
+    """The scale of that device or board, minus one."""
     unmodelled: Unmodelled = NOTHING
     """What none of the names explains (`unmodelled.py`)."""
 
@@ -114,6 +116,7 @@ class Posterior(Shown):
             covariance=padded(self.covariance),
             device=np.pad(self.device, ((0, count), (0, 0))),
             rival=None,  # nothing measures the scale
+            scale=0.0,
             doubted=tuple((w, np.pad(m, (0, count)), padded(c)) for w, m, c in self.doubted),
         )
 
@@ -160,10 +163,10 @@ def posterior_of(
     evidence = Evidence(matrix, vector, given, groups, TYPICAL | {'scale': scale})
     considered = {size_group(chain, name) for name in more} - {*groups[: len(names)]}
     size, slope = evidence.most_probable(considered)
-    rival = None
-    if judging and lengths and scale < PRINTED and 'scale' not in known:
+    rival, out, unknown = None, 0.0, judging and lengths and 'scale' not in known
+    if unknown and scale < PRINTED:
         odds, mean, covariance = evidence.rival('scale', OUT_OF_SCALE, size, considered)
-        rival = odds, float(mean[-1]), mean[arm], covariance[arm, arm]
+        rival, out = (odds, mean[arm], covariance[arm, arm]), float(mean[-1])
     near = evidence.near(size, slope) if judging else []
     known_by = zip(every, evidence.precision(size).tolist(), strict=False)
     priors = {name: float(each**-0.5) for name, each in known_by if each > 0.0}
@@ -178,8 +181,10 @@ def posterior_of(
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
+    if unknown and not rival:
+        out = float(wider[0][0][-1])
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
-    posterior = Posterior(chain, every, *found, doubted, rival)
+    posterior = Posterior(chain, every, *found, doubted, rival, out)
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
 
 

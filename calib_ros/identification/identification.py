@@ -144,10 +144,10 @@ def _region(
     """
     sets, freedom = fitted.problem.sets, fitted.uncertainty.overall
     region = region_of(posterior, sets, freedom)
-    if region is None and posterior.rival is not None:
+    if region is None and posterior.scale:
         checked = replace(fitted, problem=replace(fitted.problem, sigma_scale=SCALE))
         if region_of(posterior_of(checked, size, more, doubts), sets, freedom) is not None:
-            return None, posterior.rival[1]
+            return None, posterior.scale
     return region, 0.0
 
 

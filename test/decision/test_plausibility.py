@@ -365,3 +365,20 @@ def test_backlash_is_not_taken_for_a_lag_that_harms(size):
     poses = true.forward(joints, approach)
     seen = replace(seen, positions=poses[:, :3, 3], rotations=poses[:, :3, :3])
     assert identify(Problem(UR, seen)).accepted
+
+
+@pytest.mark.parametrize('on_flange', [True, False])
+@pytest.mark.parametrize('size', [0.97, 1.004, 1.03])
+def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size):
+    """More poses, which were asked for, do not make a board known."""
+    rng, camera = np.random.default_rng(3), Camera()
+    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
+    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
+    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
+    seen = replace(seen, points=seen.points * size)
+    (refusal,) = identify(Problem(chain, seen, sigma_pixel=0.1)).refusals
+    assert refusal.rule is Rule.SCALE
+    found = re.search(r'(grow|shrink) alike, by (\S+) %, as if the board', refusal)
+    assert found
+    grown = {'grow': 1.0, 'shrink': -1.0}[found[1]] * float(found[2])
+    assert grown == pytest.approx(100.0 * (size - 1.0), abs=0.15)
