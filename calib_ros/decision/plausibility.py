@@ -75,8 +75,7 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     lens, imitated = _lens(problem, result) if another else ('', False)
     board = '' if lens else stretched(problem, result)
     sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(result)]
-    printed = all(each.pixels is not None for each in problem.sets) and not problem.sigma_scale
-    if board and printed:
+    if board and all(each.pixels is not None for each in problem.sets):
         refusals.insert(0, Reason(Rule.SCALE, board))
         board = ''
     imitated = imitated or bool(lens and refusals)
