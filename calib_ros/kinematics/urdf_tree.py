@@ -124,24 +124,33 @@ class Description:
         return replace(joint, lower=offset, upper=offset, follows=(leader, ratio / one, offset))
 
     def _usual_tip(self, base: str) -> str:
-        behind, moved = {base}, set()
+        behind, moved = {base}, dict[str, None]()
         for joint in self.joints:
             if joint.parent in behind:
                 behind.add(joint.child)
                 if joint.moves or joint.parent in moved:
-                    moved.add(joint.child)
+                    moved[joint.child] = None
         for link in USUAL_TIPS:
             if link in moved:
                 return link
         parents = {joint.parent for joint in self.joints}
         ends = [link for link in self.links if link in moved and link not in parents]
-        if len(ends) != 1:
-            found = f'ends in {", ".join(ends)}' if ends else f'moves nothing behind "{base}"'
-            raise ConfigError(
-                f'the URDF {found}: name the tip_link of the arm (calib_ros chain FILE '
-                '--tip-link LINK --out arm.yaml; then --chain arm.yaml)'
-            )
-        return ends[0]
+        if len(ends) == 1:
+            return ends[0]
+        usual = ([link for link in moved if link.endswith(name)] for name in USUAL_TIPS)
+        prefixed = next((links for links in usual if links), ())
+        if len(prefixed) == 1:
+            return prefixed[0]
+        found = f'ends in {", ".join(ends)}' if ends else f'moves nothing behind "{base}"'
+        below = Counter(ends)
+        for joint in reversed(self.joints):
+            below[joint.parent] += below[joint.child]
+        if forks := [link for link in moved if below[link] == len(ends)]:
+            found += f', all behind {forks[-1]}'
+        raise ConfigError(
+            f'the URDF {found}: name the tip_link of the arm (calib_ros chain FILE '
+            '--tip-link LINK --out arm.yaml; then --chain arm.yaml)'
+        )
 
     def poses(self, base: str) -> dict[str, FloatArray]:
         """Return the frames (4, 4) of all links behind a base at zero, in the base."""
@@ -161,14 +170,18 @@ def parse_urdf(text: str) -> Description:
     if max(len(masses), len(described)) > MOST_LINKS:
         raise ConfigError(f'the URDF has more than {MOST_LINKS} links or joints')
     joints = [_joint(element, links) for element in described]
-    for what, names in (
-        ('links are named', [name for name, _ in masses]),
-        ('joints are named', [joint.name for joint in joints]),
-        ('joints lead to link', [joint.child for joint in joints]),
+    loops = (
+        ': robots with closed loops, such as delta robots and hexapods, have no serial chain, and '
+        'the links of a parallelogram are joints that mimic others'
+    )
+    for what, names, why in (
+        ('links are named', [name for name, _ in masses], ''),
+        ('joints are named', [joint.name for joint in joints], ''),
+        ('joints lead to link', [joint.child for joint in joints], loops),
     ):
         for name, count in Counter(names).items():
             if count > 1:
-                raise ConfigError(f'two {what} "{name}" in the URDF')
+                raise ConfigError(f'two {what} "{name}" in the URDF{why}')
     children = {joint.child for joint in joints}
     roots = [name for name in links if name not in children]
     if len(roots) != 1:

@@ -230,6 +230,18 @@ def elbow(kind, more=''):
     return edited(UR10E, joint, joint.replace('revolute', kind) + more)
 
 
+def pair(*prefixes):
+    """Return the URDF of UR10e's with prefixed names on one table."""
+    arms = [re.sub('(name|link)="', rf'\1="{prefix}_', UR10E) for prefix in prefixes]
+    parts = [arm.partition('>')[2].removesuffix('</robot>\n') for arm in arms]
+    mounts = [
+        f'<joint name="{prefix}" type="fixed"><parent link="table"/>'
+        f'<child link="{prefix}_base_link"/></joint>'
+        for prefix in prefixes
+    ]
+    return ''.join(['<robot name="pair"><link name="table"/>', *parts, *mounts, '</robot>'])
+
+
 XACRO = '<xacro:x xmlns:xacro="http://www.ros.org/wiki/xacro"/></robot>'
 REFUSED = {
     'no XML': ('name: ur10e', 'not valid XML'),
@@ -266,14 +278,18 @@ REFUSED = {
     'two links': (edited(SCARA, '<link name="hand"/>', '<link name="hand"/>' * 2), 'two links'),
     'two parents': (
         edited(SCARA, '<child link="hand"/>', '<child link="lower"/>'),
-        'two joints lead to link "lower"',
+        'two joints lead to link "lower" in the URDF: robots with closed loops, such as delta',
     ),
     'two roots': (edited(SCARA, '</robot>', '<link name="x"/></robot>'), 'here: base, x'),
     'loop': (
         edited(SCARA, '<parent link="column"/>', '<parent link="hand"/>'),
         'a loop among joints shoulder, elbow, wrist',
     ),
-    'many ends': (PANDA, 'ends in panda_leftfinger, panda_rightfinger: name the tip_link'),
+    'many ends': (
+        PANDA,
+        'ends in panda_leftfinger, panda_rightfinger, all behind panda_hand: name the tip_link',
+    ),
+    'two arms': (pair('left', 'right'), 'ends in left_tool0, right_tool0: name the tip_link'),
     'no end': (UR10E, 'moves nothing behind "flange"', {'base_link': 'flange'}),
     'still': (UR10E, 'no joint moves between', {'base_link': 'flange', 'tip_link': 'tool0'}),
     'itself': (UR10E, 'no joint moves between', {'base_link': 'tool0', 'tip_link': 'tool0'}),
@@ -292,6 +308,14 @@ def test_what_is_no_serial_chain_is_refused(what):
     with pytest.raises(ConfigError) as caught:
         chain_from_urdf(text, **(links[0] if links else {}))
     assert words in str(caught.value)
+
+
+def test_a_tip_of_usual_name_is_found_behind_a_prefix():
+    camera = '<link name="c"/><joint name="c" type="fixed"><parent link="{}"/><child link="c"/>'
+    text = pair('r1').replace('</robot>', camera.format('r1_wrist_3_link') + '</joint></robot>')
+    assert chain_from_urdf(text).tool.matrix == pytest.approx(
+        chain_from_urdf(UR10E).tool.matrix, abs=1e-12
+    )
 
 
 def test_a_wrong_link_names_the_right_ones():
