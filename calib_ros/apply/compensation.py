@@ -232,8 +232,8 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
                 f'or {1e3 * tolerated:g} mrad'
             )
         else:
-            how = 'remain' if result.converged[k] else 'remain, without convergence'
-            reason = f'{left} {how}: more than tolerated'
+            how = '' if result.converged[k] else ', without convergence'
+            reason = f'at the end of the reach, or near a singularity: {left} remain{how}'
         found.append(Refusal(k, reason))
     return found
 

@@ -148,6 +148,16 @@ def test_a_command_beyond_a_limit_is_refused(side):
         assert ('the command' in reasons) is said
 
 
+def test_a_pose_that_the_shorter_arm_does_not_reach_says_so():
+    shorter = UR.with_offsets({'elbow_joint.a': 1e-3})  # a is negative
+    q = np.array([[0.0, -1.0, elbow, 0.5, 1.0, 0.0] for elbow in (0.06, 0.12)])
+    refusal = only_refusal(compensate(Compensator(UR, shorter), q))
+    assert refusal.sample == 0
+    assert refusal.reason == (
+        'at the end of the reach, or near a singularity: 0.3360 mm and 0.6822 mrad remain'
+    )
+
+
 def test_a_singular_command_is_refused_and_not_jumped():
     q = regular(UR, 1)
     q[0, 4] = 0.0  # the axes of wrist_1 and wrist_3 are parallel
