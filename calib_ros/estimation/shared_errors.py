@@ -350,8 +350,8 @@ def _fading(
     lengths, sizes = np.transpose(kernels)
     last, before = end
     turned, here, past = np.empty_like(rows), [], []
-    for first in range(0, len(time), SOME_POSES // 2):
-        run = np.s_[first : first + SOME_POSES // 2]
+    for first in range(0, len(time), SOME_POSES // 4):
+        run = np.s_[first : first + SOME_POSES // 4]
         then, own = time[run, np.newaxis], rows[:, run]
         fade = np.exp(-np.abs(then - time[run])[..., np.newaxis] / lengths)
         turned[:, run] = own @ np.linalg.cholesky(fade @ sizes)
