@@ -34,9 +34,7 @@ def solved(
     matrix: FloatArray, vector: FloatArray, precision: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return mean (P,) and a root (P, P) of the covariance."""
-    scaled, scale = _scaled(matrix, precision)
-    inverse = lapack.dtrtri(_factor(scaled), lower=1, overwrite_c=1)[0]
-    inverse *= scale
+    inverse = lapack.dtrtri(_factor(matrix, precision), lower=1, overwrite_c=1)[0]
     return inverse.T @ (inverse @ vector), inverse.T
 
 
@@ -51,22 +49,18 @@ def mixed(
     return mean, root @ root.T
 
 
-def _factor(scaled: FloatArray) -> FloatArray:
-    """Return the lower triangular factor (P, P); overwrites the matrix."""
-    factor, failed = lapack.dpotrf(scaled.T, lower=1, overwrite_a=1)
-    if failed:
+def _factor(matrix: FloatArray, precision: FloatArray) -> FloatArray:
+    """Return the lower triangular factor (P, P) of a matrix and precisions (P,).
+
+    Rounding does not depend on the scale of the columns.
+    """
+    posterior, size = matrix.copy(), np.arange(len(matrix))
+    diagonal = matrix[size, size] + precision
+    posterior[size, size] = diagonal + ROUNDING * np.maximum(diagonal, 1e-300)  # never singular
+    factor, failed = lapack.dpotrf(posterior.T, lower=1, overwrite_a=1)
+    if failed or not np.isfinite(diagonal).all():
         raise np.linalg.LinAlgError('singular posterior')
     return np.asarray(factor)
-
-
-def _scaled(matrix: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return matrices (..., P, P) + precisions (..., P), scaled to unit diagonal, and scales."""
-    size = np.arange(len(matrix))
-    diagonal = matrix[size, size] + precision
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-300))
-    scaled = matrix * (scale[..., np.newaxis, :] * scale[..., np.newaxis])
-    scaled[..., size, size] = diagonal * scale**2 + ROUNDING  # never singular
-    return scaled, scale
 
 
 class Evidence:
@@ -211,10 +205,8 @@ class Evidence:
 
     def _of(self, sizes: FloatArray) -> FloatArray:
         """Return the log evidence of log sizes (S, G)."""
-        scaled, scale = _scaled(self._matrix, self.precision(sizes))
-        factors = [_factor(each) for each in scaled]
-        seen = zip(factors, scale * self._vector, strict=True)
-        fit = [(lapack.dtrtrs(factor, each, lower=1)[0] ** 2).sum() for factor, each in seen]
-        roots = np.array([np.diag(factor) for factor in factors])
-        volume = 2.0 * (np.log(scale) - np.log(roots)).sum(axis=1)
-        return np.asarray(0.5 * (fit + volume) - sizes @ self._member.sum(axis=1))
+        factors = [_factor(self._matrix, each) for each in self.precision(sizes)]
+        seen = [lapack.dtrtrs(each, self._vector, lower=1)[0] for each in factors]
+        fit = 0.5 * (np.array(seen) ** 2).sum(axis=1)
+        volume = np.log([np.diag(each) for each in factors]).sum(axis=1)
+        return np.asarray(fit - volume - sizes @ self._member.sum(axis=1))
