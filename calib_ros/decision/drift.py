@@ -23,7 +23,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from calib_ros.estimation.leastsquares import System
 from calib_ros.estimation.levels import SEVERAL
 from calib_ros.estimation.observations import SOME_POSES, Observations
-from calib_ros.estimation.samples import summed
+from calib_ros.estimation.samples import gram, summed
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray, Index, norms
 
@@ -50,22 +50,21 @@ class Shifts:
             begins = np.flatnonzero(np.diff(seen.stops, prepend=-1))
             self._stops.append((begins, _weights(seen, begins)))
         count = min(SHIFTS, 2 * max(len(begins) for begins, _ in self._stops))
-        windows, self._energy = [], np.zeros(count)
+        self._shifted, self._energy = list[FloatArray](), np.zeros(count)
         for stops, residual in zip(self._stops, residuals, strict=True):
             series = _by_stop(residual, *stops)
             length = series.shape[1]
             circle = np.concatenate([series, series[:, ::-1], series], axis=1)
             every = sliding_window_view(circle, length, axis=1).swapaxes(0, 1)
             starts = (np.arange(count) / count * 2 * length).astype(int)
-            moved = every[starts].reshape(-1, length)
-            slow = moved @ slow_cosines(length).T
-            windows.append(moved := moved.reshape(count, -1))
+            moved = every[starts].reshape(count, -1)
+            slow = moved.reshape(-1, length) @ slow_cosines(length).T
             self._energy += norms(moved) ** 2 - norms(slow.reshape(count, -1)) ** 2
-        self._shifted = np.concatenate(windows, axis=1)  # columns lack the slowest part
+            self._shifted.append(moved)  # columns lack the slowest part
 
     def columns(self, columns: Iterable[Sequence[FloatArray]]) -> ShiftProducts:
         """Return the products of weighted columns, (P, c, N) for each set, in one or more lots."""
-        rows = []
+        lots = []
         for lot in columns:
             parts = []
             for stops, column in zip(self._stops, lot, strict=True):
@@ -75,9 +74,11 @@ class Shifts:
                 rest = (flat - flat @ slow.T @ slow).reshape(len(series), -1)
                 rest[norms(rest) <= HALF_THE_DIGITS * whole] = 0.0  # rounding
                 parts.append(rest)
-            rows.append(np.concatenate(parts, axis=1))
-        every = np.concatenate(rows)
-        return every @ every.T, every @ self._shifted.T
+            lots.append(parts)
+        every = [np.concatenate(parts) for parts in zip(*lots, strict=True)]
+        pairs = zip(every, self._shifted, strict=True)
+        own, cross = sum(map(gram, every)), sum(rows @ moved.T for rows, moved in pairs)
+        return np.asarray(own), np.asarray(cross)
 
     def shares(
         self,
