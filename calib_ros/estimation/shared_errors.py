@@ -342,10 +342,10 @@ def _fading(
     kernels: Sequence[tuple[float, float]],
     end: tuple[int, FloatArray],
 ) -> tuple[int, FloatArray]:
-    """Add to `found` (P, P) the J^T K J of rows (P c, n) of stops at times (n,), all distances.
+    """Add J^T K J of rows (P c, n) of stops at times (n,) to `found` (P, P); return the new end.
 
-    Of K kernels, the rows of a run of stops are multiplied with a root of their sum, and with the
-    sums (P c, K) of all before it, faded until its `end`, a time. Return that of the last.
+    Runs of stops are multiplied with a root of the sum of K kernels, and with what is left of all
+    stops before: their faded sums (P c, K) at the `end`, after a time.
     """
     lengths, sizes = np.transpose(kernels)
     last, before = end

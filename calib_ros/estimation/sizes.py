@@ -97,7 +97,8 @@ class Evidence:
             mean, variance = self._means(weight)
             gamma = (self._member - weight * variance).sum(axis=1)
             slope = weight @ mean**2 - gamma - width * (size - self._typical)
-            step = np.clip(slope / (2.0 * np.maximum(gamma, 0.0) + width), -1.0, 1.0)
+            step = slope / (2.0 * np.maximum(gamma, 0.0) + width)
+            step = np.maximum(np.minimum(step, 1.0), -1.0)  # np.clip is slow
             size = self._within(size + step)
             self._lengthen(mean**2 + variance, 0.0, size)
             if np.abs(step).max(initial=0.0) < SETTLED:
@@ -165,7 +166,7 @@ class Evidence:
     def _within(self, size: FloatArray) -> FloatArray:
         """Return log sizes (G,) clipped to the searched range."""
         most = -np.log(LEAST_SIZE)
-        return self._typical + np.clip(size - self._typical, -most, most)
+        return np.asarray(np.maximum(np.minimum(size, self._typical + most), self._typical - most))
 
     def widen(self, size: FloatArray) -> None:
         """Set the variances to the mean over the tails of the prior, for log sizes (G,)."""
