@@ -23,16 +23,17 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.decision.comparison import residuals
 from calib_ros.decision.lost_rows import row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
-from calib_ros.decision.trials import Bare, Trial, in_frames, refined, trial_of
+from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
 from calib_ros.estimation.levels import (
     ALIKE,
     CLEARLY,
     CONFIDENT,
+    FEW,
+    LEAST_ASIDE,
     MOST_OUTLIERS,
     NEARER,
     SEVERAL,
@@ -41,11 +42,13 @@ from calib_ros.estimation.levels import (
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
+from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import Flags, norms
+from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import LEVER
+from calib_ros.shown import some
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +143,6 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         or _of_a_lost_row(problem, chain, sets, given)
         or _named(problem, chain, sets, given)
         or _by_places(problem, chain, sets, given)
-        or _beyond(problem, sets)
         or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
@@ -154,43 +156,31 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
 
 def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
-    sets = [each for each in problem.all_sets if each.pixels is None]
-    errors = [norms(residuals(chain, each).position) for each in sets]
-    return _alone(problem, sets, [each > problem.largest_error for each in errors])
+    sets = (each for each in problem.all_sets if each.distances is None and each.pixels is None)
+    return next(filter(None, (_of_rows(problem, chain, each) for each in sets)), None)
 
 
-def _beyond(problem: Problem, sets: Sets) -> Explained | None:
-    """Return what explains the measurements clearly further away than all others."""
-    if _of_images(problem):
+def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
+    """Return what explains the rows that a chain misses by more than faulty arms.
+
+    Its frames hold for them too, so few rows tell as much as many.
+    """
+    far = misses(chain, seen, flange(chain, seen)) > _largest(problem)
+    rows = np.flatnonzero(far)
+    if len(rows) < LEAST_ASIDE:
         return None
-    sizes = [norms(each.positions) for each in sets]
-    order = np.sort(np.concatenate(sizes))
-    gaps = order[1:] > CLEARLY * order[:-1]
-    least = order[:-1][gaps].max() if gaps.any() else np.inf
-    return _alone(problem, sets, [each > least for each in sizes])
-
-
-def _alone(
-    problem: Problem, sets: Sequence[Observations], far: Sequence[Flags]
-) -> Explained | None:
-    """Return what explains some measurements (N,) of each set."""
-    parts = [each.select(np.flatnonzero(k)) for each, k in zip(sets, far, strict=True) if k.any()]
-    if not parts:
+    for name in (seen.base, seen.tool):
+        chain = chain.with_frame(name, replace(chain.frame(name), fixed=True))
+    if (given := trial_of(chain, (seen.select(rows),))) is None:
         return None
-    found = explained(
-        replace(problem, observations=parts[0], more=tuple(parts[1:]), held_out=None), far=True
-    )
-    few, every = (sum(map(len, some)) for some in (parts, sets))
-    if found is None or few == every:
+    found = _named(problem, chain, given.sets, given, of_rows=True)
+    if found is None or len(rows) == len(seen):
         return found
-    return _of_a_part(problem, found, found.where or f'in {few} of {every} measurements alone, ')
-
-
-def _of_a_part(problem: Problem, found: Explained, where: str) -> Explained:
-    if problem.of_messages:
-        return replace(found, where=where)
-    alike = 'write them as the others ({} reads them)'
+    runs = np.split(rows + 1, np.flatnonzero(np.diff(rows) > 1) + 1)
+    poses = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
+    alike = '{}' if problem.of_messages else 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
+    where = f'in poses {", ".join(some(poses))} of {len(seen)} alone, '
     return replace(found, suspects=tuple(named), where=where)
 
 
@@ -215,10 +205,15 @@ def _of_images(problem: Problem) -> bool:
     return any(each.pixels is not None for each in problem.sets)
 
 
-def _named(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
+def _named(
+    problem: Problem, chain: Chain, sets: Sets, given: Trial, of_rows: bool = False
+) -> Explained | None:
+    """Return the mistakes that explain the sets best; only of what is written in each row."""
     rough, tried = [], []
     bare: Bare = {}
     for each in suspects(chain, given.sets, _of_images(problem)):
+        if of_rows and not each.changes:
+            continue
         few = given.sets
         if each.rows:
             few = tuple(_moved(problem, one, each.rows).spread() for one in sets)
@@ -264,37 +259,38 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
 
 
 def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
-    """Return what is wrong with rows that the arm does not explain, if it explains others.
+    """Return what is wrong with some rows, if the arm explains the others.
 
-    A third at one end of the session and the other end, or every second row and the others.
+    These may be nearly all rows, those clearly nearer than the rest, a third at one end of the
+    session, or every second row.
     """
     if len(sets) > 1 or sets[0].socket or _of_images(problem):
         return None
     whole = _moved(problem, sets[0], 0)
-    rows, third = np.arange(len(whole)), len(whole) // 3
-    if third < 2 * IN_A_FRAME:
+    rows, third, sizes = np.arange(len(whole)), len(whole) // 3, norms(whole.positions)
+    order = np.sort(sizes)
+    least = order[:-1].max(initial=0.0, where=order[1:] > CLEARLY * order[:-1])
+    parts = [sizes <= least]
+    if enough := third >= 2 * IN_A_FRAME:
+        parts += [rows < third, rows >= 2 * third, rows % 2 == 0, rows % 2 == 1]
+    trials = [
+        in_frames(problem, chain, (whole.select(part),)) if part.sum() >= FEW else None
+        for part in parts
+    ]
+    for one in (given, *trials):
+        if one is None or one.error > _largest(problem):
+            continue
+        if found := _of_rows(problem, one.chain, whole):
+            return found
+    most = min(_largest(problem), NEARER * given.error)
+    if not enough or any(one is None or one.error > most for one in trials[-2:]):
         return None
-    ends = {'first third of the rows': rows < third, 'last third of the rows': rows >= 2 * third}
-    turns = {'odd rows': rows % 2 == 0, 'even rows': rows % 2 == 1}
-    largest = min(_largest(problem), NEARER * given.error)
-    for halves in (ends, turns):
-        parts = [whole.select(part) for part in halves.values()]
-        trials = [in_frames(problem, chain, (part,)) for part in parts]
-        fits = [each is not None and each.error <= largest for each in trials]
-        if all(fits) and halves is turns:
-            remedy = 'name them in a column session, and identify each alone (--session)'
-            two = Suspect(
-                'odd and even rows are of two arms, or of two devices or targets',
-                remedy,
-                published='give each its own device in sources',
-            )
-            return Explained((two,), given.error, np.nan)
-        for name, part, trial, fit in zip(halves, parts, trials, fits, strict=True):
-            if fit or trial is None or not any(fits):
-                continue
-            if found := _named(problem, chain, (part,), trial):
-                return _of_a_part(problem, found, f'in the {name} alone, ')
-    return None
+    two = Suspect(
+        'odd and even rows are of two arms, or of two devices or targets',
+        'name them in a column session, and identify each alone (--session)',
+        published='give each its own device in sources',
+    )
+    return Explained((two,), given.error, np.nan)
 
 
 def _by_places(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:
@@ -333,10 +329,10 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
     kept: list[tuple[Suspect, ...]] = [()]
     for number in range(SEVERAL + 1):  # several of joints, one of the poses
         found: dict[float, tuple[Trial, tuple[Suspect, ...]]] = {}
-        together = [(*some, each) for some in kept for each in options]
-        for some in together if number else [*together, *hidden(chain, options)]:
-            if len({one.part for one in some}) == len(some):
-                more = tuple(sorted(some, key=lambda one: (*FIRST, one.part).index(one.part)))
+        together = [(*these, each) for these in kept for each in options]
+        for these in together if number else [*together, *hidden(chain, options)]:
+            if len({one.part for one in these}) == len(these):
+                more = tuple(sorted(these, key=lambda one: (*FIRST, one.part).index(one.part)))
                 trial = trial_of(chain, reduce(lambda sets, one: one.undone(sets), more, few))
                 if trial is not None:  # keeps the first of equivalent ones
                     found.setdefault(round(trial.share, 6), (trial, more))
@@ -345,7 +341,7 @@ def _several(problem: Problem, chain: Chain, given: Trial) -> Explained | None:
             return None
         least = best[0][0].share
         polished = refined(problem, best[0][0])
-        kept = [some for _, some in best]
+        kept = [these for _, these in best]
         if len(kept[0]) > 1 and polished.error <= largest and polished.share <= share:
             return Explained((_together(kept[0]),), given.error, polished.error)
     return None

@@ -183,7 +183,7 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
         (replace(seen, joints=np.degrees(seen.joints)), 'are in degrees, not radians'),
         (
             replace(seen, positions=seen.positions * np.where(late, 1e3, 1.0)),
-            'n 6 of 10 measurements alone, the positions are in mm, not metres',
+            'n poses 5 to 10 of 10 alone, the positions are in mm, not metres',
         ),
     ):
         for tolerance in (None, 1e-3):

@@ -57,14 +57,32 @@ def test_rows_that_are_not_like_the_others_are_named():
     assert explained(Problem(arm, one)) is None
     found = explained(Problem(arm, mixed))
     assert str(found).startswith('odd and even rows are of two arms, or of two devices or targets')
-    for part, where in ((rows < 22, 'first'), (rows >= 27, 'last')):
+    for part, where in ((rows < 22, '1 to 22'), (rows >= 27, '28 to 50')):
         spoilt = replace(one, joints=np.where(part, np.rad2deg(q), q))
         found = explained(Problem(arm, spoilt))
-        assert found.where == f'in the {where} third of the rows alone, '
+        assert found.where == f'in poses {where} of 50 alone, '
         assert (
             found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
         )
         assert found.corrected < 0.01
+
+
+@pytest.mark.parametrize(
+    ('rows', 'where'), [([5, 6, 7], '6 to 8'), ([3, 9, 20, 21], '4, 10, 21 to 22')]
+)
+@pytest.mark.parametrize('oriented', [True, False])
+def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
+    """Too few to place base and tool, which the others do."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
+    q = arm.random_joints(40, rng)
+    seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, 2e-4, oriented)
+    some = np.isin(np.arange(40), rows)[:, np.newaxis]
+    for positions, joints, words in (
+        (np.where(some, 1e3 * seen.positions, seen.positions), q, 'positions are in mm'),
+        (seen.positions, np.where(some, np.degrees(q), q), 'joint values are in degrees'),
+    ):
+        found = str(explained(Problem(arm, replace(seen, positions=positions, joints=joints))))
+        assert found.startswith(f'in poses {where} of 40 alone, the {words}, not ')
 
 
 @pytest.mark.parametrize('rows', [slice(5, 6), slice(5, 12)])

@@ -34,7 +34,7 @@ def earlier():
 def test_half_a_table_in_mm_is_named():
     """It was refused for its errors alone."""
     found = identify(seen(40, in_mm=20, **SIGMAS))
-    assert 'in 20 of 40 measurements alone, the positions are in mm' in str(found.refusals[0])
+    assert 'in poses 1 to 20 of 40 alone, the positions are in mm' in str(found.refusals[0])
     assert 'write them as the others (--length mm reads them)' in str(found.refusals[0])
 
 
@@ -42,7 +42,7 @@ def test_half_a_table_in_mm_is_named():
 def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
     there = replace(TRUE, base=random_frame(np.random.default_rng(1), 2.0))
     few = seen(15, in_mm=7, true=there)
-    with pytest.raises(InputError, match='in 7 of 15 measurements alone, the positions are in mm'):
+    with pytest.raises(InputError, match='in poses 1 to 7 of 15 alone, the positions are in mm'):
         recalibrate(earlier[without_noise], few, 0.1, new=('base',))
 
 

@@ -272,7 +272,7 @@ def test_new_poses_of_which_half_are_in_other_units_are_named(earlier, seed):
     positions = seen.observations.positions.copy()
     positions[7:] *= 1e3
     wrong = replace(seen, observations=replace(seen.observations, positions=positions))
-    with pytest.raises(InputError, match='in 8 of 15 measurements alone, the positions are in mm'):
+    with pytest.raises(InputError, match='in poses 8 to 15 of 15 alone, the positions are in mm'):
         recalibrate(previous, wrong, 0.1)
 
 
