@@ -26,9 +26,9 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import MOST_ENTRIES, ConfigError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import Columns, check_quaternions, joints_left_out, read_columns
-from calib_ros.files.layouts import joint_columns
-from calib_ros.files.programs import POSE_COLUMNS
+from calib_ros.files.columns import Columns, check_quaternions, read_columns
+from calib_ros.files.headers import joints_left_out
+from calib_ros.files.vocabulary import POSE_COLUMNS, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.se3 import FloatArray, Index
@@ -219,7 +219,11 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     if posed:
         check_quaternions(found, values[:, 3:])
         values = joints_of_poses(values[:, :3], se3.from_quat(values[:, 3:]))
-    return dict(zip(names, values, strict=True)), posed, joints_left_out(found, joints)
+    return (
+        dict(zip(names, values, strict=True)),
+        posed,
+        joints_left_out(path, found.header, joints),
+    )
 
 
 def observed(

@@ -4,13 +4,6 @@
 
 A layout gives expressions of their columns for ours (q1, x, qw ...), units, and the form of
 rotations. Presets are layouts in YAML files; a user's own is named by its path.
-
-Rotations become quaternions, standard deviations covariances. XYZ are turns about the axes as
-turned before, R = Rx(r1) Ry(r2) Rz(r3); xyz about fixed ones, which is ZYX in the other order.
-Standard deviations s of Euler angles make the covariance J diag(s^2) J' of the rotation about the
-device's axes: the columns of J are the axes about which the angles turn, e1, R1 e2, R1 R2 e3. For
-a rotation vector v it is J_l(v), for quaternions the standard deviations are those about the
-device's axes.
 """
 
 from __future__ import annotations
@@ -24,32 +17,22 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, ConfigError, InputError, UnknownNameError
-from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import BETWEEN, Columns, check_quaternions
-from calib_ros.kinematics import se3
-from calib_ros.kinematics.chain_file import TWO_TURNS, shared_files
+from calib_ros.errors import LONGEST_NAME, MOST_ENTRIES, ConfigError, UnknownNameError
+from calib_ros.files.vocabulary import (
+    ANGLES,
+    JOINT,
+    LENGTHS,
+    MATRIX,
+    NUMBERS,
+    SEPARATORS,
+    WORDS,
+    joint_columns,
+)
+from calib_ros.kinematics.chain_file import shared_files
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import parse_yaml, read_text
-from calib_ros.values import MOST_NAMES, ROUNDED, parse_mapping
+from calib_ros.values import MOST_NAMES, parse_mapping
 
-LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
-"""Metres in units of length."""
-ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
-SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
-POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
-UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
-COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
-TURNS = ('rx', 'ry', 'rz')
-"""Angles about x, y, z of three different letters, or a rotation vector."""
-IN_TURN = ('r1', 'r2', 'r3')  # Euler angles in the order of the letters
-MATRIX = tuple(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3))
-"""Rotation matrices, row by row."""
-SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
-"""Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
-WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'stamp_ns')  # as text
-ROTATION = (*QUATERNION, *TURNS, *IN_TURN, *MATRIX)
-NUMBERS = (*POSITION, *ROTATION, *SIGMAS, 'distance', 'time', 'delay')
 UNREADABLE = (
     '"{}" is not an expression of columns: give names, {{names with blanks}} or column '
     'numbers (#7) with + - * / and brackets'
@@ -62,13 +45,6 @@ TOKEN = re.compile(
 SIGNS: dict[type[ast.AST], Callable[..., Any]]
 SIGNS = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.true_divide}
 SIGNS |= {ast.UAdd: np.positive, ast.USub: np.negative}
-JOINT = re.compile('[qsva][0-9]+')
-"""Columns with a number of each joint: values, signs of last moves, and rates."""
-
-
-def joint_columns(joints: int, letter: str = 'q') -> tuple[str, ...]:
-    """Return the columns with a number of each joint."""
-    return tuple(f'{letter}{k + 1}' for k in range(joints))
 
 
 @dataclass(frozen=True)
@@ -100,6 +76,12 @@ class Expression:
         except (SyntaxError, ValueError, KeyError, RecursionError, MemoryError) as err:
             raise ConfigError(UNREADABLE.format(text)) from err
         return found
+
+    @classmethod
+    def word(cls, text: str) -> Expression:
+        """Return the expression of a column of text, by its name or number."""
+        braced = text.startswith('{') and text.endswith('}')
+        return cls(text, (text[1:-1] if braced else text,), ast.Name('_0'))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -251,147 +233,3 @@ def layout_of(preset: str, columns: Sequence[str], given: Mapping[str, Any]) -> 
             merged[ours] = theirs if ours in WORDS else _in_their_names(theirs, known)
             defined.add(ours)
     return replace(layout, columns=merged, **changes)
-
-
-def finished(made: Columns, layout: Layout) -> Columns:
-    """Return the columns with quaternions for rotations, covariances for standard deviations."""
-    path, values, words = made.path, dict(made.values), dict(made.words)
-    time = values.pop('time', None)
-    if time is not None:
-        for line in made.lines[~(np.abs(time) <= 9e9)][:1].tolist():
-            raise InputError(
-                f'{path}, line {line}: time [s] must be a number of at most 9e9: if it is in ms, '
-                'give --columns time=NAME/1000'
-            )
-        words['stamp_ns'] = BETWEEN.join(str(round(each * 1e9)) for each in time.tolist())
-    rotation, axes = _rotations(values, layout, made)
-    sigmas = [values.pop(name, None) for name in SIGMAS]
-    for name in (*TURNS, *IN_TURN, *MATRIX):
-        values.pop(name, None)
-    covariance = _covariance(sigmas, axes, path)
-    if layout.inverse:
-        if rotation is None or not set(POSITION) <= set(values):
-            raise ConfigError('--inverse needs poses with their rotations')
-        given = np.column_stack([values[name] for name in POSITION])
-        poses = Observations.from_arrays(np.zeros((len(given), 1)), given, rotation)
-        turned = replace(poses, covariance=covariance).inverted()
-        values |= dict(zip(POSITION, turned.positions.T, strict=True))
-        rotation, covariance = turned.rotations, turned.covariance
-    if rotation is not None:
-        values |= dict(zip(QUATERNION, se3.to_quat(rotation).T, strict=True))
-    if covariance is not None:
-        rows, columns = np.transpose(UPPER)
-        values |= dict(zip(COVARIANCE, covariance[:, rows, columns].T, strict=True))
-    return replace(made, values=values, words=words)
-
-
-def _rotations(
-    values: dict[str, FloatArray], layout: Layout, made: Columns
-) -> tuple[FloatArray | None, FloatArray | None]:
-    """Return rotations (N, 3, 3), and the axes (N, 3, 3) of their sigmas in columns, or None."""
-    if set(QUATERNION) & set(values):
-        return _from_quaternions(values, layout, made)
-    if set(MATRIX) & set(values) and not (layout.euler or layout.rotation_vector):
-        return _from_matrices(values, made)
-    three = [each for each in (TURNS, IN_TURN) if set(each) & set(values)]
-    if not three:
-        for name in ('euler', 'rotation_vector', 'quaternion'):
-            if getattr(layout, name):
-                raise ConfigError(
-                    f'{made.path}: {name.replace("_", " ")} is given, but no columns: --columns '
-                    'rx=NAME,ry=NAME,rz=NAME (or qx, qy, qz, qw)'
-                )
-        return None, None
-    names, called = three[0], ', '.join(three[0])
-    if len(three) > 1:
-        raise ConfigError(f'{made.path}: give rx, ry, rz or r1, r2, r3, not both')
-    angles = _whole(values, names, made, 'Euler angles and rotation vectors have three columns')
-    for row in np.flatnonzero(np.abs(angles).max(axis=1) > TWO_TURNS)[:1].tolist():
-        raise InputError(
-            f'{made.where(row, called)} are angles of up to '
-            f'{np.abs(angles[row]).max():.6g} rad: if they are in degrees, give --angle deg '
-            '(and --joint-angle rad if the joint values are in radians)'
-        )
-    if layout.rotation_vector:
-        left = np.linalg.inv(se3.left_jacobian_inverse(angles))
-        return se3.exp_rotation(angles), np.asarray(left)
-    if not layout.euler:
-        raise ConfigError(
-            f'{made.path} has {called}: say which, --euler XYZ (ZYX, zyx ...) or --rotation-vector'
-        )
-    return _from_euler(angles, layout.euler, names)
-
-
-def _from_euler(
-    angles: FloatArray, letters: str, names: Sequence[str]
-) -> tuple[FloatArray, FloatArray]:
-    """Return rotations, and the axes of angles (N, 3) about the axes named by letters."""
-    if names == TURNS:
-        if len(set(letters.upper())) < 3:
-            raise ConfigError(
-                f'with --euler {letters} an axis comes twice: give r1, r2, r3 in its order'
-            )
-        angles = angles[:, ['XYZ'.index(letter) for letter in letters.upper()]]
-    axes = np.zeros((len(angles), 3, 3))
-    turned = np.tile(np.eye(3), (len(angles), 1, 1))
-    for k in range(3) if letters.isupper() else (2, 1, 0):
-        unit = 'XYZ'.index(letters[k].upper())
-        axes[:, :, k] = turned[:, :, unit]
-        turned = turned @ se3.exp_rotation(np.eye(3)[unit] * angles[:, k, np.newaxis])
-    if names == TURNS:  # order rx, ry, rz
-        axes = axes[:, :, [letters.upper().index(letter) for letter in 'XYZ']]
-    return turned, axes
-
-
-def _from_quaternions(
-    values: dict[str, FloatArray], layout: Layout, made: Columns
-) -> tuple[FloatArray, FloatArray]:
-    quat = _whole(values, QUATERNION, made, 'a quaternion has four columns')
-    if layout.quaternion == 'wxyz':
-        quat = quat[:, [1, 2, 3, 0]]
-    check_quaternions(made, quat)
-    return se3.from_quat(quat), np.tile(np.eye(3), (len(quat), 1, 1))
-
-
-def _from_matrices(values: dict[str, FloatArray], made: Columns) -> tuple[FloatArray, FloatArray]:
-    given = _whole(values, MATRIX, made, 'a rotation matrix has nine columns').reshape(-1, 3, 3)
-    rotations = se3.nearest_rotation(given)
-    for row in np.flatnonzero(np.abs(given - rotations).max(axis=(1, 2)) > ROUNDED)[:1].tolist():
-        raise InputError(
-            f'{made.where(row, "r11 ... r33")} are no rotation: check the order of the columns, '
-            'and that the axes are right-handed'
-        )
-    return rotations, np.tile(np.eye(3), (len(given), 1, 1))
-
-
-def _whole(
-    values: dict[str, FloatArray], names: Sequence[str], made: Columns, what: str
-) -> FloatArray:
-    """Return the values (N, len(names)) of columns that belong together."""
-    if missing := [name for name in names if name not in values]:
-        raise ConfigError(f'{made.path}: {what}, missing {", ".join(missing)}')
-    found = np.column_stack([values[name] for name in names])
-    for row in np.flatnonzero(np.isnan(found).any(axis=1))[:1].tolist():
-        raise InputError(f'{made.where(row, ", ".join(names))} must be numbers, not blank')
-    return found
-
-
-def _covariance(
-    sigmas: Sequence[FloatArray | None], axes: FloatArray | None, path: Path
-) -> FloatArray | None:
-    """Return covariances (N, 6, 6) of standard deviations (N,), or None."""
-    place, turn = ([x for x in each if x is not None] for each in (sigmas[:3], sigmas[3:]))
-    if not place and not turn:
-        return None
-    if len(place) < 3:
-        raise ConfigError(f'{path}: standard deviations need sx, sy and sz')
-    if turn and (len(turn) < 3 or axes is None):
-        raise ConfigError(
-            f'{path}: standard deviations of rotations need srx, sry, srz, and rotations'
-        )
-    found = np.zeros((len(place[0]), 6, 6))
-    found[:, :3, :3] = np.square(np.column_stack(place))[:, :, np.newaxis] * np.eye(3)
-    if turn and axes is not None:
-        scaled = axes * np.column_stack(turn)[:, np.newaxis, :]
-        found[:, 3:, 3:] = scaled @ np.swapaxes(scaled, 1, 2)
-    return found

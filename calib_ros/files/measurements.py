@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import ColumnsError, ConfigError, InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import (
-    Codes,
-    Columns,
-    check_quaternions,
-    codes_of,
-    lines_in_words,
-    named_by_option,
-    refuse_separator,
+from calib_ros.files.columns import Codes, Columns, check_quaternions, codes_of, lines_in_words
+from calib_ros.files.headers import named_by_option, refuse_separator
+from calib_ros.files.vocabulary import (
+    COVARIANCE,
+    KINDS,
+    POSITION,
+    QUATERNION,
+    UPPER,
+    joint_columns,
 )
-from calib_ros.files.layouts import COVARIANCE, POSITION, QUATERNION, UPPER, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.messages import frame_name
@@ -33,9 +33,7 @@ from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults
 
 SPLITS = {name: name for name in ('', 'train', 'test', 'removed')}
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
-KINDS = ('x', 'distance', 'socket', 'plane')
-"""Columns whose cells determine what a row measured."""
-POSE, DISTANCE, SOCKET, PLANE = range(4)
+POSE, DISTANCE, SOCKET, PLANE = range(4)  # of KINDS
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +201,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         columns.labels('session'),
         _devices(columns, kind),
         columns.labels('target'),
-        _frames(columns),
+        columns.labels('frame_id', frame_name),
         columns.labels('view'),
         choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
         split == 'test',
@@ -272,12 +270,6 @@ def _stamps(columns: Columns) -> NDArray[np.int64]:
         return columns.integers('stamp_ns', lines)
     except InputError as err:
         raise InputError(f'{err}; if it is in seconds, give --columns time=stamp_ns') from err
-
-
-def _frames(columns: Columns) -> Codes:
-    numbers, names = columns.labels('frame_id')
-    place, found = codes_of([*map(frame_name, names)])
-    return place[numbers], found
 
 
 def _devices(columns: Columns, kind: Index) -> Codes:

@@ -26,8 +26,9 @@ from calib_ros.files.columns import (
     columns_of,
     with_rows,
 )
-from calib_ros.files.layouts import ANGLES, LENGTHS, POSITION, QUATERNION, joint_columns
-from calib_ros.files.sheets import decimal_sign, name_and_unit, places, text_and_separator
+from calib_ros.files.headers import name_and_unit, places
+from calib_ros.files.sheets import decimal_sign, text_and_separator
+from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_columns
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
@@ -36,7 +37,6 @@ from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
 
-POSE_COLUMNS = (*POSITION, *QUATERNION)
 RATES = ('positions', 'velocities', 'accelerations')
 """Fields of a JointTrajectory point that a correction changes."""
 

@@ -14,14 +14,12 @@ import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from itertools import zip_longest
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
-    DECIMAL_COMMA,
-    THOUSANDS,
     Cells,
     Columns,
     cell_number,
@@ -29,50 +27,22 @@ from calib_ros.files.columns import (
     lines_in_words,
     of_rows,
 )
-from calib_ros.files.layouts import ANGLES, LENGTHS, SEPARATORS, Layout
+from calib_ros.files.headers import name_and_unit, only, places
+from calib_ros.files.layouts import Layout
+from calib_ros.files.vocabulary import DECIMAL_COMMA, SEPARATORS, SHEETS, THOUSANDS, UNIT_SIGNS
 from calib_ros.shown import some
 from calib_ros.texts import LARGEST_TABLE, read_bytes
 
 HEAD_LINES = MOST_ENTRIES // 10
 """Lines searched for the header and the first row of numbers."""
 LARGEST_SHEET = 3 * LARGEST_TABLE  # bytes of an unpacked workbook
-SHEETS = ('.xlsx', '.xlsm')
-LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
-LONG |= {'micrometer': 'um'}
-UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
-UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
-UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
-"""Units by their signs and words in small letters."""
-_ANY = '|'.join(UNIT_SIGNS)
-UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))', re.I)
-"""A name with its unit: X [mm], X (mm), X / mm."""
-
-
-def name_and_unit(cell: str) -> tuple[str, str]:
-    """Return the name of a column, and its unit if the header says it."""
-    match = UNIT.fullmatch(cell)
-    return (match[1], UNIT_SIGNS[(match[2] or match[3]).lower()]) if match else (cell, '')
-
-
-def places(header: Sequence[str], name: str) -> list[int]:
-    """Return the indices of the columns of a name, with or without its unit."""
-    return [k for k, cell in enumerate(header) if name in (cell, name_and_unit(cell)[0])]
-
-
-def only(found: Sequence[int], name: str) -> int:
-    """Return the index of a column; refuse several."""
-    if len(found) > 1:
-        where = ', '.join(some([f'#{k + 1}' for k in found]))
-        raise InputError(
-            f'column "{name}" comes {len(found)} times: name it by its number ({where})'
-        )
-    return found[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
     """The rows of a table in columns `#1`, `#2` ..., their names, and the cells `above`."""
 
+    path: Path
     header: tuple[str, ...]
     above: tuple[tuple[str, ...], ...]
     columns: Columns
@@ -85,14 +55,19 @@ class Sheet:
         found = places(self.header, name)
         return f'#{only(found, name) + 1}' if found else None
 
+    def called(self, number: str) -> str:
+        """Return the name of the column `#k`."""
+        return self.header[int(number[1:]) - 1]
+
 
 @dataclass(frozen=True)
 class _Content:
-    rows: list[Cells]  # of a text only the first
+    """Rows that are not empty, in blocks, of a text or of the sheet with a title."""
+
+    rows: Iterator[list[Cells]]
     notes: list[str]
-    text: str = ''
     separator: str = ''
-    title: str = ''  # of a sheet
+    title: str = ''
 
 
 def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence[str]) -> Sheet:
@@ -121,47 +96,53 @@ def read_sheet(path: Path, layout: Layout, names: Sequence[str], known: Sequence
 
 
 def _of_text(path: Path, layout: Layout) -> _Content:
-    notes: list[str] = []
     text, coding = _text(path)
-    if coding:
-        notes.append(f'the text is read as {coding}')
+    notes = [f'the text is read as {coding}'] if coding else []
     if '\r' in text:
         text = text.replace('\r\n', '\n').replace('\r', '\n')
     if layout.comment:
         text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
     text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
     separator = layout.cut or _separator(path, text, notes)
-    text = _narrow(text, separator)
-    rows = _cells(path, text[: _after(text, HEAD_LINES)], separator)
-    return _Content(rows, notes, text, separator)
+    return _Content(_rows_of_text(path, _narrow(text, separator), separator), notes, separator)
+
+
+def _rows_of_text(path: Path, text: str, separator: str) -> Iterator[list[Cells]]:
+    for block in csv_blocks(path, text.encode(), separator):
+        rows = [(line, [*map(str.strip, cells)]) for line, cells in block]
+        yield [(line, cells) for line, cells in rows if any(cells)]
 
 
 def _sheet(
     path: Path, content: _Content, layout: Layout, names: Sequence[str], known: Sequence[str]
 ) -> Sheet:
     rows, notes = content.rows, content.notes
-    at, header = _header(path, rows, names, known)
-    used = [k for name in names if not name.startswith('#') for k in places(header, name)]
-    used += [int(n[1:]) - 1 for n in names if n.startswith('#')]
+    whole = list[Cells]()
+    while (not whole or whole[-1][0] < HEAD_LINES) and (block := next(rows, None)) is not None:
+        whole += block
+    # a workbook comes as one block
+    looked = [row for row in whole if row[0] <= HEAD_LINES or content.title]
+    head = [(line, [' '.join(cell.split()) for cell in cells]) for line, cells in looked]
+    if not head:
+        raise InputError(f'{path} has no rows')
+    at, header = _header(path, head, names, known)
     low = {name.lower() for name in known}
+    used = [k for name in names if not name.startswith('#') for k in places(header, name)]
+    used += [int(name[1:]) - 1 for name in names if name.startswith('#')]
     used += [k for k, cell in enumerate(header) if name_and_unit(cell)[0].lower() in low]
-    cells = (row[k] for _, row in rows[at + 1 :] for k in used if k < len(row))
+    cells = (row[k] for _, row in head[at + 1 :] for k in used if k < len(row))
     decimal = layout.decimal or decimal_sign(cells, content.separator)
     if decimal == ',' and not layout.decimal:
         notes.append('numbers have decimal commas (--decimal)')
-    first = _first(path, rows, at, used, decimal, notes)
+    first = _first(path, head, at, used, decimal, notes)
     if at < 0 and first:  # columns by their numbers
-        header = tuple(f'#{k + 1}' for k in range(len(rows[first][1])))
-    header = _with_units(header, [cells for _, cells in rows[at + 1 : first]])
-    above = tuple(tuple(cells) for _, cells in rows[: max(at, 0)])
-    start = rows[first][0]
-    body: Iterable[Sequence[Cells]] = [rows[first:]]
-    if content.text:
-        body = _below(path, content.text, start, content.separator)
+        header = tuple(f'#{k + 1}' for k in range(len(head[first][1])))
+    header = _with_units(header, [cells for _, cells in head[at + 1 : first]])
+    above = tuple(tuple(cells) for _, cells in head[: max(at, 0)])
+    body = chain([whole[first:]], rows)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
-    columns = replace(columns, decimal=decimal)
     header = (*header, *[''] * (len(columns.header) - len(header)))
-    return Sheet(header, above, columns, tuple(notes))
+    return Sheet(path, header, above, replace(columns, decimal=decimal), tuple(notes))
 
 
 def text_and_separator(path: Path) -> tuple[str, str]:
@@ -199,23 +180,6 @@ def _with_units(header: tuple[str, ...], below: Sequence[Sequence[str]]) -> tupl
     return header
 
 
-def _below(path: Path, text: str, start: int, separator: str) -> Iterator[list[Cells]]:
-    """Yield the rows of a text from a line on."""
-    body = text[_after(text, start - 1) :]
-    for block in csv_blocks(path, body.encode(), separator, above=start - 1):
-        rows = [(line, [*map(str.strip, cells)]) for line, cells in block]
-        yield [(line, cells) for line, cells in rows if any(cells)]
-
-
-def _after(text: str, lines: int) -> int:
-    at = 0
-    for _ in range(lines):
-        at = text.find('\n', at) + 1
-        if not at:
-            return len(text)
-    return at
-
-
 def _text(path: Path) -> tuple[str, str]:
     data = read_bytes(path, LARGEST_TABLE, InputError)
     if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
@@ -251,11 +215,10 @@ def _of_workbook(path: Path, name: str) -> Iterator[_Content]:
                 raise InputError(f'{path} has no sheet "{name}"; it has {", ".join(titles)}')
             visible = [each for each in book.worksheets if each.sheet_state == 'visible']
             for sheet in [titles[name]] if name else visible:
-                notes = []
-                if len(visible) > 1 and not name:
-                    notes = [f'sheet "{sheet.title}" of {len(visible)} is read (--sheet)']
+                told = f'sheet "{sheet.title}" of {len(visible)} is read (--sheet)'
+                notes = [told] if len(visible) > 1 and not name else []
                 if rows := _rows(path, sheet):
-                    yield _Content(rows, notes, title=sheet.title)
+                    yield _Content(iter([rows]), notes, title=sheet.title)
     except InputError:
         raise
     except zipfile.BadZipFile as err:
@@ -287,8 +250,9 @@ def _cell(value: object) -> str:
 
 
 def _separator(path: Path, text: str, notes: list[str]) -> str:
-    head = re.sub('"[^"\n]*"', '0', text[: _after(text, HEAD_LINES)])  # cells in quotes
-    lines = [line for line in head.split('\n') if line.strip()][-30:]  # mostly below the header
+    head = text.split('\n', HEAD_LINES)[:HEAD_LINES]
+    cut = re.sub('"[^"\n]*"', '0', '\n'.join(head)).split('\n')  # cells in quotes
+    lines = [line for line in cut if line.strip()][-30:]  # mostly below the header
     if not lines:
         raise InputError(f'{path} has no rows')
     best, most, cells = 'comma', 0, 1
@@ -307,52 +271,40 @@ def _separator(path: Path, text: str, notes: list[str]) -> str:
     return SEPARATORS[best]
 
 
-def _cells(path: Path, text: str, separator: str) -> list[Cells]:
-    """Return the cells of all non-empty lines, with line numbers."""
-    found: list[Cells] = [
-        (line, [' '.join(cell.split()) for cell in row])
-        for block in csv_blocks(path, text.encode(), separator)
-        for line, row in block
-        if any(cell.strip() for cell in row)
-    ]
-    if not found:
-        raise InputError(f'{path} has no rows')
-    return found
-
-
 def _header(
     path: Path, rows: Sequence[Cells], names: Sequence[str], known: Sequence[str]
 ) -> tuple[int, tuple[str, ...]]:
     """Return the row index of the header, and its names; -1 if there is none."""
+    rows = rows[:HEAD_LINES]
+    words = [sum(not _is_number(c, ',') for c in cells if c) for _, cells in rows]
+    at = words.index(max(words))  # title and data have fewer
+    bare = [{name_and_unit(cell)[0] for cell in cells} for _, cells in rows]
     wanted = {name for name in names if not name.startswith('#')}
+    if wanted:
+        missing = [wanted - each - {*cells} for each, (_, cells) in zip(bare, rows, strict=True)]
+        fewest = min(missing, key=len)
+        if len(fewest) < len(wanted):
+            at = missing.index(fewest)
+        if fewest:
+            has = ', '.join(f'"{cell}"' for cell in rows[at][1] if cell)
+            raise InputError(
+                f'{path} has no column {", ".join(sorted(missing[at]))}; line {rows[at][0]} has '
+                f'{has}: name its columns (--columns OURS=NAME or OURS=#NUMBER)'
+            )
+        return at, tuple(rows[at][1])
     low = {name.lower() for name in known}
-    words = [sum(not _is_number(c, ',') for c in cells if c) for _, cells in rows[:HEAD_LINES]]
-    likely = words.index(max(words))  # title and data have fewer
-    best: tuple[int, set[str]] = (likely, wanted)
-    numbers = [int(name[1:]) - 1 for name in names if name.startswith('#')]
-    for k, (_, cells) in enumerate(rows[:HEAD_LINES]):
-        bare = {name_and_unit(cell)[0] for cell in cells}
-        missing = wanted - bare - set(cells)
-        if wanted and not missing:
-            return k, tuple(cells)
-        if not wanted and len(low & {name.lower() for name in bare}) > 1:
-            found = [cells[i] for i in numbers if i < len(cells)]
-            of_data = any(_is_number(cell, ',') for cell in found)
+    for k, (_, cells) in enumerate(rows):
+        if len(low & {name.lower() for name in bare[k]}) > 1:
+            numbered = [cells[int(n[1:]) - 1] for n in names if int(n[1:]) <= len(cells)]
+            of_data = any(_is_number(cell, ',') for cell in numbered)
             return (-1, ()) if of_data else (k, tuple(cells))
-        if len(missing) < len(best[1]):
-            best = (k, missing)
-    if not wanted:
-        return (-1, ()) if names else (likely, tuple(rows[likely][1]))
-    has = ', '.join(f'"{cell}"' for cell in rows[best[0]][1] if cell)
-    raise InputError(
-        f'{path} has no column {", ".join(sorted(best[1]))}; line {rows[best[0]][0]} has {has}: '
-        'name its columns (--columns OURS=NAME or OURS=#NUMBER)'
-    )
+    return (-1, ()) if names else (at, tuple(rows[at][1]))
 
 
 def _first(
     path: Path, rows: Sequence[Cells], at: int, used: Sequence[int], decimal: str, notes: list[str]
 ) -> int:
+    """Return the row index of the first row of numbers in the columns `used`."""
     limit = HEAD_LINES if at < 0 else at + 4  # three lines of units at most
     for k in range(at + 1, min(len(rows), limit + 1)):
         cells = [rows[k][1][i] for i in used if i < len(rows[k][1])]

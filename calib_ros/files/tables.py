@@ -28,20 +28,10 @@ from calib_ros.files.columns import (
     Columns,
     columns_of,
     joined_columns,
-    joints_left_out,
     lines_in_words,
 )
-from calib_ros.files.foreign import Foreign, measured, not_read
-from calib_ros.files.layouts import (
-    COVARIANCE,
-    MATRIX,
-    POSITION,
-    QUATERNION,
-    TURNS,
-    UPPER,
-    WORDS,
-    joint_columns,
-)
+from calib_ros.files.foreign import Foreign, measured
+from calib_ros.files.headers import joints_left_out, not_read
 from calib_ros.files.measurements import (
     DISTANCE,
     PLANE,
@@ -50,6 +40,16 @@ from calib_ros.files.measurements import (
     Measurements,
     distinct_rows,
     measurements,
+)
+from calib_ros.files.vocabulary import (
+    COVARIANCE,
+    MATRIX,
+    POSITION,
+    QUATERNION,
+    TURNS,
+    UPPER,
+    WORDS,
+    joint_columns,
 )
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
@@ -91,12 +91,12 @@ def read_table(
         read = _of_journal(path, joints, progress)
     if read is None:
         found = columns_of(path, read_bytes(path, LARGEST_TABLE, InputError), progress)
-        lower = Counter(map(str.lower, found.words))
-        meant = {name: name.lower() for name in found.words if lower[name.lower()] == 1}
+        lower = Counter(map(str.lower, found.cells))
+        meant = {name: name.lower() for name in found.cells if lower[name.lower()] == 1}
         meant = {name: ours for name, ours in meant.items() if ours in WORDS and ours != name}
         notes = [f'{path}: the column {name} is read as {ours}' for name, ours in meant.items()]
-        words = {meant.get(name, name): text for name, text in found.words.items()}
-        found = replace(found, words=words)
+        named = {meant.get(name, name): given for name, given in found.cells.items()}
+        found = replace(found, cells=named)
         kept, skipped = measured(found)
         if skipped:  # of whole rows: others were cut off
             found.block([name for name in joint_columns(joints) if name in found.header])
@@ -109,7 +109,7 @@ def read_table(
 
 
 def _unread(found: Columns, joints: int) -> Iterator[str]:
-    yield from joints_left_out(found, joints)
+    yield from joints_left_out(found.path, found.header, joints)
     known = {*columns(joints), *TURNS, 'plane', f'q{joints + 1}'}
     if {*TURNS} <= {*found.header} and QUATERNION[0] not in found.header:
         turns = ', '.join(TURNS)
@@ -166,7 +166,7 @@ def check_table(made: Columns) -> None:
             f'{made.path} has no joint values: name their columns (--columns q1=...), give the '
             'chain with those joint names (--chain), or their separate table (--joints)'
         )
-    sessions = made.texts('session') if 'session' in made.words else ()
+    sessions = made.texts('session') if 'session' in made.cells else ()
     _table(_chosen(made, joints, tuple(dict.fromkeys(sessions))))
 
 

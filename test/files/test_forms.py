@@ -10,7 +10,8 @@ from calib_ros import Chain, Settings, read_table
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.layouts import MATRIX, Layout, layout_of
+from calib_ros.files.layouts import Layout, layout_of
+from calib_ros.files.vocabulary import MATRIX
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
@@ -50,6 +51,21 @@ def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
     log.write_text(text_of(JOINTS, names=['actual_q_0', 'actual_q_1']))
     with pytest.raises(InputError, match='give --columns "q1=actual_q_0,q2=actual_q_1" or'):
         Foreign(given, ARM, log).convert(path)
+
+
+def test_an_open_quotation_mark_in_the_first_row_hides_no_rows(tmp_path):
+    """Of the row that it makes of all lines only the last was read."""
+    path = tmp_path / 'cell.csv'
+    path.write_text('q1;q2;x;y;z\n1;2;3;4;"5\n1;2;3;4;6\n1;2;3;4;7\n')
+    with pytest.raises(InputError, match='line 4: z must be a finite number, not .5'):
+        read_table(path, 2, foreign=Foreign(Layout()))
+
+
+def test_a_number_of_a_column_that_is_not_there_is_told(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(PLAIN)
+    with pytest.raises(InputError, match='has no column #9 for session; it has q1, q2, x, y, z'):
+        read_table(path, 2, foreign=Foreign(Layout(columns={'session': '#9'})))
 
 
 def test_points_between_thousands_are_no_decimals(tmp_path):

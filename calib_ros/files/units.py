@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Units of the columns of other systems: given by options, told by the header, or assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from calib_ros.errors import InputError
+from calib_ros.files.headers import name_and_unit
+from calib_ros.files.layouts import Expression, Layout
+from calib_ros.files.sheets import Sheet
+from calib_ros.files.vocabulary import (
+    ANGLES,
+    IN_TURN,
+    JOINT,
+    LENGTHS,
+    POSITION,
+    SIGMAS,
+    TURNS,
+    UNIT_SIGNS,
+)
+from calib_ros.kinematics.chain import Chain
+
+OPTIONS = {
+    'length': ('lengths', LENGTHS, 'm'),
+    'angle': ('angles', ANGLES, 'rad'),
+    'joint-angle': ('joint values', ANGLES, 'rad'),
+}
+"""What an option gives the unit of, the units it may have, and the one assumed."""
+
+
+class Units:
+    """The units of our columns, of which `columns` are expressions of those of a sheet."""
+
+    def __init__(
+        self, sheet: Sheet, columns: Mapping[str, Expression], layout: Layout, chain: Chain | None
+    ) -> None:
+        self._sheet, self._columns, self._chain = sheet, columns, chain
+        self.notes: list[str] = []
+        self._assumed: list[str] = []
+        joints = [name for name in columns if JOINT.fullmatch(name) and name[0] != 's']
+        types = [] if chain is None else [joint.type for joint in chain.joints]
+        slides = [name for name in joints if types[int(name[1:]) - 1 :][:1] == ['prismatic']]
+        turns = [name for name in joints if name not in slides]
+        main = [name for name in turns if name[0] == 'q']
+        length = self._above(layout.length)
+        found = self._told('length', length, (*POSITION, 'distance'), (*slides, *SIGMAS[:3]))
+        angles = self._told('angle', layout.angle, (*TURNS, *IN_TURN), SIGMAS[3:])
+        said = {self._said(name) for name in angles} - {''}
+        given = layout.joint_angle or layout.angle
+        if not given and len(said) == 1 and not any(map(self._said, turns)):
+            given = said.pop()
+        found |= angles | self._told(
+            'joint-angle', given, main, [n for n in turns if n not in main]
+        )
+        self.factors = {name: (LENGTHS | ANGLES)[unit] for name, unit in found.items()}
+        """Factors of our columns to m and rad."""
+        if self._assumed:
+            self.notes.append(f'no units are given: taking {", ".join(self._assumed)}')
+
+    def _above(self, length: str) -> str:
+        """Return the unit of lengths: beside `Length Units` above the header, or the given one."""
+        for cells in self._sheet.above:
+            if 'Length Units' in cells[:-1]:
+                unit = UNIT_SIGNS.get(cells[cells.index('Length Units') + 1].lower(), '')
+                if unit in LENGTHS and unit != length:
+                    self.notes.append(f'lengths are in {unit}, as its head says')
+                    length = unit
+        return length
+
+    def _told(
+        self, option: str, given: str, main: Sequence[str], more: Sequence[str]
+    ) -> dict[str, str]:
+        """Return the units of our columns of a kind: given, in the header, or of the main ones."""
+        what, units, usual = OPTIONS[option]
+        said = {name: self._said(name) for name in (*main, *more) if name in self._columns}
+        for name, unit in said.items():
+            self._check(name, unit, units, given)
+        if given:
+            self.notes += [
+                f'its header says {unit}, but {given} is given: taking {given}'
+                for unit in dict.fromkeys(said.values())
+                if unit not in ('', given)
+            ]
+            return dict.fromkeys(said, given)
+        found = {said[name] for name in main if name in said} - {''}
+        bare = [name for name, unit in said.items() if not unit]
+        if bare and len(found) > 1:
+            raise InputError(
+                f'{self._sheet.path}: {bare[0]} has no unit, others are in '
+                f'{" and ".join(sorted(found))}: write it in the header, or convert them '
+                f'(--columns) and give --{option}'
+            )
+        if bare and not found:
+            self._assumed.append(f'{what} in {usual} (--{option})')
+        return {name: unit or next(iter(found), usual) for name, unit in said.items()}
+
+    def _check(self, ours: str, unit: str, units: Mapping[str, float], given: str) -> None:
+        """Refuse a unit of another kind; note one that an expression may have converted."""
+        each = self._columns[ours]
+        if unit and unit not in units:
+            raise InputError(
+                f'{self._sheet.path}: {ours} = {" ".join(map(self._sheet.called, each.names))} '
+                f'cannot be in {unit}, expected {", ".join(units)}: name the right column '
+                '(--columns)'
+                + ', or give --chain if it is prismatic'
+                * (self._chain is None and ours[0] == 'q')
+            )
+        if unit and not given and not {*each.terms} <= {*each.names}:
+            self.notes.append(f'{ours} = {each.text} is in {unit}, as its header says')
+
+    def _said(self, ours: str) -> str:
+        """Return the unit of one of our columns that the header says, `X [mm]`, or empty."""
+        each = self._columns[ours]
+        found = {name_and_unit(self._sheet.called(name))[1] for name in each.names} - {''}
+        if len(found) > 1:
+            raise InputError(
+                f'{self._sheet.path}: {ours} = {each.text} mixes {" and ".join(sorted(found))}, '
+                'as its header says: write these columns in one unit'
+            )
+        return found.pop() if found else ''

@@ -1,0 +1,53 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The words of tables: names of our columns, units, separators and cells without a value."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
+"""Metres in units of length."""
+ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
+LONG = {'degree': 'deg', 'radian': 'rad', 'meter': 'm', 'centimeter': 'cm', 'millimeter': 'mm'}
+LONG |= {'micrometer': 'um'}
+UNIT_SIGNS = {word + s: unit for word, unit in LONG.items() for s in ('', 's')}
+UNIT_SIGNS |= {'°': 'deg', 'µm': 'um', 'μm': 'um', 'inch': 'in', 'inches': 'in'}
+UNIT_SIGNS |= {unit: unit for unit in (*LENGTHS, *ANGLES)}
+"""Units by their signs and words in small letters."""
+_ANY = '|'.join(UNIT_SIGNS)
+UNIT = re.compile(rf'(.*\S) *(?:[\[(] *({_ANY}) *[\])]|/ *({_ANY}))', re.I)
+"""A name with its unit: X [mm], X (mm), X / mm."""
+
+SEPARATORS = {'comma': ',', 'semicolon': ';', 'tab': '\t', 'space': ' '}
+DECIMAL_COMMA = re.compile(r'\s*[+\u2212-]?[0-9]+,[0-9]+([eE][+-]?[0-9]+)?\s*')
+THOUSANDS = re.compile(r"[+\u2212-]?[1-9][0-9]{0,2}([\s.,'\u2019][0-9]{3})+([.,][0-9]*)?")
+MISSING = frozenset(('', 'nan', '-nan', 'na', 'n/a', '#n/a', '#nv', 'null', 'none', '-', '--'))
+"""Cells without a value, in small letters."""
+SHEETS = ('.xlsx', '.xlsm')
+
+POSITION, QUATERNION = ('x', 'y', 'z'), ('qx', 'qy', 'qz', 'qw')
+POSE_COLUMNS = (*POSITION, *QUATERNION)
+UPPER = tuple((i, j) for i in range(6) for j in range(i, 6))
+COVARIANCE = tuple(f'c{i + 1}{j + 1}' for i, j in UPPER)
+TURNS = ('rx', 'ry', 'rz')
+"""Angles about x, y, z of three different letters, or a rotation vector."""
+IN_TURN = ('r1', 'r2', 'r3')  # Euler angles in the order of the letters
+MATRIX = tuple(f'r{i}{j}' for i in (1, 2, 3) for j in (1, 2, 3))
+"""Rotation matrices, row by row."""
+SIGMAS = ('sx', 'sy', 'sz', 'srx', 'sry', 'srz')
+"""Standard deviations of x y z, and of rx ry rz (or about x y z of the device)."""
+WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'stamp_ns')  # as text
+NUMBERS = (*POSE_COLUMNS, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time', 'delay')
+JOINT = re.compile('[qsva][0-9]+')
+"""Columns with a number of each joint: values, signs of last moves, and rates."""
+MEASURED_COLUMNS = (*POSITION, 'distance', 'socket', 'plane')
+KINDS = ('x', 'distance', 'socket', 'plane')
+"""Columns whose cells determine what a row measured."""
+
+
+def joint_columns(joints: int, letter: str = 'q') -> tuple[str, ...]:
+    """Return the columns with a number of each joint."""
+    return tuple(f'{letter}{k + 1}' for k in range(joints))
