@@ -258,11 +258,13 @@ def csv_blocks(
             'Save it as CSV in UTF-8'
         )
     as_text(data, str(path), ColumnsError)
-    reader = csv.reader(csv_lines(data, str(path)), delimiter=separator, strict=strict)
-    line, block = 0, list[Cells]()
+    lines = chain(csv_lines(data, str(path)), ['\n'])  # no row, unless a quotation mark is open
+    reader = csv.reader(lines, delimiter=separator, strict=strict)
+    before = line = 0
+    block = list[Cells]()
     try:
         for row in reader:
-            line = reader.line_num
+            before, line = line, reader.line_num
             if any(row):
                 block.append((above + line, row))
             if len(block) * len(row) >= MOST_ENTRIES:  # cells that fit the caches
@@ -270,6 +272,9 @@ def csv_blocks(
                     raise InputError(f'{path} has {len(row)} columns, more than {MOST_ENTRIES}')
                 yield block
                 block = []
+        if row:
+            line = before
+            raise csv.Error('unexpected end of data')
     except csv.Error as err:
         raise InputError(
             f'cannot read {path} from line {above + line + 1}: {err}: are its quotation marks '

@@ -53,12 +53,14 @@ def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
         Foreign(given, ARM, log).convert(path)
 
 
-def test_an_open_quotation_mark_in_the_first_row_hides_no_rows(tmp_path):
-    """Of the row that it makes of all lines only the last was read."""
+@pytest.mark.parametrize('cell', ['"5', '5,"as above', '5,"'])
+def test_an_open_quotation_mark_hides_no_rows(tmp_path, cell):
+    """The rows below were one cell with it, of a column that need not be read."""
     path = tmp_path / 'cell.csv'
-    path.write_text('q1;q2;x;y;z\n1;2;3;4;"5\n1;2;3;4;6\n1;2;3;4;7\n')
-    with pytest.raises(InputError, match='line 4: z must be a finite number, not .5'):
-        read_table(path, 2, foreign=Foreign(Layout()))
+    path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5\n1,2,3,4,{cell}\n1,2,3,4,6\n1,2,3,4,7\n')
+    for foreign in (None, Foreign(Layout())):
+        with pytest.raises(InputError, match=r'from line 3: .* quotation marks paired'):
+            read_table(path, 2, foreign=foreign)
 
 
 def test_a_number_of_a_column_that_is_not_there_is_told(tmp_path):
