@@ -10,14 +10,15 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from calib_ros.kinematics.se3 import Flags, Index
+from calib_ros.estimation.configurations import STILL
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.messages import JOINT_STATE, PICTURES, Readings, usable
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, JointIndices, Piece, StreamKey
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
 from calib_ros.values import MOST_NAMES
 
-JointLayout: TypeAlias = tuple[JointIndices, Index]
+JointLayout: TypeAlias = tuple[JointIndices, Index, str]
 OTHERS = 'none of the joints in the message'
 NOWHERE = -1  # column of a joint that needs no name
 
@@ -32,12 +33,10 @@ class JointNames:
     def __init__(self, names: Sequence[str], held: Mapping[int, float] | None = None) -> None:
         self._names, self.held = names, held or {}
         self._layouts: dict[tuple[str, ...], JointLayout] = {}
-        self.foreign: tuple[str, ...] = ()
-        """Names received if some of the chain's joints are never named."""
-        self.never: tuple[str, ...] = ()  # these joints
+        self._heard: dict[str, tuple[float, float]] = {}  # lowest and highest value by name
 
     def layout(self, key: tuple[str, ...]) -> JointLayout:
-        """Return the joints of the chain in messages, and the columns of their values.
+        """Return the joints of the chain in messages, the columns of their values, and any fault.
 
         Of held joints that are not named the column is NOWHERE.
         """
@@ -45,15 +44,37 @@ class JointNames:
             if len(self._layouts) == MOST_NAMES:
                 self._layouts.clear()
             known = {k: key.index(n) for k, n in enumerate(self._names) if n in key}
-            some = known.keys() - self.held.keys()
-            known = dict.fromkeys(self.held, NOWHERE) | known if some else {}
-            known = dict(sorted(known.items()))
-            self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp)
-            named = {name for names in self._layouts for name in names}
-            needed = {n for k, n in enumerate(self._names) if k not in self.held}
-            self.never = tuple(sorted(needed - named))
-            self.foreign = tuple(sorted(named)) if self.never else ()
+            needed = known.keys() - self.held.keys()
+            known = dict(sorted((dict.fromkeys(self.held, NOWHERE) | known).items()))
+            twice = any(key.count(name) > 1 for name in self._names)
+            fault = 'a joint is named twice' if twice else '' if needed else OTHERS
+            self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp), fault
         return self._layouts[key]
+
+    def hear(self, names: Sequence[str], values: FloatArray) -> None:
+        """Note the names and values (N, len(names)) of joint states, but of too many others."""
+        lows, highs = np.fmin.reduce(values).tolist(), np.fmax.reduce(values).tolist()
+        for name, low, high in zip(names, lows, highs, strict=True):
+            if name in self._heard or name in self._names or len(self._heard) < MOST_NAMES:
+                before = self._heard.get(name, (np.inf, -np.inf))
+                self._heard[name] = min(before[0], low), max(before[1], high)
+
+    @property
+    def never(self) -> tuple[str, ...]:
+        """Return the joints that must be named and never were."""
+        needed = {name for k, name in enumerate(self._names) if k not in self.held}
+        return tuple(sorted(needed - self._heard.keys()))
+
+    @property
+    def foreign(self) -> tuple[str, ...]:
+        """Return the names received if some of the chain's joints are never named."""
+        return tuple(sorted(name or '""' for name in self._heard)) if self.never else ()
+
+    @property
+    def missed(self) -> list[str]:
+        """Return the names of joints that move but are not in the chain."""
+        moved = {name for name, (low, high) in self._heard.items() if high - low > STILL}
+        return sorted(moved.difference(self._names))
 
     def foreign_ones(self, missing: Sequence[int]) -> str:
         """Return a hint that other joints arrive than the missing ones; empty if none do."""
@@ -179,9 +200,10 @@ class MessageFilter:
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
         latest = -1
         for places, _, (stamps, (_, *names), numbers) in parts:
-            columns, index = self._names.layout(tuple(names))
-            if not columns:
-                self.miss(JOINTS, len(stamps), OTHERS)
+            self._names.hear(names, numbers)
+            columns, index, fault = self._names.layout(tuple(names))
+            if fault:
+                self.miss(JOINTS, len(stamps), fault)
                 continue
             values = numbers[:, index]
             for place in np.flatnonzero(index == NOWHERE):

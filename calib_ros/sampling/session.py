@@ -206,6 +206,8 @@ class CalibrationSession:
         notes = collector.notes.copy()
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
+        if missed := self._names.missed:
+            notes[f'joint that moves but is not in the chain: {", ".join(missed)}'] = len(missed)
         return Account(
             joint_states=self.received[JOINTS],
             poses=self.received[POSES],

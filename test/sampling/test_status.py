@@ -11,6 +11,7 @@ from streams import POSE, TRACKER, joint_state, of_joints, pose, stamps, stops, 
 from calib_ros.errors import InputError
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
+from calib_ros.values import MOST_NAMES
 
 # Settings and words
 
@@ -138,6 +139,46 @@ def test_the_status_tells_why_no_joint_state_is_used(stamp, value, cause):
     assert 'refused' not in made.status()
     take(made, refused)  # a driver may fail later
     assert made.status().startswith(said)
+
+
+def named(*messages):
+    """Return a session that has heard joint states (names, values)."""
+    made = session()
+    stamps = range(10**18, 10**18 + 10**7 * len(messages), 10**7)
+    take(
+        made, *(of_joints(joint_state(t, *each)) for t, each in zip(stamps, messages, strict=True))
+    )
+    return made
+
+
+def test_a_joint_that_is_named_twice_has_no_value():
+    twice = (*UR5E.joint_names, UR5E.joint_names[0])
+    made = named((twice, [0.1] * 6 + [0.2]))
+    assert 'joint states are refused, a joint is named twice' in made.status()
+    assert made.latest is None
+    assert made.account().dropped == {'joints: a joint is named twice': 1}
+    others = (*UR5E.joint_names, 'finger', 'finger')  # not ours to judge
+    assert named((others, [0.1] * 8)).account().dropped == {}
+
+
+def test_what_was_heard_is_remembered_however_the_names_are_arranged(rng):
+    """More arrangements than are kept, the last of them without one joint."""
+    orders = [rng.permutation(6) for _ in range(MOST_NAMES)] + [np.arange(5)]
+    made = named(*(([UR5E.joint_names[k] for k in each], 0.1 * each) for each in orders))
+    assert (made.account().never_named, made.account().foreign_names) == ((), ())
+
+
+def test_names_that_are_empty_are_shown():
+    assert 'Those received name "", not shoulder' in named(([''] * 6, [0.1] * 6)).status()
+
+
+def test_a_joint_that_moves_but_is_not_in_the_chain_is_told():
+    names = [*UR5E.joint_names, 'rail', 'finger', 'unknown']
+    made = named(*((names, [0.1] * 6 + [0.01 * k, 0.3, np.nan]) for k in range(3)))
+    assert made.account().notes == {'joint that moves but is not in the chain: rail': 1}
+    take(made, of_joints(joint_state(2 * 10**18, ['finger'], [0.0])))
+    (note,) = made.account().notes
+    assert note.endswith('finger, rail')
 
 
 def test_the_status_tells_that_nothing_is_recorded():
