@@ -37,7 +37,7 @@ from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.slices import JOINTS, POSES
 from calib_ros.sampling.sources import Source
-from calib_ros.sampling.transforms import STATIC, Linked, Links
+from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000  # messages taken at once (benchmarks/bags.py, benchmarks/soak.py)
@@ -136,16 +136,17 @@ def decode(
     """
     parts: list[Part] = []
     problems: list[str] = []
-    linked: dict[Links, list[Linked]] = {}
+    linked: dict[Links, tuple[list[Part], list[Part]]] = {}  # moving and still ones
     for stream, places, found in _read(batch, deserialise, pictures, miss, problems):
         if stream.type != JOINT_STATE:
             found = found._replace(strings=tuple(map(frame_name, found.strings)))
+        part = Part(places, stream.source, found)
         if stream.links is None:
-            parts.append(Part(places, stream.source, found))
+            parts.append(part)
         else:
-            linked.setdefault(stream.links, []).append(Linked(places, stream.still, found))
+            linked.setdefault(stream.links, ([], []))[stream.still].append(part)
     for links, come in linked.items():
-        measured, faults = links.take(come)
+        measured, faults = links.take(*come)
         parts += measured
         for cause, count in faults.items():
             miss(POSES, count, cause)

@@ -62,10 +62,6 @@ class Rows:
         self._stamps[: len(stamps)] = stamps
         self.count = len(stamps)
 
-    def release(self, count: int) -> None:
-        """Drop the first rows."""
-        self.keep(slice(count, None))
-
     def sort(self) -> tuple[int, int]:
         """Sort the rows by stamp, one row each; return how many were dropped as equal or contrary.
 

@@ -174,7 +174,7 @@ class Collector:
         for rows in self.waiting.values():
             if rows.count:
                 self._count_causes(self.track.causes(rows.stamps - self.delay_ns))
-                rows.release(rows.count)
+                rows.keep(slice(0))
 
     def state(self) -> str:
         """Return the state of sampling, for display."""
@@ -320,7 +320,7 @@ class Collector:
                 approach = self.track.approach(stamps[good[begins]], motion.joints[begins])
                 delay, sigma = 1e-9 * self.delay_ns, self.settings.sigma_position
                 found += self.sampler.samples(seen, motion, begins, approach, delay, sigma)
-            rows.release(due)
+            rows.keep(slice(due, None))
         for stop in () if moving else plan.stops:
             self.unmeasured = 0 if stop in measured else self.unmeasured + 1
         self.sampler.add(found)

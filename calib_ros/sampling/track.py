@@ -207,7 +207,7 @@ class Track:
             earlier, revolute = self._earlier[index], self._revolute[index]
             signs = last_moves(rows.values, cuts, rows.values[cuts], earlier, revolute)
             self._earlier[index] = signs[0]
-            rows.release(cut)
+            rows.keep(slice(cut, None))
             dropped += cut
         self.horizon_ns = max(self.horizon_ns, before_ns)
         return dropped

@@ -20,7 +20,7 @@ import numpy as np
 
 from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import MessageLayout
 from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, short_type, usable
@@ -29,23 +29,9 @@ from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
 from calib_ros.values import SAME
 
-Pair: TypeAlias = tuple[str, str]  # parent and child frame of a link
+Pair: TypeAlias = tuple[str, ...]  # parent and child frame of a link
 
 STATIC = '_static'  # suffix of the topic of static links
-
-
-class Linked(NamedTuple):
-    """Transforms between two frames, from messages at `places` (N,) in the batch."""
-
-    places: Index
-    still: bool
-    readings: Readings
-
-    @property
-    def link(self) -> Pair:
-        """Return the parent and child frame."""
-        parent, child = self.readings.strings
-        return parent, child
 
 
 class Route(NamedTuple):
@@ -94,31 +80,35 @@ class Links:
         self._held: deque[tuple[Pair, Readings]] = deque()
         self._let_go: Counter[Pair] = Counter()
 
-    def take(self, come: Sequence[Linked]) -> tuple[list[Part], Counter[str]]:
+    def take(
+        self, moving: Sequence[Part], still: Sequence[Part] = ()
+    ) -> tuple[list[Part], Counter[str]]:
         """Return the measurements of sources in transforms, and why some cannot be used.
 
         Frames named anywhere among them are known for all. Measurements wait while the links
         between their frames are unknown.
         """
-        for each in come:
-            self._fix(each) if each.still else self._move(each)
+        for each in still:
+            self._fix(each.readings)
+        for each in moving:
+            self._move(each.readings)
         open_before = {source for source, route in self._routes.items() if route == ''}
         self._update()
-        first, faults = min(int(each.places[0]) for each in come), Counter[str]()
+        first, faults = min(int(each.places[0]) for each in (*moving, *still)), Counter[str]()
         found = [
             Part(np.full(len(waited.stamps_ns), first), s, self._reading(s, route, waited))
             for link, waited in self._held
             for s, route in self._of(link)
             if s in open_before
         ]
-        for each in come:
-            if each.still or not (self._open or each.link in self._wanted):
+        for places, _, readings in moving:
+            link = readings.strings
+            if not (self._open or link in self._wanted):
                 continue
-            good, causes = usable(TRANSFORM, each.readings)
-            read, measured = each.readings.rows(good), self._of(each.link)
+            good, causes = usable(TRANSFORM, readings)
+            places, read, measured = places[good], readings.rows(good), self._of(link)
             faults += Counter({cause: n * len(measured) for cause, n in causes.items()})
-            self._held.append((each.link, read))
-            places = each.places[good]
+            self._held.append((link, read))
             found += [Part(places, s, self._reading(s, route, read)) for s, route in measured]
         if not self._open:
             lost_count = sum(n * len(self._of(link)) for link, n in self._let_go.items())
@@ -130,18 +120,18 @@ class Links:
             self._let_go[oldest] += len(lost.stamps_ns)
         return found, faults
 
-    def _fix(self, come: Linked) -> None:
-        stamped = come.readings._replace(stamps_ns=np.ones_like(come.places))  # they need none
-        good, _ = usable(TRANSFORM, stamped)
-        for numbers in stamped.numbers[good]:
+    def _fix(self, come: Readings) -> None:
+        link, stampless = come.strings, come._replace(stamps_ns=np.ones_like(come.stamps_ns))
+        good, _ = usable(TRANSFORM, stampless)
+        for numbers in come.numbers[good]:
             matrix = se3.transform(se3.from_quat(numbers[3:]), numbers[:3])
-            before = self._fixed.setdefault(come.link, matrix)
+            before = self._fixed.setdefault(link, matrix)
             if not np.allclose(before, matrix, rtol=0.0, atol=SAME):
-                self._changed.add(come.link)
+                self._changed.add(link)
             self._known = False
 
-    def _move(self, come: Linked) -> None:
-        link, (first_ns, last_ns) = come.link, come.readings.stamps_ns[[0, -1]].tolist()
+    def _move(self, come: Readings) -> None:
+        link, (first_ns, last_ns) = come.strings, come.stamps_ns[[0, -1]].tolist()
         if link not in self._moving:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()
@@ -151,7 +141,7 @@ class Links:
             self._moving[link] = Seen(0, first_ns, last_ns)
             self._known = False
         seen = self._moving[link]
-        seen.count += len(come.places)
+        seen.count += len(come.stamps_ns)
         seen.first_ns, seen.last_ns = min(seen.first_ns, first_ns), max(seen.last_ns, last_ns)
 
     def problems(self) -> list[str]:

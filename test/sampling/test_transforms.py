@@ -24,10 +24,11 @@ from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.cdr import alike
+from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import JOINT_STATE, TRANSFORMS, Readings
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.sampling.sources import parse_sources
-from calib_ros.sampling.transforms import Linked, Links
+from calib_ros.sampling.transforms import Links
 from calib_ros.settings import Settings
 
 PLAIN = '/tf parent=world child=tool'
@@ -243,7 +244,7 @@ def test_frames_without_end_are_not_remembered(rng):
     links = Links('/tf')
     at, numbers = np.zeros(1, int), np.array([[0.0] * 6 + [1.0]])
     for k in range(1500):
-        links.take([Linked(at, False, Readings(at + k, ('tracker', f'marker {k}'), numbers))])
+        links.take([Part(at, None, Readings(at + k, ('tracker', f'marker {k}'), numbers))])
     assert 'and 980 more' in str(links)
 
 
