@@ -19,7 +19,12 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import distinct
-from calib_ros.estimation.identifiability import DEGENERATE, excited, structurally_independent
+from calib_ros.estimation.identifiability import (
+    DEGENERATE,
+    excited,
+    independent,
+    structurally_independent,
+)
 from calib_ros.estimation.leastsquares import (
     System,
     factor_of,
@@ -27,7 +32,8 @@ from calib_ros.estimation.leastsquares import (
     normal_equations,
     triangular_factor,
 )
-from calib_ros.estimation.observations import SOME_POSES, Observations
+from calib_ros.estimation.levels import TELLING
+from calib_ros.estimation.observations import SOME_POSES, Observations, numbered
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.resection import board_poses
 from calib_ros.estimation.robust import robust_fit, thorough_fit
@@ -85,18 +91,34 @@ def in_new_frames(
         known = known.with_frame(name, replace(frame, fixed=frame.fixed or name not in new))
     own = movable(known, new)
     found = start_frames(replace(problem, chain=known))
+    if needed:
+        _check_shown(found, own, problem, system)
     seen = excited(triangular_factor(found, own, system), own)
-    hidden = set(structurally_independent(known, own, problem.kinds)).difference(seen)
-    if hidden and needed:
-        frames = ' and '.join(dict.fromkeys(name.owner for name in own if name in hidden))
-        raise InputError(
-            f'{counted(system.count, "pose")} cannot place the new {frames}: measure more, all '
-            'over the joint range'
-        )
     placed = minimise(found, seen, system).chain
     for name in new:
         arm = arm.with_frame(name, replace(arm.frame(name), matrix=placed.frame(name).matrix))
     return arm
+
+
+def _check_shown(
+    chain: Chain, names: Sequence[Parameter], problem: Problem, system: System
+) -> None:
+    """Require that poses show parameters of frames, also without any one of them.
+
+    Frames that fit all poses exactly tell nothing of the arm.
+    """
+    groups = numbered(problem.all_sets)
+    folds = min(TELLING, distinct(np.concatenate(groups)))
+    rests = [system.select([g % folds != k for g in groups]) for k in range(folds)]
+    shown = set(excited(triangular_factor(chain, names, system), names)).intersection(
+        *(independent(triangular_factor(chain, names, rest), names) for rest in rests)
+    )
+    if hidden := set(structurally_independent(chain, names, problem.kinds)).difference(shown):
+        frames = ' and '.join(dict.fromkeys(name.owner for name in names if name in hidden))
+        raise InputError(
+            f'{counted(system.count, "pose")} cannot place the new {frames}: measure more, all '
+            'over the joint range'
+        )
 
 
 def _start_one(

@@ -148,3 +148,17 @@ def test_too_few_poses_for_a_new_frame_are_refused(earlier):
     new = ('base', 'tool') if oriented else ('base',)
     with pytest.raises(InputError, match=rf'{len(few.observations)} poses? cannot place the new '):
         recalibrate(previous, few, 0.1, new=new)
+
+
+@pytest.mark.parametrize('new', [('base',), ('tool',), ('base', 'tool')])
+def test_new_frames_that_fit_their_poses_exactly_confirm_nothing(earlier, new):
+    """One pose places a frame, three positions both, whatever the arm: none is left to judge."""
+    true, previous, oriented = earlier
+    rng = np.random.default_rng(1)
+    there = {name: random_frame(rng, 1.0) for name in new}
+    now = replace(slipped(true, [0.0, 0.0, 3e-3, 0.0, 0.0, 0.0]), **there)
+    count = {1: 1 if oriented or new == ('tool',) else 2, 2: 3}[len(new)]
+    with pytest.raises(InputError, match=rf'{count} poses? cannot place the new '):
+        recalibrate(previous, seen(now, count, 1, oriented), 0.1, new=new)
+    few = seen(now, 8, 1, oriented)
+    assert 'elbow_joint' in owners(recalibrate(previous, few, 0.1, new=new).changed)[0]
