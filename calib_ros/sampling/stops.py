@@ -68,13 +68,13 @@ def mean_of_each(rows: FloatArray, begins: Index, used: Flags) -> FloatArray:
 
 
 def _noise(values: FloatArray) -> float:
-    """Return the standard deviation of one coordinate from successive differences.
+    """Return the standard deviation of a coordinate, RMS over them, from successive differences.
 
     The second ones have less of a motion in them, the first ones fewer spikes.
     """
-    first, second = (np.median(np.abs(np.diff(values, k, axis=0))) for k in (1, 2))
-    noise = min(first / np.sqrt(2.0), second / np.sqrt(6.0))
-    return float(1.4826 * noise)  # the median: spikes do not count
+    first, second = (np.median(np.abs(np.diff(values, k, axis=0)), axis=0) for k in (1, 2))
+    noise = np.minimum(first / np.sqrt(2.0), second / np.sqrt(6.0))
+    return float(1.4826 * np.sqrt((noise**2).mean()))  # the median: spikes do not count
 
 
 def _settled(values: FloatArray, reach: float) -> int:

@@ -115,6 +115,13 @@ def test_a_steady_motion_of_few_measurements_is_refused(rng, count):
     assert average(noisy(rng, count) + motion) is None
 
 
+@pytest.mark.parametrize('depth', [5.0, 20.0])
+def test_noise_along_one_axis_is_no_motion(rng, depth):
+    """A camera knows depth less well than the rest."""
+    noise = rng.normal(scale=SIGMA * np.array([1.0, 1.0, depth]), size=(400, 20, 3))
+    assert sum(average(each) is None for each in noise) < 20
+
+
 @pytest.mark.parametrize('count', [5, 10, 60])
 def test_noise_larger_than_the_sigma_given_is_no_motion(rng, count):
     refused = sum(average(noisy(rng, count), SIGMA / 10.0) is None for _ in range(200))
