@@ -87,7 +87,7 @@ def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
     """Return the cameras among sources by image topic."""
     sources = [source for source in parse_sources(texts) if source.board]
     for source in sources:
-        if 'image_rect' in source.topic.rpartition('/')[2]:
+        if 'image_rect' in source.raw_topic.rpartition('/')[2]:
             raise ConfigError(
                 f'source "{source.topic}" is rectified: give what CameraInfo describes, image_raw'
             )

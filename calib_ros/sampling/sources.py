@@ -65,9 +65,14 @@ class Source:
                 raise ConfigError(f'a device or target needs a name without . and , not "{name}"')
 
     @property
+    def raw_topic(self) -> str:
+        """Return the topic of the same images uncompressed."""
+        return self.topic.removesuffix('/compressed')
+
+    @property
     def camera_info(self) -> str:
         """Return the CameraInfo topic of images."""
-        beside = self.topic.removesuffix('/compressed').rpartition('/')
+        beside = self.raw_topic.rpartition('/')
         return self.info or f'{beside[0]}{beside[1]}camera_info'
 
 

@@ -304,6 +304,7 @@ def test_an_image_that_does_not_fit_its_camera_info_is_refused(shift, board):
         ('cam/image_raw board=x.yaml lens=thick', 'unknown lens'),
         ('cam/image_raw board=/nowhere.yaml', 'nowhere.yaml'),
         ('cam/image_rect board=BOARD', 'is rectified: give what'),
+        ('cam/image_rect_color/compressed board=BOARD', 'is rectified: give what'),
     ],
 )
 def test_a_source_of_images_that_cannot_be(board, text, said):
