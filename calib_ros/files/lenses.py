@@ -49,12 +49,12 @@ def _require_size(path: Path, content: Mapping[str, Any], found: Detections) -> 
     if not all(keys):
         return
     size = tuple(parse_number(content[key], f'{path}: {key}') for key in keys)
-    farthest = found.pixels.max(axis=0)
-    if found.size is not None:
-        what, right = 'of images of {} x {} px'.format(*found.size), found.size == size
-    else:
-        what, right = 'reach {:.1f}, {:.1f}'.format(*farthest), (farthest < size).all()
-    if not right:
+    farthest, what = found.pixels.max(axis=0), ''
+    if found.size not in (None, size):
+        what = 'of images of {} x {} px'.format(*found.size)
+    elif not (farthest < size).all():
+        what = 'reach {:.1f}, {:.1f} (is u to the right, v down?)'.format(*farthest)
+    if what:
         raise InputError(
             f'{path} is of images of {size[0]:g} x {size[1]:g} px, the corners {what}: give the '
             'intrinsics of the camera as it took these images'

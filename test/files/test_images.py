@@ -243,6 +243,7 @@ def test_intrinsics_of_other_images_are_refused(tmp_path):
         (',3200,2400', '10', 'of 1600 x 1200 px, the corners of images of 3200 x 2400'),
         (',800,600', '10', 'of 1600 x 1200 px, the corners of images of 800 x 600'),
         ('', '1600.2', r'of 1600 x 1200 px, the corners reach 1600.2, 20'),
+        (',1600,1200', '1600.2', r'reach 1600.2, 20.0 \(is u to the right, v down\?\)'),
     ):
         sized = ',width,height' if size else ''
         table.write_text(f'image,corner,u,v{sized}\na,0,{beyond},20{size}\na,1,5,5{size}\n')
