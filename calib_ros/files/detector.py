@@ -190,12 +190,15 @@ class Detector:
         apart = np.inf if placed is None else np.linalg.norm(placed - seen, axis=1).max(initial=0)
         # lens and board may bend it by half a refinement window, or 10 %
         if apart > max(0.5 * WIDEST, EXCEPTION * self._spacing(points, seen)):
-            return Flaw(
-                'whose corners do not fit the board',
-                f'its {"markers" if few else "corners"} do not fit the board ({apart:.0f} px '
-                'off): are type, columns, rows, square, marker and legacy those of this board, '
-                'and is it flat?',
+            asked = (
+                'are type, columns, rows, square, marker and legacy those of this board, and is '
+                'it flat?'
             )
+            for number in np.flatnonzero(np.bincount(ids) > 1)[:1].tolist():
+                asked = f'marker {number} appears twice: show one such board only'
+            what = f'its {"markers" if few else "corners"} do not fit the board'
+            reason = f'{what} ({apart:.0f} px off): {asked}'
+            return Flaw('whose corners do not fit the board', reason)
         if few:
             return Flaw(
                 'with too little of the board',

@@ -59,7 +59,10 @@ def test_images_are_refused_with_the_reason():
     wider = boards.Board('markers', 3, 6, 0.036, 0.026, 'DICT_6X6_250')
     turned = boards.Board('charuco', 7, 5, 0.036, 0.026, 'DICT_6X6_250')
     whole = Detector(CHARUCO)
+    small_part = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    twice = np.hstack([small_part, small_part])
     cases = [
+        (whole, twice, r'not fit .* off\): marker \d+ appears twice: show one such board only'),
         (whole, photograph(CHARUCO, blur=4.0)[0], r'blurred: its sharpest edges are \d+ px wide'),
         (whole, photograph(CHARUCO, shift=(0.27, 0.2))[0], 'of the 24 corners, fewer than 6'),
         (whole, image[:, ::-1].copy(), r'no marker of DICT_6X6_250, but \d+ mirrored'),
