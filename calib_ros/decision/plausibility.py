@@ -14,7 +14,8 @@ leave errors that are larger where the arm is faster or accelerates more; nothin
 
 Lag. A device that smooths, late stamps or a creeping arm measure each pose towards the previous
 stop, at joint values q_i - w (q_i - q_i-1): a delay w with the last move as velocity. The arm
-imitates what depends on q_i alone, and may become worse; the rest is most of the residuals.
+imitates what depends on q_i alone, and may become worse; the rest is most of the residuals. Play
+of the joints, which depends on the sign of that move, looks alike but explains more.
 
 Order. If one joint only goes one way during the session, what drifts with time is fitted as its
 error, and no test can tell them apart.
@@ -47,6 +48,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.sizes import TYPICAL
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.effects import members
 from calib_ros.kinematics.parameter import DELAY, IN_A_FRAME, LENS_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import EXACT, EXCEPTION, Settings
@@ -196,6 +198,15 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     share = explained_share(late, chain, result.names, delays)
     if share < EXPLAINED:
         return result
+    play = [name for name in members(chain, 'backlash') if name not in result.names]
+    played = explained_share(late, chain.with_effects(play), result.names, play)
+    if played > share:
+        text = (
+            f'the joints have play, which explains {100.0 * played:.0f} % of the residuals: '
+            'reach each pose from the same side, or fit the play (model auto) with the signs of '
+            'the last moves (s1 ... sn)'
+        )
+        return replace(result, remarks=(*result.remarks, text))
     text = (
         f'poses lie towards the previous stop, which explains {100.0 * share:.0f} % of the '
         'residuals: the device smooths, stamps are late, or the arm creeps. Set settle to the '
@@ -207,11 +218,12 @@ def _lag(problem: Problem, result: Identification) -> Identification:
 
 
 def _with_moves(each: Observations) -> Observations:
-    """Return poses with the move from the previous stop (N, n) as velocity."""
+    """Return poses with the last move (N, n) as velocity, and its sign where unknown."""
     order = np.argsort(each.stamps_ns, kind='stable')
     moves = np.zeros_like(each.joints)
     moves[order[1:]] = np.diff(each.joints[order], axis=0)
-    return replace(each, velocity=moves, delay=np.zeros(len(each)))
+    signs = np.sign(moves) if each.approach is None else each.approach
+    return replace(each, velocity=moves, approach=signs, delay=np.zeros(len(each)))
 
 
 def _sigmas(problem: Problem, result: Identification) -> str:
