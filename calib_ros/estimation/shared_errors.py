@@ -24,6 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg, special
@@ -101,10 +102,13 @@ class Stops:
 
     def kernel(self, kind: str, length: float) -> FloatArray:
         """Return (n, n): covariance of the sums over each stop, per root of count."""
-        root, place = np.sqrt(self.count), self.place
-        if kind == 'successive':
-            place = self.time[:, np.newaxis]
-        return np.asarray(np.outer(root, root) * np.exp(-cdist(place, place) / length))
+        root = np.sqrt(self.count)
+        return np.asarray(np.outer(root, root) * np.exp(-self._apart[kind] / length))
+
+    @cached_property
+    def _apart(self) -> dict[str, FloatArray]:  # (n, n) by kind
+        places = {'successive': self.time[:, np.newaxis], 'near': self.place}
+        return {kind: cdist(place, place) for kind, place in places.items()}
 
 
 def shared_errors(fit: Fit, names: Sequence[str], system: System) -> Shared:
@@ -183,14 +187,16 @@ class _Forms:
         """Return the traces (F, F) tr(A B C B) of forms with matrices (K, n, n) by part."""
         inner, alone = list[FloatArray](), list[FloatArray]()
         for part, own in matrices.items():
-            basis, known, flat = self._basis[part], self._known[part], own.reshape(len(own), -1)
-            crossed = [gram(_rooted(basis, matrix).transpose(2, 0, 1)) for matrix in own]
-            inner.append(np.reshape(crossed, (len(own), -1)))
-            alone.append(np.zeros((len(own), len(own))))
+            basis, known, count = self._basis[part], self._known[part], len(own)
+            crossed, traces = np.zeros((count, basis.shape[2] ** 2)), np.zeros((count, count))
             for seen in np.unique(known, axis=1).T:
                 alike = (known == seen[:, np.newaxis]).all(axis=0)
-                white = alike.sum() * np.diag(seen) - 2.0 * gram(basis[:, alike])
-                alone[-1] += (seen[:, np.newaxis] * (own @ white)).reshape(flat.shape) @ flat.T
+                both = own * np.outer(seen, seen)
+                more, common = _crossed(basis[:, alike], own, both)
+                crossed += more.reshape(count, -1)
+                traces += alike.sum() * gram(both) - 2.0 * common
+            inner.append(crossed)
+            alone.append(traces)
         return np.asarray(gram(np.concatenate(inner)) + linalg.block_diag(*alone))
 
     def _values(self, matrices: Mapping[int, FloatArray]) -> FloatArray:
@@ -246,6 +252,22 @@ def nonnegative(moments: FloatArray, values: FloatArray) -> FloatArray:
     along = (values / scale) @ directions / roots
     sizes = optimize.nnls(roots[:, np.newaxis] * directions.T, along)[0]
     return np.asarray(sizes / scale)
+
+
+def _crossed(
+    basis: FloatArray, own: FloatArray, both: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return Q^T A Q (K, P, P) of columns Q (n, c, P), and the traces (K, K) tr(A C Q Q^T).
+
+    Of matrices A (K, n, n) and, for the traces, those between the rows that were measured.
+    """
+    columns, rows = basis.reshape(len(basis), -1), basis.reshape(-1, basis.shape[2])
+    if columns.shape[1] <= len(columns):
+        spread = both @ columns
+        return rows.T @ spread.reshape(-1, *rows.shape), gram(spread)
+    crossed = [gram(_rooted(basis, each).transpose(2, 0, 1)) for each in own]
+    spread = both @ (columns @ columns.T)
+    return np.array(crossed), spread.reshape(len(both), -1) @ both.reshape(len(both), -1).T
 
 
 def _rooted(basis: FloatArray, matrix: FloatArray) -> FloatArray:

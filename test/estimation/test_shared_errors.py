@@ -271,9 +271,11 @@ def test_errors_near_in_joint_space_have_the_kernel_of_their_distance():
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
-def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(monkeypatch):
+@pytest.mark.parametrize('width', [4, 9])  # fewer rows of 20 stops than columns, and more
+def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(width, monkeypatch):
     """Forms of exactly the expected values give back the sizes, of both parts."""
-    units, extra = drawn(np.random.default_rng(3)), np.random.default_rng(4).normal(size=(2, 4))
+    units = drawn(np.random.default_rng(3), width=width)
+    extra = np.random.default_rng(4).normal(size=(2, width))
     forms = shared_errors._Forms(units, extra)
     assert forms.parts == [0, 1]
     kernels = {0: [('successive', 5.0), ('near', 0.5)], 1: [('near', 0.5)]}
@@ -282,18 +284,24 @@ def test_sizes_are_those_that_make_the_forms_as_large_as_they_are(monkeypatch):
         part: np.array([np.eye(20), *(units.kernel(*kernel) for kernel in own)])
         for part, own in kernels.items()
     }
-    values, expected = forms._values(matrices), forms._moments(matrices) @ np.concatenate(truth)
-    monkeypatch.setattr(forms, '_values', lambda _: expected)
+    values, moments = forms._values(matrices), forms._moments(matrices)
+    monkeypatch.setattr(forms, '_values', lambda _: moments @ np.concatenate(truth))
     found = forms.sizes(kernels)
     for part in (0, 1):
         np.testing.assert_allclose(found[part], truth[part], rtol=1e-6, atol=1e-9)
     residual = np.concatenate([part[-1].ravel() for part in units.parts] + [[0.0, 0.0]])
-    rows = [part[:-1].reshape(4, -1).T for part in units.parts]
+    rows = [part[:-1].reshape(width, -1).T for part in units.parts]
     basis = np.linalg.qr(np.concatenate([*rows, extra]))[0]
     residual -= basis @ (basis.T @ residual)
     own = residual[:120].reshape(2, 3, 20)
     forms = [np.einsum('cn,knm,cm->k', own[part], matrices[part], own[part]) for part in (0, 1)]
     np.testing.assert_allclose(values, np.concatenate(forms))
+    measured = np.concatenate([part.any(axis=0).ravel() for part in units.parts])
+    left = np.diag(measured.astype(float)) - basis[:120] @ basis[:120].T
+    axes = np.kron(np.eye(2), np.ones(3))
+    whole = [np.kron(np.diag(axes[part]), each) for part in (0, 1) for each in matrices[part]]
+    traces = [[np.trace(one @ left @ other @ left) for one in whole] for other in whole]
+    np.testing.assert_allclose(moments, traces, rtol=1e-9)
 
 
 def test_where_nothing_is_left_nothing_is_shared():
