@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
+from calib_ros.decision.drift import inverse_root
 from calib_ros.estimation.identifiability import followed
 from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, SEVERAL, chance_of
 from calib_ros.estimation.observations import SOME_POSES
@@ -151,15 +152,10 @@ class Information(Shown):
     def explained(self, columns: FloatArray) -> tuple[float, FloatArray, FloatArray, int]:
         """Return gain, changes, their covariance and its rank for columns (P, k)."""
         inner = columns.T @ self.matrix @ columns
-        own = np.diag(inner)
-        known = own > 0.0  # rounding leaves less than nothing of what far poses tell
-        scale = known / np.sqrt(np.where(known, own, 1.0))
-        covariance = scale[:, np.newaxis] * linalg.pinvh(inner * np.outer(scale, scale), rtol=1e-9)
-        covariance = covariance * scale
-        seen = columns.T @ self.vector
-        values = covariance @ seen
-        rank = max(1, int(np.linalg.matrix_rank(inner, hermitian=True)))
-        return float(seen @ values), values, covariance, rank
+        root = inverse_root(inner, np.abs(np.diag(inner)))  # rounding may leave less than nothing
+        along = root.T @ (columns.T @ self.vector)
+        rank = max(1, int(root.any(axis=0).sum()))
+        return float(along @ along), root @ along, root @ root.T, rank
 
     def evidence(self, columns: FloatArray, sizes: FloatArray) -> tuple[float, float]:
         """Return the log evidence of changes along columns (P, k), and how many `sizes` (k,)."""
@@ -181,22 +177,25 @@ def root_of(square: FloatArray) -> FloatArray:
     return np.asarray(scale[:, np.newaxis] * directions * np.sqrt(np.maximum(sizes, 0.0)))
 
 
-def explanations(
-    information: Information, columns: Effects, freedom: float
+def reasons_of(
+    information: Information, columns: Effects, freedom: float, most: float = FALSE
 ) -> tuple[Explanation, ...]:
-    """Return the possible explanations of a change, best first.
+    """Return the best explanation of a change, and those indistinguishable from it.
 
-    `freedom` are the degrees of freedom of the noise estimate.
+    None if all are by chance with a probability above `most`. `freedom` are the degrees of freedom
+    of the noise estimate.
     """
     if not columns.sets:
         return ()
     logs = [columns.evidence(information, names)[0] for _, names in columns.sets]
-    shares = special.softmax(logs).tolist()
     found = [
         _explanation(information, columns, freedom, *each, share)
-        for each, share in zip(columns.sets, shares, strict=True)
+        for each, share in zip(columns.sets, special.softmax(logs).tolist(), strict=True)
     ]
-    return tuple(sorted(found, key=lambda each: -each.share))
+    if min(each.chance for each in found) > most:
+        return ()
+    found.sort(key=lambda each: -each.share)
+    return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or (found[0],)
 
 
 def _explanation(
@@ -212,14 +211,6 @@ def _explanation(
     chance = min(1.0, len(columns.sets) * chance_of(gain, rank, freedom))
     times = columns.evidence(information, names)[1]
     return Explanation(owner, names, gain, chance, share, change, sigma, times)
-
-
-def reasons_of(
-    information: Information, columns: Effects, freedom: float
-) -> tuple[Explanation, ...]:
-    """Return the likely explanations; none if the change may be chance."""
-    found = explanations(information, columns, freedom)
-    return likeliest(found) if any(each.chance <= FALSE for each in found) else ()
 
 
 def likelier(
@@ -259,11 +250,6 @@ def likelier(
         alone = information.marginalised(others)
         found.append((_explanation(alone, columns, freedom, *pair),))
     return found
-
-
-def likeliest(found: Sequence[Explanation]) -> tuple[Explanation, ...]:
-    """Return the best explanation and those indistinguishable from it."""
-    return tuple(each for each in found if each.share > 1.0 - CONFIDENT) or tuple(found[:1])
 
 
 def _sizes(names: Sequence[Parameter]) -> FloatArray:

@@ -151,6 +151,21 @@ def inverse_root(matrix: FloatArray, size: FloatArray) -> FloatArray:
     return np.asarray(scale[..., np.newaxis] * vectors * lengths[..., np.newaxis, :])
 
 
+def gain_of(products: FloatArray, count: int) -> tuple[float, int, float]:
+    """Return the squares that added columns explain of the residual, and in how many directions.
+
+    By the products (P, P) of the first `count` columns, the added ones and the residual. The
+    squares left beside the first columns alone follow.
+    """
+    sizes, known, rest = np.diag(products), np.s_[:count], np.s_[count:]
+    root = inverse_root(products[known, known], sizes[known])
+    cross = products[rest, known] @ root
+    left = products[rest, rest] - cross @ cross.T
+    root = inverse_root(left[:-1, :-1], sizes[count:-1])
+    along = root.T @ left[:-1, -1]
+    return float(along @ along), int(root.any(axis=0).sum()), float(left[-1, -1])
+
+
 def chance(shares: FloatArray) -> float:
     """Return the share of shifted residuals explained as well as the unshifted, first of (S,)."""
     return float(np.mean(shares[1:] >= shares[0]))

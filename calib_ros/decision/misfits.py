@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib_ros.decision.drift import gain_of
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
@@ -78,13 +79,7 @@ def explained_share(
     """Return the share of the residual squares that added parameters explain, linearly."""
     few = [each.spread() for each in problem.sets]
     rows = stacked(problem.system(few).rows_of(chain, (*fitted, *added)))
-    count = len(fitted)
-    if len(rows) - count - len(added) < len(rows) // 3:
+    if len(rows) - len(fitted) - len(added) < len(rows) // 3:
         return 0.0
-    scale = np.linalg.norm(rows, axis=0)
-    scale[scale == 0.0] = 1.0
-    factor = np.asarray(np.linalg.qr(rows / scale, mode='r'))
-    rest = factor[count:, count:]  # beyond the fitted parameters
-    left = rest[:, -1] - rest[:, :-1] @ np.linalg.lstsq(rest[:, :-1], rest[:, -1], rcond=1e-6)[0]
-    total = float(rest[:, -1] @ rest[:, -1])
-    return 1.0 - float(left @ left) / total if total > 0.0 else 0.0
+    gain, _, left = gain_of(rows.T @ rows, len(fitted))
+    return gain / left if left > 0.0 else 0.0

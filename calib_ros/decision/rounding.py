@@ -16,8 +16,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib_ros.decision.changes import Information
-from calib_ros.estimation.considered import Doubted
+from calib_ros.decision.drift import gain_of
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.leastsquares import owners, stacked
 from calib_ros.estimation.levels import CLEARLY, SURE, chance_of
@@ -95,13 +94,9 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
         columns.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
     beside = np.column_stack(columns)
     every = np.column_stack([beside, rows[:, len(frames) : len(frames) + len(arm)], rows[:, -1]])
-    first, rest = np.s_[: beside.shape[1]], np.s_[beside.shape[1] :]
-    products = every.T @ every
-    prior = np.diag(np.arange(beside.shape[1]) >= len(frames)).astype(float)
-    inner = products[first, first] + prior
-    left = Doubted(products[rest, rest], products[rest, first], inner).reduced
-    information = Information(tuple(map(Parameter, arm)), left[:-1, :-1], left[:-1, -1])
-    gain, _, _, rank = information.explained(np.eye(len(arm)))
+    prior, count = np.zeros(every.shape[1]), beside.shape[1]
+    prior[len(frames) : count] = 1.0
+    gain, rank, left = gain_of(every.T @ every + np.diag(prior), count)
     freedom = max(len(rows) - len(frames) - rank, 1)
-    noise = max(float(left[-1, -1]) - gain, 1e-300) / freedom
+    noise = max(left - gain, 1e-300) / freedom
     return chance_of(gain / noise, rank, freedom) > 1.0 - SURE

@@ -22,7 +22,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from calib_ros.decision.drift import inverse_root, slow_cosines
+from calib_ros.decision.drift import gain_of, inverse_root, slow_cosines
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.estimation.configurations import stops
 from calib_ros.estimation.fitted import Fitted
@@ -201,12 +201,12 @@ class _Scan:
         self._numbers = np.split(number, np.cumsum([len(each) for each in sets])[:-1])
         self._stops = int(number.max(initial=-1)) + 1
         known = replace(few, separations=()).extra_rows(self._chain, fitted.names)
-        extra, offset = np.pad(known[0], ((0, 0), (0, len(constant)))), known[1]
+        extra = np.column_stack([np.pad(known[0], ((0, 0), (0, len(constant)))), known[1]])
+        self._given = extra.T @ extra  # products of priors
         whole = np.array([gram(rows) for rows in self._rows])
-        matrix = whole.sum(axis=0)[: self._fitted]
-        normal = matrix[:, : self._fitted] + extra.T @ extra
-        self._root = inverse_root(normal, np.diag(normal))
-        self._known = self._root.T @ (matrix[:, -1] + extra.T @ offset)
+        matrix = whole.sum(axis=0)[: self._fitted, [*range(self._fitted), -1]] + self._given[:-1]
+        self._root = inverse_root(matrix[:, :-1], np.diag(matrix))
+        self._known = self._root.T @ matrix[:, -1]
         left = np.zeros(len(self._names) + 1)
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
@@ -292,11 +292,8 @@ class _Scan:
         sets = found.group.sets
         kept = np.concatenate([self._weights[k] > 0.0 for k in sets])
         numbers = np.concatenate([self._numbers[k] for k in sets])
-        used, gross = np.unique(numbers[kept]), np.unique(numbers[~kept])
-        gross = np.setdiff1d(gross, used)
-        every = np.union1d(used, gross)
-        late = np.count_nonzero(every >= found.stop)
-        after = 2 * late < len(every)
+        gross, every = np.setdiff1d(numbers[~kept], numbers[kept]), np.unique(numbers)
+        after = 2 * np.count_nonzero(every >= found.stop) < len(every)
         return 0 < int(np.count_nonzero((gross >= found.stop) == after)) < LEAST_ASIDE
 
     def drifts(self, found: _Found) -> bool:
@@ -310,48 +307,52 @@ class _Scan:
             moving = rows[columns][:, np.newaxis] * slow[:, np.newaxis, numbers]
             wide = moving.reshape(-1, *rows.shape[1:])
             matrix += gram(np.concatenate([rows[: self._fitted], wide, rows[-1:]]))
-        cross = self._root.T @ matrix[: self._fitted, self._fitted : -1]
-        own = matrix[self._fitted : -1, self._fitted : -1]
-        root = inverse_root(own - cross.T @ cross, np.diag(own))
-        gain = root.T @ (matrix[self._fitted : -1, -1] - cross.T @ self._known)
+        ends = [*range(self._fitted), -1]
+        matrix[np.ix_(ends, ends)] += self._given
+        gain, rank, _ = gain_of(matrix, self._fitted)
         _, freedom, left = self._budget(found.group)
-        freedom -= float(root.any(axis=0).sum())
-        return freedom > 0.0 and float(left - gain @ gain) / freedom < found.variance
+        return freedom > rank and (left - gain) / (freedom - rank) < found.variance
 
     def described(self, found: _Found) -> Step:
         """Return a step with its first sample and its effect on the poses."""
         group, problem = found.group, self._problem
-        first: list[tuple[int, int, int]] = []
-        moved: list[FloatArray] = []
-        places: list[tuple[FloatArray, Flags]] = []
-        weights: tuple[list[FloatArray], list[FloatArray]] = ([], [])
-        for number in group.sets:
-            each = self._sets[number]
-            after = self._numbers[number] >= found.stop
-            places.append((each.joints, after))
-            stamps, samples = each.stamps_ns[after].tolist(), self._chosen[number][after].tolist()
-            first += [(stamp, number, k) for stamp, k in zip(stamps, samples, strict=True)]
-            model = ErrorModel(self._chain, group.names, each.base, each.tool)
-            moved.append(model.jacobian(each.joints[after]) @ found.size)
-            for side, which in zip(weights, (~after, after), strict=True):
-                side.append(self._weights[number][which])
-        stamp, of_set, sample = min(first)
-        change = np.sqrt((np.concatenate(moved) ** 2).mean(axis=0))
+        sets = [self._sets[k] for k in group.sets]
+        after = [self._numbers[k] >= found.stop for k in group.sets]
+        stamp, of_set, sample = min(
+            (stamp, number, k)
+            for number, each, late in zip(group.sets, sets, after, strict=True)
+            for stamp, k in zip(each.stamps_ns[late], self._chosen[number][late], strict=True)
+        )
+        moved = [
+            ErrorModel(self._chain, group.names, each.base, each.tool).jacobian(each.joints[late])
+            for each, late in zip(sets, after, strict=True)
+        ]
+        change = np.sqrt(((np.concatenate(moved) @ found.size) ** 2).mean(axis=0))
         size, turn = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
         unit, oriented = 'm', any(kind.oriented for kind in problem.kinds)
         if group.kind == 'joint':
             size, unit = abs(float(found.size[0])), Parameter(group.names[0]).unit
         elif oriented and turn * problem.sigma_position > size * problem.sigma_orientation:
             size, unit = turn, 'rad'
-        sides = zip(('before that', 'from there on'), weights, strict=True)
-        unused = [where for where, side in sides if found.stop and not np.concatenate(side).any()]
+        weights = np.concatenate([self._weights[k] for k in group.sets])
+        later = np.concatenate(after)
+        sides = ('before that', ~later), ('from there on', later)
+        unused = [where for where, side in sides if found.stop and not weights[side].any()]
         seen = problem.sets[of_set]
-        image = None if seen.pixels is None else int(seen.images[sample])
-        where = (of_set, sample, stamp)
-        named = group.what, group.kind, _thing(group.kind, seen)
-        apart = _apart(*map(np.concatenate, zip(*places, strict=True)))
         return Step(
-            *named, *where, size, unit, found.share, ''.join(unused), image, apart, not found.stop
+            what=group.what,
+            kind=group.kind,
+            thing=_thing(group.kind, seen),
+            set=of_set,
+            sample=int(sample),
+            stamp_ns=int(stamp),
+            size=size,
+            unit=unit,
+            share=found.share,
+            unused=''.join(unused),
+            image=None if seen.pixels is None else int(seen.images[sample]),
+            apart=_apart(np.concatenate([each.joints for each in sets]), later),
+            held=not found.stop,
         )
 
 
@@ -394,6 +395,5 @@ def _groups(problem: Problem) -> list[_Group]:
             fixed = problem.model.frame(frame).fixed
             found.append(_Group(frame, kind, names, tuple(sets), fixed))
     everywhere = tuple(range(len(problem.sets)))
-    for joint in problem.chain.joints:
-        found.append(_Group(joint.name, 'joint', (joint.driven,), everywhere))
-    return found
+    joints = problem.chain.joints
+    return found + [_Group(each.name, 'joint', (each.driven,), everywhere) for each in joints]

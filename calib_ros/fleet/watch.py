@@ -38,9 +38,8 @@ from calib_ros.decision.changes import (
     Effects,
     Explanation,
     Information,
-    explanations,
-    likeliest,
     reason_in_words,
+    reasons_of,
 )
 from calib_ros.estimation.levels import CLEARLY, KNOWN, TELLING
 from calib_ros.files.rows import Row
@@ -174,7 +173,7 @@ def _cause(
         return lag, (), tests.groups[len(one) + int(two.argmin())]
     columns = Effects(row.corrected(), tests.names)
     information = Information(tests.names, tests.weight[lag, k], tests.pull[lag, k])
-    return lag, likeliest(explanations(information, columns, float(tests.freedom[k]))), ()
+    return lag, reasons_of(information, columns, float(tests.freedom[k]), most=1.0), ()
 
 
 class _Tests(NamedTuple):

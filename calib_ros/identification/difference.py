@@ -25,10 +25,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from calib_ros.decision import changes
 from calib_ros.decision.changes import Effects, Explanation, Information
+from calib_ros.decision.drift import inverse_root
 from calib_ros.errors import InputError
 from calib_ros.estimation.evidence import size_group
 from calib_ros.estimation.identifiability import structurally_independent
@@ -39,7 +39,7 @@ from calib_ros.estimation.start import fit_to_arm
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import Parameter, parameters_of
-from calib_ros.kinematics.se3 import HALF_THE_DIGITS, ROUNDING, FloatArray
+from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.shown import Shown
 from calib_ros.values import require
 
@@ -240,8 +240,8 @@ def _change(chain: Chain, names: Sequence[Parameter], own: Sequence[str]) -> Flo
 def _information(
     names: tuple[Parameter, ...], change: FloatArray, square: FloatArray
 ) -> Information:
-    scale = np.sqrt(np.diag(square))
-    inverse = linalg.pinvh(square / np.outer(scale, scale), rtol=ROUNDING) / np.outer(scale, scale)
+    root = inverse_root(square, np.diag(square))
+    inverse = root @ root.T
     return Information(names, inverse, inverse @ change)
 
 
