@@ -9,7 +9,6 @@ from there on, and one of them is zero.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
@@ -23,7 +22,7 @@ from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
-from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
 
 SLIPS = (0, 1, -1, 2, -2)  # rows that may be missing (benchmarks/mistakes.py loses one)
@@ -45,9 +44,19 @@ def row_loss(
     if not FEWEST_ROWS <= count <= MOST_SEARCHED:
         return None
     best: tuple[str, float] | None = None
-    good = EXPLAINED_ROWS * count
-    for chain in _frames(problem, nominal, seen):
-        tables = {s: _shifted(chain, seen, s) for s in SLIPS}
+    good, rows = EXPLAINED_ROWS * count, np.arange(count)
+    inside = {s: (rows + s >= 0) & (rows + s < count) for s in SLIPS}
+    paired = {
+        s: replace(seen.select(own), joints=seen.joints[rows[own] + s])
+        for s, own in inside.items()
+    }
+    for part, shift in product((rows < count // 3, rows >= count - count // 3), SLIPS):
+        some = paired[shift].select(part[inside[shift]])
+        if (found := in_frames(problem, nominal, (some,))) is None:
+            continue
+        tables = {s: np.full(count, np.inf) for s in SLIPS}
+        for s, pairs in paired.items():
+            tables[s][inside[s]] = misses(found.chain, pairs, flange(found.chain, pairs))
         for before, after in product(SLIPS, SLIPS):
             if before == after or (before and after):
                 continue
@@ -60,30 +69,6 @@ def row_loss(
                 error = float(np.median(pieced[np.isfinite(pieced)]))
                 best = f'{where} {rows_away(after or before)}', error
     return best
-
-
-def _frames(problem: Problem, chain: Chain, seen: Observations) -> Iterator[Chain]:
-    third = len(seen) // 3
-    for part, shift in product((slice(third), slice(-third, None)), SLIPS):
-        rows = np.arange(len(seen))[part]
-        rows = rows[(rows + shift >= 0) & (rows + shift < len(seen))]
-        if found := in_frames(problem, chain, (_paired(seen, rows, shift),)):
-            yield found.chain
-
-
-def _paired(seen: Observations, rows: Index, shift: int) -> Observations:
-    """Return measurements of some rows with the joint values of `shift` rows below."""
-    return replace(seen.select(rows), joints=seen.joints[rows + shift])
-
-
-def _shifted(chain: Chain, seen: Observations, shift: int) -> FloatArray:
-    """Return the errors (N,) [m] of measurements at joint values `shift` rows below."""
-    rows = np.arange(len(seen))
-    inside = (rows + shift >= 0) & (rows + shift < len(seen))
-    found = np.full(len(seen), np.inf)
-    pairs = _paired(seen, rows[inside], shift)
-    found[inside] = misses(chain, pairs, flange(chain, pairs))
-    return found
 
 
 def _where(before: Flags, after: Flags) -> int:

@@ -146,18 +146,22 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
     )
-    if found is None:
-        return None
-    named = found.suspects
-    if problem.of_messages:
-        named = tuple(replace(each, remedy=each.published) for each in named)
-    return replace(found, suspects=named, where=where + found.where)
+    return found and _told(problem, replace(found, where=where + found.where))
+
+
+def _told(problem: Problem, found: Explained) -> Explained:
+    """Return what explains the measurements with remedies for messages, if these were some."""
+    if not problem.of_messages:
+        return found
+    named = tuple(replace(each, remedy=each.published) for each in found.suspects)
+    return replace(found, suspects=named)
 
 
 def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
     sets = (each for each in problem.all_sets if each.distances is None and each.pixels is None)
-    return next(filter(None, (_of_rows(problem, chain, each) for each in sets)), None)
+    found = filter(None, (_of_rows(problem, chain, each) for each in sets))
+    return next((_told(problem, each) for each in found), None)
 
 
 def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:

@@ -12,7 +12,7 @@ from fits import NOISE, SIGMAS
 
 from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.mistakes import explained
+from calib_ros.decision.mistakes import explained, explained_alone
 from calib_ros.estimation.problem import Problem
 
 
@@ -75,7 +75,8 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
     """Too few to place base and tool, which the others do."""
     arm, rng = load_chain('ur10e'), np.random.default_rng(2)
     q = arm.random_joints(40, rng)
-    seen = measure(faulty(arm, Cell(), rng), q, rng, 5e-5, 2e-4, oriented)
+    true = faulty(arm, Cell(), rng)
+    seen = measure(true, q, rng, 5e-5, 2e-4, oriented)
     some = np.isin(np.arange(40), rows)[:, np.newaxis]
     for positions, joints, words in (
         (np.where(some, 1e3 * seen.positions, seen.positions), q, 'positions are in mm'),
@@ -83,6 +84,10 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
     ):
         found = str(explained(Problem(arm, replace(seen, positions=positions, joints=joints))))
         assert found.startswith(f'in poses {where} of 40 alone, the {words}, not ')
+    many = Problem(arm, replace(seen, joints=np.where(some, np.degrees(q), q)), of_messages=True)
+    told = str(explained_alone(many, true))
+    assert told.startswith(f'in poses {where} of 40 alone, the joint values are in degrees, not ')
+    assert ': correct the publisher and measure again' in told
 
 
 @pytest.mark.parametrize('rows', [slice(5, 6), slice(5, 12)])
