@@ -12,8 +12,9 @@ import yaml
 
 from calib_ros.cli.main import main
 from calib_ros.errors import LONGEST, ConfigError, InputError, UnknownNameError
+from calib_ros.files.journal import read_journal
 from calib_ros.files.programs import read_program
-from calib_ros.files.tables import read_journal, read_table
+from calib_ros.files.tables import read_table
 from calib_ros.files.vocabulary import COVARIANCE
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, parse_chain

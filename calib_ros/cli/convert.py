@@ -15,9 +15,10 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.foreign import Foreign, as_csv
+from calib_ros.files.journal import table_text
 from calib_ros.files.layouts import Layout
 from calib_ros.files.recording import Recording, write_bag
-from calib_ros.files.tables import check_table, read_table, table_text
+from calib_ros.files.tables import check_table, read_table
 from calib_ros.kinematics.chain_file import load_chain
 
 

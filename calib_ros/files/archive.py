@@ -17,8 +17,7 @@ from urllib.parse import quote
 
 from calib_ros.atomic import short_name, whole_folder, write_file, write_files, write_together
 from calib_ros.errors import InputError, trouble
-from calib_ros.files.journal import Journal
-from calib_ros.files.tables import read_journal
+from calib_ros.files.journal import Journal, read_journal
 from calib_ros.sampling.sample import Sample
 
 _CALIBRATION, _JOURNAL, _SETTINGS = '.yaml', '.csv', '.settings.yaml'

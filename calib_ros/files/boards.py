@@ -146,13 +146,15 @@ def read_detections(path: Path, board: Board) -> Detections:
     found = read_columns(path, HEADER)
     image, names = found.labels('image')
     corner, most = found.integers('corner'), len(board.corners)
-    for row in np.flatnonzero((corner < 0) | (corner >= most))[:1].tolist():
-        where = found.where(row, 'corner')
-        raise InputError(f'{where} must be from 0 to {most - 1} on this board, not {corner[row]}')
-    _, first = np.unique(image * most + corner, return_index=True)
-    for row in np.delete(np.arange(len(image)), first)[:1].tolist():
-        again = f'{found.where(row, "corner")} {corner[row]} of image {names[image[row]]}'
-        raise InputError(f'{again} already exists')
+    found.refuse(
+        (corner < 0) | (corner >= most),
+        lambda row: f'corner must be from 0 to {most - 1} on this board, not {corner[row]}',
+    )
+    again = np.ones(len(image), dtype=bool)
+    again[np.unique(image * most + corner, return_index=True)[1]] = False
+    found.refuse(
+        again, lambda row: f'corner {corner[row]} of image {names[image[row]]} already exists'
+    )
     order, pixels = np.argsort(image, kind='stable'), found.block(('u', 'v'))
     corners = image[order], corner[order], pixels[order]
     lines = found.lines[np.unique(image, return_index=True)[1]].tolist()
@@ -204,9 +206,8 @@ def read_places(path: Path, joints: int) -> tuple[dict[str, FloatArray], bool, t
     """
     found = read_columns(path, ('image',))
     image, names = found.labels('image')
-    if len(names) < len(image):
-        row = int(np.argmax(np.bincount(image)[image] > 1))
-        raise InputError(f'{found.where(row, "image")} {names[image[row]]} appears twice')
+    twice = np.bincount(image)[image] > 1
+    found.refuse(twice, lambda row: f'image {names[image[row]]} appears twice')
     posed = 'q1' not in found.header
     columns = POSE_COLUMNS if posed else joint_columns(joints)
     missing = [name for name in columns if name not in found.header]

@@ -15,13 +15,21 @@ import errno
 import fcntl
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from calib_ros.errors import InputError
-from calib_ros.files.tables import cells, columns, is_whole
-from calib_ros.sampling.sample import Sample
+import numpy as np
+
+from calib_ros.errors import InputError, unreadable
+from calib_ros.files.columns import Columns, columns_of, joined_columns, lines_in_words
+from calib_ros.files.measurements import measurements, view_of
+from calib_ros.files.vocabulary import COVARIANCE, POSE_COLUMNS, UPPER, joint_columns
+from calib_ros.kinematics import se3
+from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.progress import Notify, quiet
+from calib_ros.sampling.sample import Sample, View
+from calib_ros.texts import LARGEST_TABLE, LARGEST_TEXT, csv_text, read_bytes, to_cell
 
 
 class Journal:
@@ -106,3 +114,130 @@ class Journal:
         if written < len(data):  # the disk is full: no half row may stay
             os.ftruncate(self._file, begin)
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def read_journal(path: Path, joints: int) -> tuple[tuple[Sample, ...], tuple[str, ...]]:
+    """Return the samples of a journal, possibly none, and warnings; leave out damaged rows."""
+    damaged: list[int] = []
+    found, warnings = of_journal(path, joints, damaged=damaged) or (
+        columns_of(path, read_bytes(path, LARGEST_TABLE, InputError)),
+        (),
+    )
+    if damaged:
+        words = f'{path}: {lines_in_words(damaged)} cannot be read: left out, but kept in the file'
+        warnings = (*warnings, words)
+    return tuple(measurements(found, joints).kept().samples()), warnings
+
+
+def of_journal(
+    path: Path, joints: int, progress: Notify = quiet, damaged: list[int] | None = None
+) -> tuple[Columns, tuple[str, ...]] | None:
+    """Return the columns of a journal, and warnings; None for other files.
+
+    It may have any length, since its samples were in memory: it is read in parts. The lines of
+    damaged rows go into a list; without one they are refused.
+    """
+    header = ','.join(columns(joints)).encode() + b'\n'
+    parts = [columns_of(path, header)]
+    lines, rest = 1, b''
+    try:
+        with path.open('rb') as file:
+            if (begin := file.read(len(header))) != header:
+                return (parts[0], ()) if begin and header.startswith(begin) else None
+            size = path.stat().st_size
+            while data := file.read(LARGEST_TEXT):
+                whole, end, rest = (rest + data).rpartition(b'\n')
+                if file.tell() == size and is_whole(rest, len(columns(joints))):
+                    whole, end, rest = whole + end + rest, b'\n', b''
+                if end:
+                    some = [each + b'\n' for each in whole.split(b'\n')]
+                    parts += _rows(path, joints, some, lines - 1, damaged)
+                    lines += len(some)
+                if len(rest) > LARGEST_TEXT:
+                    raise InputError(f'{path}, line {lines + 1} is incomplete: is it a journal?')
+                progress(min(file.tell() / size, 1.0))
+    except OSError as err:
+        raise InputError(unreadable(path, err)) from err
+    cut_off = f'{path}: line {lines + 1} was cut off and is ignored'
+    return joined_columns(parts), (cut_off,) if rest else ()
+
+
+def _rows(
+    path: Path, joints: int, lines: Sequence[bytes], above: int, damaged: list[int] | None
+) -> Iterator[Columns]:
+    """Yield the rows in lines of a journal, in halves if one is damaged, until it is alone."""
+    header = ','.join(columns(joints)).encode() + b'\n'
+    try:
+        found = columns_of(path, header + b''.join(lines), above=above)
+        if damaged is not None:
+            made = measurements(found, joints)
+            if found.blank('split').any():
+                raise InputError(f'{path} has incomplete rows')
+            for text in filter(None, made.view[1]):
+                view_of(text, '')
+    except InputError:
+        if damaged is None:
+            raise
+        half = len(lines) // 2
+        if not half:
+            damaged.append(above + 2)
+            return
+        yield from _rows(path, joints, lines[:half], above, damaged)
+        yield from _rows(path, joints, lines[half:], above + half, damaged)
+    else:
+        yield found
+
+
+def is_whole(row: bytes, width: int) -> bool:
+    """Tell whether a row lacks only its line end; the numbers of a view may lack more."""
+    if not row.endswith(b',') or b'\0' in row:
+        return False
+    return len(next(csv.reader([row.decode(errors='replace')]))) == width
+
+
+def columns(joints: int) -> list[str]:
+    """Return the columns of a table for every kind of sample."""
+    names = ['stamp_ns', *(name for letter in 'qsva' for name in joint_columns(joints, letter))]
+    names += [*POSE_COLUMNS, 'distance', *COVARIANCE, 'device', 'target', 'frame_id']
+    names += ['eye_in_hand', 'delay', 'count', 'spread', 'session', 'split']
+    return [*names, 'location', 'socket', 'view']
+
+
+def cells(sample: Sample, split: str | None = None) -> list[str]:
+    """Return the exact cells of a sample in the order of `columns`."""
+
+    def numbers(values: FloatArray | None, count: int) -> list[str]:
+        return [''] * count if values is None else [repr(float(value)) for value in values]
+
+    joints = len(sample.joints)
+    row = [str(sample.stamp_ns)]
+    for values in (sample.joints, sample.approach, sample.velocity, sample.acceleration):
+        row += numbers(values, joints)
+    row += numbers(sample.position, 3)
+    row += numbers(None if sample.rotation is None else se3.to_quat(sample.rotation), 4)
+    row.append('' if sample.distance is None else repr(sample.distance))
+    covariance = sample.covariance
+    row += numbers(None if covariance is None else covariance[tuple(np.transpose(UPPER))], 21)
+    place = sample.device.rpartition('_')[::2] if sample.socket else ('', '')
+    device = '' if sample.socket else sample.device
+    row += [to_cell(name) for name in (device, sample.target, sample.frame_id)]
+    row.append('1' if sample.eye_in_hand else '')
+    row += [repr(sample.delay), str(sample.count), repr(sample.spread)]
+    row.append(to_cell(sample.session))
+    row.append(split or ('test' if sample.validation else 'train'))
+    view = '' if sample.view is None else _view_cell(sample.view)
+    return [*row, *map(to_cell, place), view]
+
+
+def _view_cell(view: View) -> str:
+    rows = np.column_stack([view.points, view.pixels]).tolist()
+    lens = [*view.lens.values.values(), int(view.lens.fixed)]
+    return ';'.join(' '.join(map(repr, row)) for row in (lens, *rows))
+
+
+def table_text(samples: Sequence[Sample], joints: int) -> str:
+    """Return samples as a table with the columns that are used."""
+    names = columns(joints)
+    rows = [cells(sample) for sample in samples]
+    used = [k for k, column in enumerate(zip(*rows, strict=True)) if any(column)]
+    return csv_text([row[k] for k in used] for row in (names, *rows))

@@ -5,10 +5,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,12 @@ from calib_ros.files.vocabulary import (
     joint_columns,
 )
 from calib_ros.kinematics import se3
+from calib_ros.kinematics.lens import Lens
+from calib_ros.kinematics.parameter import LENS_KINDS
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.messages import frame_name
-from calib_ros.sampling.sample import socket_place
-from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults
+from calib_ros.sampling.sample import Sample, View, socket_place
+from calib_ros.values import LARGEST, LARGEST_RATE, covariance_faults, parse_number
 
 SPLITS = {name: name for name in ('', 'train', 'test', 'removed')}
 FLAGS = {'': False, '0': False, 'false': False, '1': True, 'true': True}
@@ -105,6 +108,38 @@ class Measurements:
             socket=bool(kind == SOCKET),
             plane=bool(kind == PLANE),
         )
+
+    def samples(self) -> Iterator[Sample]:
+        """Yield the rows as samples."""
+        for k, kind in enumerate(self.kind.tolist()):
+            texts: dict[str, Any] = {
+                name: getattr(self, name)[1][getattr(self, name)[0][k]]
+                for name in ('session', 'device', 'target', 'frame_id')
+            }
+            optional: dict[str, Any] = {
+                name: None if values is None or np.isnan(values[k]).any() else values[k]
+                for name in ('approach', 'velocity', 'acceleration', 'covariance')
+                for values in (getattr(self, name),)
+            }
+            view = self.view[1][self.view[0][k]]
+            where = f'{self.path}, line {self.lines[k]}: view'
+            yield Sample(
+                int(self.stamps_ns[k]),
+                self.joints[k],
+                position=self.position[k] if kind == POSE else None,
+                rotation=self.rotation[k] if self.oriented[k] else None,
+                distance=float(self.distance[k]) if kind in (DISTANCE, PLANE) else None,
+                socket=kind == SOCKET,
+                plane=kind == PLANE,
+                view=view_of(view, where) if view else None,
+                eye_in_hand=bool(self.eye_in_hand[k]),
+                validation=bool(self.test[k]),
+                delay=float(self.delay[k]),
+                count=int(self.count[k]),
+                spread=float(self.spread[k]),
+                **texts,
+                **optional,
+            )
 
     @cached_property
     def codes(self) -> Index:
@@ -257,8 +292,7 @@ def choices(
     numbers, found = columns.labels(name)
     for k, word in enumerate(found):
         if word not in known:
-            row = int(np.argmax(numbers == k))
-            raise InputError(f'{columns.where(row, name)} must be {what}, not {word!r}')
+            columns.refuse(numbers == k, f'{name} must be {what}, not {word!r}')
     return np.array([known[word] for word in found])[numbers]
 
 
@@ -287,8 +321,7 @@ def _devices(columns: Columns, kind: Index) -> Codes:
             try:
                 name = socket_place(f'{place}/{socket}')
             except ConfigError as err:
-                row = int(np.argmax(number == k))
-                raise InputError(f'{columns.path}, line {columns.lines[row]}: {err}') from err
+                columns.refuse(number == k, str(err))
         elif what == DISTANCE and 'x' in columns.header:  # not the tracker's origin
             name = name or 'distance'
         names.append(name)
@@ -319,9 +352,9 @@ def _covariance(
     full[:, rows, across] = full[:, across, rows] = upper
     known = np.where(oriented[given, np.newaxis], 1.0, np.repeat([1.0, 0.0], 3))
     faults = covariance_faults(full[given] * known[:, :, np.newaxis] * known[:, np.newaxis, :])
-    for k in np.flatnonzero(faults != '')[:1].tolist():
-        line = columns.lines[np.flatnonzero(given)[k]]
-        raise InputError(f'{columns.path}, line {line}: c11 ... c66: {faults[k]}')
+    told = np.full(len(given), '', faults.dtype)
+    told[given] = faults
+    columns.refuse(told != '', lambda row: f'c11 ... c66: {told[row]}')
     full[~given | ~full.any(axis=(1, 2))] = np.nan
     return None if np.isnan(full).all() else full
 
@@ -340,3 +373,16 @@ def distinct_rows(codes: Index) -> tuple[Index, Index]:
     rank = np.empty(len(order), dtype=np.intp)
     rank[order] = np.arange(len(order))
     return codes[first[order]], rank[number.reshape(-1)]
+
+
+def view_of(text: str, where: str) -> View:
+    """Return the corners of a board in a cell; errors name it `where`."""
+    first, *rows = [
+        [parse_number(cell, where, InputError) for cell in part.split(' ')]
+        for part in text.split(';')
+    ]
+    if len(first) != len(LENS_KINDS) + 1 or not rows or any(len(row) != 5 for row in rows):
+        raise InputError(f'{where} must be a lens of 10 numbers, then x y z u v of each corner')
+    corners = np.array(rows)
+    values = dict(zip(LENS_KINDS, first, strict=False))
+    return View(corners[:, :3], corners[:, 3:], Lens(**values, fixed=bool(first[-1])))

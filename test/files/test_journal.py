@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, strategies as st
 
 from calib_ros.errors import InputError
-from calib_ros.files import tables
 from calib_ros.files.foreign import Foreign
-from calib_ros.files.journal import Journal
+from calib_ros.files.journal import Journal, read_journal, table_text
 from calib_ros.files.layouts import Layout
-from calib_ros.files.tables import read_journal, read_table, table_text
+from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.lens import Lens
 from calib_ros.sampling.sample import Sample, View
@@ -169,8 +168,8 @@ def test_a_journal_of_any_length_is_read(tmp_path, monkeypatch, device):
     written(path, many)
     with path.open('ab') as file:
         file.write(b'1,2')
-    monkeypatch.setattr(tables, 'LARGEST_TABLE', 1000)
-    monkeypatch.setattr(tables, 'LARGEST_TEXT', 700)
+    monkeypatch.setattr('calib_ros.files.journal.LARGEST_TABLE', 1000)
+    monkeypatch.setattr('calib_ros.files.journal.LARGEST_TEXT', 700)
     found, (warning,) = read_journal(path, JOINTS)
     assert_equal(found, many)
     assert 'line 31 was cut off' in warning
@@ -196,8 +195,8 @@ def test_a_journal_longer_than_any_table_is_identified(tmp_path, monkeypatch, se
     with path.open('ab') as file:
         file.write(b'1,2')
     at_once = read_table(path, JOINTS, sessions)
-    monkeypatch.setattr(tables, 'LARGEST_TEXT', 700)
-    monkeypatch.setattr(tables, 'LARGEST_TABLE', 1000)
+    monkeypatch.setattr('calib_ros.files.journal.LARGEST_TEXT', 700)
+    monkeypatch.setattr('calib_ros.files.tables.LARGEST_TABLE', 1000)
     shares = []
     by_parts = read_table(path, JOINTS, sessions, progress=shares.append)
     assert shares[-1] == 1.0

@@ -152,8 +152,7 @@ def detections(path):
 
 @target('.csv')
 def journal(path):
-    from calib_ros.files.journal import Journal
-    from calib_ros.files.tables import read_journal
+    from calib_ros.files.journal import Journal, read_journal
 
     samples, _ = read_journal(path, len(ARM.joints))
     writing = Journal(path, len(ARM.joints))

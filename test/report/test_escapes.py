@@ -14,8 +14,7 @@ from measured import measured
 
 from calib_ros.estimation.problem import Problem
 from calib_ros.files.export import exports
-from calib_ros.files.journal import Journal
-from calib_ros.files.tables import read_journal
+from calib_ros.files.journal import Journal, read_journal
 from calib_ros.identification.identification import identify
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.parameter import Parameter

@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from calib_ros.files.archive import Archive
-from calib_ros.files.tables import read_journal
+from calib_ros.files.journal import read_journal
 
 
 @pytest.fixture

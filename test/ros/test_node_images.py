@@ -25,8 +25,9 @@ from calib_ros.apply.simulation import (
 from calib_ros.errors import CalibrationError, ConfigError
 from calib_ros.files.bags import replay
 from calib_ros.files.cameras import cameras_of, grey, lens_in
+from calib_ros.files.journal import read_journal
 from calib_ros.files.recording import Recording
-from calib_ros.files.tables import read_journal, read_table
+from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens

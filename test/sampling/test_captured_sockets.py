@@ -8,8 +8,8 @@ from in_sockets import DISTANCE, IIWA, cell
 from streams import joint_state, of_joints, take
 
 from calib_ros.errors import ConfigError
-from calib_ros.files.journal import Journal
-from calib_ros.files.tables import read_journal, read_table
+from calib_ros.files.journal import Journal, read_journal
+from calib_ros.files.tables import read_table
 from calib_ros.sampling.session import CalibrationSession
 from calib_ros.settings import Settings
 
