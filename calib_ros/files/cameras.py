@@ -4,11 +4,13 @@
 
 from __future__ import annotations
 
+import bisect
+import operator
 import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,7 @@ from calib_ros.files.detector import Detector, Image, opencv
 from calib_ros.files.lenses import lens_of
 from calib_ros.files.stored import LARGEST_IMAGE
 from calib_ros.kinematics.lens import Lens
+from calib_ros.sampling.messages import head_of
 from calib_ros.sampling.pictures import Flaw
 from calib_ros.sampling.sample import View
 from calib_ros.sampling.sources import Source, parse_sources
@@ -32,6 +35,17 @@ ENCODINGS |= {'bayer_gbrg8': (1, 'BayerGR'), 'bayer_grbg8': (1, 'BayerGB')}
 """Channels, and what OpenCV calls them: a Bayer pattern by its second row."""
 
 
+class _Told(NamedTuple):
+    """What a CameraInfo said: the lens, and height and width [px]."""
+
+    stamp_ns: int
+    lens: Lens | Flaw
+    size: tuple[int, int]
+
+
+_stamp = operator.attrgetter('stamp_ns')
+
+
 class BoardCamera:
     """Finds the board of a source in its images."""
 
@@ -39,29 +53,37 @@ class BoardCamera:
         self._source = source
         self._board = read_board(given_path(source.board))
         self._detector = Detector(self._board)
-        reason = 'no CameraInfo of it has come'
-        self._lens: Lens | Flaw = Flaw('before any CameraInfo', reason)
-        self._size = (0, 0)
+        self._told: tuple[_Told, ...] = ()  # whenever it changed, by stamp
 
     def learn(self, info: Any) -> None:
         """Take a CameraInfo; an unusable one refuses the images after it."""
-        self._size = (info.height, info.width)
+        fixed = self._source.lens == 'given'
+        lens: Lens | Flaw
         try:
-            fixed = self._source.lens == 'given'
-            self._lens = replace(lens_in(info, not fixed), fixed=fixed)
+            lens = replace(lens_in(info, not fixed), fixed=fixed)
         except CalibrationError as err:
-            self._lens = Flaw('whose CameraInfo cannot be used', str(err))
+            lens = Flaw('whose CameraInfo cannot be used', str(err))
+        new = _Told(head_of(info)[0], lens, (info.height, info.width))
+        k = bisect.bisect_right(self._told, new.stamp_ns, key=_stamp)
+        if not k or self._told[k - 1][1:] != new[1:]:
+            self._told = (*self._told[:k], new, *self._told[k:])
 
     def look(self, message: Any) -> View | Flaw:
-        """Return the corners in an Image or CompressedImage, or why it is not used."""
-        lens = self._lens
+        """Return the corners in an Image or CompressedImage, or why it is not used.
+
+        Its lens is that at its stamp: recordings are read ahead of their images.
+        """
+        if not self._told:
+            return Flaw('before any CameraInfo', 'no CameraInfo of it has come')
+        later = bisect.bisect_right(self._told, head_of(message)[0], key=_stamp)
+        _, lens, size = self._told[max(later - 1, 0)]
         if isinstance(lens, Flaw):
             return lens
         image = image_of(message)
         if isinstance(image, Flaw):
             return image
-        if image.size and all(self._size) and image.shape != self._size:
-            sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, self._size))
+        if image.size and all(size) and image.shape != size:
+            sizes = ' and '.join(f'{w} x {h}' for h, w in (image.shape, size))
             reason = f'it and its CameraInfo are of {sizes} px: set both alike'
             return Flaw('of another size than its CameraInfo', reason)
         found = self._detector.of(image)

@@ -176,7 +176,7 @@ def test_direct_bag_and_live_give_equal_corners(tmp_path, shift, truth, board):
         info = cell.publisher(CameraInfo, 'cam/camera_info')
         info.publish(played.pop('cam/camera_info')[0])
         camera = live.pictures.cameras[TOPICS[Image]]
-        cell.spin_until(lambda: not isinstance(camera._lens, Flaw))
+        cell.spin_until(lambda: bool(camera._told))
         cell.play(played)
         answer = cell.call('identify')
         assert_same(wanted, live.problem().observations)
@@ -205,6 +205,20 @@ def test_compressed_images_of_a_bag_and_of_messages(tmp_path, shift, board):
     bag_of(tmp_path / 'bag', come)
     replay(tmp_path / 'bag', replayed)
     assert_same(raw, replayed.problem().observations)
+
+
+@pytest.mark.parametrize('until', [5, STOPS])
+def test_a_lens_that_changed_is_refused_though_it_changed_back(shift, board, until):
+    """A bag is read ahead of its images, so that all had the lens of its end."""
+    come, given = messages(shift, Image, 8), sources(board, Image)
+    info = next(message for _, message in come if isinstance(message, CameraInfo))
+    for k, focal in ((4, 1.01 * LENS.fx), (until, LENS.fx)):
+        other = CameraInfo(distortion_model='plumb_bob', d=info.d, k=info.k.copy())
+        other.header, other.k[0] = header(shift[2][k - 1][-1] + 1, 'camera'), focal
+        come.append(('cam/camera_info', other))
+    session = directly(sorted(come, key=lambda each: stamp_ns(each[1])), given)
+    with pytest.raises(CalibrationError, match='the CameraInfo of camera has changed'):
+        session.problem()
 
 
 class Slow:
@@ -287,7 +301,8 @@ def test_an_image_that_does_not_fit_its_camera_info_is_refused(shift, board):
     camera.learn(info)
     assert camera.look(image).reason.startswith('it and its CameraInfo are of 640 x 480 and 1280')
     given = {
-        each: getattr(image, each) for each in ('width', 'height', 'step', 'encoding', 'data')
+        each: getattr(image, each)
+        for each in ('header', 'width', 'height', 'step', 'encoding', 'data')
     }
     for change, said in (
         ({'encoding': 'yuv422'}, 'unknown encoding of images "yuv422"'),
