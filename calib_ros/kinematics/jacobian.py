@@ -211,7 +211,7 @@ def _lines(
     return found
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=1024)
 def _layout(
     names: tuple[str, ...],
     joints: tuple[tuple[str, bool], ...],
