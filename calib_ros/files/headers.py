@@ -73,7 +73,8 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     }
     of_joints = {*joint_columns(joints)}
     lacking = of_joints & found.keys()
-    whole, fewer = lacking == of_joints, bool(lacking) and 'q1' in header and 'q0' not in header
+    whole = bool(joints) and lacking == of_joints
+    fewer = bool(lacking) and 'q1' in header and 'q0' not in header
     like = like_joints(header, joints) if lacking and not fewer else {}
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
     if whole or like:

@@ -164,3 +164,13 @@ def test_a_blank_in_a_log_of_joint_values_is_told_with_its_line(tmp_path):
     log.write_text(log.read_text().replace('0.3,nan', '0.3,0.4'))
     (found,) = read_table(path, 2, foreign=foreign).fitted
     assert found.joints.tolist() == [[0.3, 0.4], [0.1, 0.2]]
+
+
+def test_a_table_beside_a_log_is_not_asked_for_joint_values(tmp_path):
+    """It was told to give the file that was given."""
+    path, log = tmp_path / 'p.csv', tmp_path / 'js.csv'
+    path.write_text('a,b\n1,2\n')
+    log.write_text('q1,q2\n1,2\n')
+    with pytest.raises(InputError) as told:
+        read_table(path, 2, foreign=Foreign(Layout(), None, log))
+    assert str(told.value).endswith('names: --columns "x=NAME,y=NAME,z=NAME"')
