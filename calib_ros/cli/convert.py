@@ -14,7 +14,8 @@ from calib_ros.cli.file_types import refuse_others
 from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.foreign import Foreign, as_csv
+from calib_ros.files.columns import as_csv
+from calib_ros.files.foreign import Foreign
 from calib_ros.files.journal import table_text
 from calib_ros.files.layouts import Layout
 from calib_ros.files.recording import Recording, write_bag

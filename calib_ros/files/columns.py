@@ -22,11 +22,25 @@ from numpy.typing import NDArray
 
 from calib_ros.errors import MOST_ENTRIES, ColumnsError, InputError
 from calib_ros.files.headers import refuse_separator
-from calib_ros.files.vocabulary import DECIMAL_COMMA, MISSING, THOUSANDS
+from calib_ros.files.vocabulary import (
+    DECIMAL_COMMA,
+    IN_ORDER,
+    MEASURED_COLUMNS,
+    MISSING,
+    THOUSANDS,
+)
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.progress import Notify, quiet
 from calib_ros.shown import some
-from calib_ros.texts import LARGEST_TABLE, MOST_ROWS, as_text, csv_lines, from_cell, read_bytes
+from calib_ros.texts import (
+    LARGEST_TABLE,
+    MOST_ROWS,
+    as_text,
+    csv_lines,
+    csv_text,
+    from_cell,
+    read_bytes,
+)
 from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 Cells = tuple[int, list[str]]  # line number and cells
@@ -310,9 +324,10 @@ def _numbers(text: str, decimal: str = '.') -> FloatArray:
     return np.concatenate(found)
 
 
-def cell_number(text: str) -> float:
+def cell_number(text: str, decimal: str = '.') -> float:
     """Return the number in a cell (1.5D-3 as Fortran writes), NaN if blank, else infinity."""
     low = text.strip().lower().replace('\u2212', '-')  # the minus of typesetting
+    low = low.replace(decimal, '.')
     with suppress(ValueError):
         return math.nan if low in MISSING else float(low.replace('d', 'e'))
     return math.inf
@@ -340,3 +355,21 @@ def check_quaternions(columns: Columns, quat: FloatArray) -> None:
 def lines_in_words(lines: Sequence[int]) -> str:
     """Return the numbers of the first lines as text."""
     return f'line{"s" if len(lines) > 1 else ""} {", ".join(some(list(map(str, lines))))}'
+
+
+def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
+    """Return the rows in which something was measured, and a note about the others."""
+    blank = [made.blank(name) for name in MEASURED_COLUMNS if name in made.cells]
+    if not blank or not (empty := np.logical_and.reduce(blank)).any():
+        return made, ()
+    left = lines_in_words(made.lines[empty].tolist())
+    if empty.all():
+        raise InputError(f'{made.path}: nothing measured in {left}: rows need x, y, z or distance')
+    return made.select(~empty), (f'{made.path}: nothing measured in {left}: skipped',)
+
+
+def as_csv(columns: Columns) -> str:
+    """Return the text of a table; numbers are exact."""
+    names = [name for name in IN_ORDER if name in columns.cells]
+    names += [name for name in columns.cells if name not in names]
+    return csv_text([names, *zip(*map(columns.texts, names), strict=True)])

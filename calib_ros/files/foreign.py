@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from calib_ros.errors import ConfigError, InputError
-from calib_ros.files.columns import Columns, cell_number, lines_in_words
+from calib_ros.files.columns import Columns, cell_number, measured
 from calib_ros.files.conventions import finished
 from calib_ros.files.headers import (
     as_typed,
@@ -32,11 +32,9 @@ from calib_ros.files.layouts import Expression, Layout
 from calib_ros.files.sheets import read_sheet
 from calib_ros.files.units import Units
 from calib_ros.files.vocabulary import (
-    COVARIANCE,
     JOINT,
     MEASURED_COLUMNS,
     NUMBERS,
-    POSE_COLUMNS,
     POSITION,
     QUATERNION,
     WORDS,
@@ -45,12 +43,7 @@ from calib_ros.files.vocabulary import (
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.se3 import FloatArray, Index
-from calib_ros.texts import csv_text
 from calib_ros.values import MOST_NAMES
-
-ALL_JOINTS = [name for letter in 'qsva' for name in joint_columns(MOST_NAMES, letter)]
-IN_ORDER = ['session', 'split', 'stamp_ns', *ALL_JOINTS, *POSE_COLUMNS, 'distance', *COVARIANCE]
-"""Columns in the order of a converted table; others follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,32 +62,31 @@ class Foreign:
     def convert(self, path: Path) -> tuple[Columns, tuple[str, ...]]:
         """Return our columns of a table, and notes about guesses and omissions."""
         table = _Table(path, self.layout, self.chain, self.log is None)
-        values, matched = table.values(), ''
+        made, matched = table.columns(), ''
         notes = [f'{path}: {note}' for note in table.notes]
         if self.log is not None:
             log = _Table(self.log, self.log_layout, self.chain, True, alone=True)
-            joints, matched = self._logged(log, table, values)
+            joints, matched = self._logged(log, table, made)
             how = f'by the column "{matched}"' if matched else 'row by row'
             notes += [f'{self.log}: {note}' for note in log.notes]
             notes.append(f'{self.log}: holds the joint values of {path}, matched {how}')
-            values = joints | values
+            made = replace(made, cells={**joints, **made.cells})
         if not self.layout.source:  # a preset is known to leave some out
             notes += not_read(path, [name for name in table.unread() if name != matched])
-        made = Columns(path, table.lines, {**table.words(), **values}, table.names)
         if self.layout.shift:
             made = _shifted(made, self.layout.shift)
         made, skipped = measured(made)
         return finished(made, self.layout), (*notes, *skipped)
 
     def _logged(
-        self, log: _Table, table: _Table, values: Mapping[str, FloatArray]
-    ) -> tuple[dict[str, FloatArray], str]:
+        self, log: _Table, table: _Table, made: Columns
+    ) -> tuple[Mapping[str, str | FloatArray], str]:
         """Return the joint values of the rows of a table, and the column that names them, if any.
 
-        `values` are the table's own.
+        `made` are our columns of the table.
         """
-        joints = log.values()
-        if 'q1' not in joints:
+        joints = log.columns()
+        if 'q1' not in joints.cells:
             count = 0 if self.chain is None else len(self.chain.joints)
             like = like_joints(log.names, count) or {'q*': 'NAME*'}
             given = ','.join(f'{ours}={as_typed(name)}' for ours, name in like.items())
@@ -103,39 +95,21 @@ class Foreign:
                 '--joints-preset'
             )
         matched, partners = _partners(table, log)
-        if not {*MEASURED_COLUMNS} & {*values}:
+        if not {*MEASURED_COLUMNS} & {*made.cells}:
             raise InputError(
                 f'{table.path} has no column x, y, z; {table.has}. '
                 f'{named_by_option(table.names, POSITION, 0)}'
             )
-        if len(partners) != len(table.lines):
+        if len(partners) != len(made.lines):
             raise InputError(
-                f'{log.path} has {len(log.lines)} rows, {table.path} has {len(table.lines)}: give '
-                'both a column of the same name that names the poses, or a row for each '
+                f'{log.path} has {len(joints.lines)} rows, {table.path} has {len(made.lines)}: '
+                'give both a column of the same name that names the poses, or a row for each '
                 'measurement'
             )
-        found = Columns(log.path, log.lines, joints).select(partners)
-        for ours in filter(re.compile('q[0-9]+').fullmatch, joints):
-            found.refuse(found.blank(ours), f'{ours} is blank: correct or leave out that row')
-        return {ours: each[partners] for ours, each in joints.items()}, matched
-
-
-def measured(made: Columns) -> tuple[Columns, tuple[str, ...]]:
-    """Return the rows in which something was measured, and a note about the others."""
-    blank = [made.blank(name) for name in MEASURED_COLUMNS if name in made.cells]
-    if not blank or not (empty := np.logical_and.reduce(blank)).any():
-        return made, ()
-    left = lines_in_words(made.lines[empty].tolist())
-    if empty.all():
-        raise InputError(f'{made.path}: nothing measured in {left}: rows need x, y, z or distance')
-    return made.select(~empty), (f'{made.path}: nothing measured in {left}: skipped',)
-
-
-def as_csv(columns: Columns) -> str:
-    """Return the text of a table; numbers are exact."""
-    rank = {name: k for k, name in enumerate(IN_ORDER)}
-    names = sorted(columns.header, key=lambda name: rank.get(name, len(rank)))
-    return csv_text([names, *zip(*map(columns.texts, names), strict=True)])
+        joints = joints.select(partners)
+        for ours in filter(re.compile('q[0-9]+').fullmatch, joints.cells):
+            joints.refuse(joints.blank(ours), f'{ours} is blank: correct or leave out that row')
+        return joints.cells, matched
 
 
 class _Table:
@@ -159,7 +133,7 @@ class _Table:
                 needed |= dict.fromkeys(asked[ours].names)
         own: dict[str, str] = {}  # names that need no layout, and ours
         if joints:
-            own = {name: name for letter in 'qsva' for name in joint_columns(most, letter)}
+            own = {name: name for name in joint_columns(most, 'qsva')}
             own |= (
                 {}
                 if chain is None
@@ -168,7 +142,7 @@ class _Table:
         if not alone:
             own |= {name: name for name in (*NUMBERS, *WORDS)}
         self._sheet = read_sheet(path, layout, list(needed), list(own))
-        self.lines, self.notes = self._sheet.columns.lines, list(self._sheet.notes)
+        self.notes, self.count = list(self._sheet.notes), len(self._sheet.columns.lines)
         self._columns = self._asked(asked, optional)
         self._columns |= self._named({name: own[name] for name in own if own[name] not in asked})
         if joints and chain is not None:
@@ -231,8 +205,8 @@ class _Table:
             )
 
     def _has_dates(self, number: str) -> bool:
-        first = self._sheet.columns.texts(number)[0].replace(self._sheet.columns.decimal, '.')
-        return math.isinf(cell_number(first))
+        sheet = self._sheet.columns
+        return math.isinf(cell_number(sheet.texts(number)[0], sheet.decimal))
 
     @property
     def header(self) -> tuple[str, ...]:
@@ -258,29 +232,23 @@ class _Table:
         """Return the cells of a column by its name in the header."""
         return self._sheet.columns.texts(self._sheet.number(name) or '')
 
-    def words(self) -> dict[str, str | FloatArray]:
-        """Return our columns of text."""
-        cells = self._sheet.columns.cells
-        return {
-            ours: cells[self._columns[ours].names[0]] for ours in WORDS if ours in self._columns
-        }
-
-    def values(self) -> dict[str, FloatArray]:
-        """Return our columns of numbers in m and rad."""
-        expressions = {o: each for o, each in self._columns.items() if o not in WORDS}
+    def columns(self) -> Columns:
+        """Return our columns: words, and numbers in m and rad."""
+        sheet, ours_in = self._sheet.columns, self._columns
+        words = {ours: sheet.cells[ours_in[ours].names[0]] for ours in WORDS if ours in ours_in}
+        made = Columns(self.path, sheet.lines, words, self.names)
+        expressions = {ours: each for ours, each in ours_in.items() if ours not in WORDS}
         numbers = list(dict.fromkeys(n for each in expressions.values() for n in each.names))
-        read = self._sheet.columns.numbers(numbers, [self._sheet.called(n) or n for n in numbers])
+        read = sheet.numbers(numbers, [self._sheet.called(n) or n for n in numbers])
         columns = dict(zip(numbers, read.T, strict=True))
         units = Units(self._sheet, expressions, self._layout, self._chain)
         self.notes += units.notes
         found = {}
         for ours, each in expressions.items():
-            value = np.broadcast_to(each.of(columns), len(self.lines))
+            value = np.broadcast_to(each.of(columns), len(sheet.lines))
             found[ours] = value * units.factors.get(ours, 1.0)
-            if np.isinf(found[ours]).any():
-                line = self.lines[int(np.argmax(np.isinf(found[ours])))]
-                raise InputError(f'{self.path}, line {line}: {ours} = {each.text} is infinite')
-        return found
+            made.refuse(np.isinf(found[ours]), f'{ours} = {each.text} is infinite')
+        return replace(made, cells={**words, **found})
 
 
 def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
@@ -295,7 +263,7 @@ def _partners(table: _Table, log: _Table) -> tuple[str, Index]:
             rows = {cell: row for row, cell in enumerate(logged)}
             if len(rows) == len(logged) and len({*named}) == len(named) and {*named} <= {*rows}:
                 return name, np.array([rows[cell] for cell in named])
-    return '', np.arange(len(log.lines))
+    return '', np.arange(log.count)
 
 
 def _shifted(made: Columns, shift: int) -> Columns:

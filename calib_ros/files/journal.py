@@ -197,10 +197,9 @@ def is_whole(row: bytes, width: int) -> bool:
 
 def columns(joints: int) -> list[str]:
     """Return the columns of a table for every kind of sample."""
-    names = ['stamp_ns', *(name for letter in 'qsva' for name in joint_columns(joints, letter))]
-    names += [*POSE_COLUMNS, 'distance', *COVARIANCE, 'device', 'target', 'frame_id']
-    names += ['eye_in_hand', 'delay', 'count', 'spread', 'session', 'split']
-    return [*names, 'location', 'socket', 'view']
+    names = ['stamp_ns', *joint_columns(joints, 'qsva'), *POSE_COLUMNS, 'distance', *COVARIANCE]
+    names += ['device', 'target', 'frame_id', 'eye_in_hand', 'delay', 'count', 'spread']
+    return [*names, 'session', 'split', 'location', 'socket', 'view']
 
 
 def cells(sample: Sample, split: str | None = None) -> list[str]:

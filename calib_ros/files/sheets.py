@@ -325,4 +325,4 @@ def _first(
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    return math.isfinite(cell_number(cell.replace(',', '.') if decimal == ',' else cell))
+    return math.isfinite(cell_number(cell, decimal))

@@ -24,8 +24,8 @@ import numpy as np
 
 from calib_ros.errors import ColumnsError, InputError, UnknownNameError
 from calib_ros.estimation.observations import Observations
-from calib_ros.files.columns import Codes, Columns, columns_of
-from calib_ros.files.foreign import Foreign, measured
+from calib_ros.files.columns import Codes, Columns, columns_of, measured
+from calib_ros.files.foreign import Foreign
 from calib_ros.files.headers import joints_left_out, not_read
 from calib_ros.files.journal import columns, of_journal
 from calib_ros.files.measurements import Measurements, distinct_rows, measurements

@@ -8,6 +8,8 @@ import re
 
 import numpy as np
 
+from calib_ros.values import MOST_NAMES
+
 LENGTHS = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3, 'um': 1e-6, 'in': 0.0254}
 """Metres in units of length."""
 ANGLES = {'rad': 1.0, 'deg': np.pi / 180.0}  # radians in units of angle
@@ -43,11 +45,16 @@ WORDS = ('session', 'device', 'target', 'frame_id', 'split', 'eye_in_hand', 'sta
 NUMBERS = (*POSE_COLUMNS, *TURNS, *IN_TURN, *MATRIX, *SIGMAS, 'distance', 'time', 'delay')
 JOINT = re.compile('[qsva][0-9]+')
 """Columns with a number of each joint: values, signs of last moves, and rates."""
-MEASURED_COLUMNS = (*POSITION, 'distance', 'socket', 'plane')
 KINDS = ('x', 'distance', 'socket', 'plane')
 """Columns whose cells determine what a row measured."""
+MEASURED_COLUMNS = (*POSITION, *KINDS[1:])
 
 
-def joint_columns(joints: int, letter: str = 'q') -> tuple[str, ...]:
+def joint_columns(joints: int, letters: str = 'q') -> tuple[str, ...]:
     """Return the columns with a number of each joint."""
-    return tuple(f'{letter}{k + 1}' for k in range(joints))
+    return tuple(f'{letter}{k + 1}' for letter in letters for k in range(joints))
+
+
+IN_ORDER = ('session', 'split', 'stamp_ns', *joint_columns(MOST_NAMES, 'qsva'), *POSE_COLUMNS)
+IN_ORDER += ('distance', *COVARIANCE)
+"""Columns in the order of a converted table; others follow."""

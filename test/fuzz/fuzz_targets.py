@@ -112,7 +112,8 @@ def table(path):
 @target('.csv')
 def foreign(path):
     """The layout in the first lines, up to a mark of its own; then the table."""
-    from calib_ros.files.foreign import Foreign, as_csv
+    from calib_ros.files.columns import as_csv
+    from calib_ros.files.foreign import Foreign
     from calib_ros.files.layouts import load_layout
 
     layout, _, rows = path.read_bytes().partition(b'===\n')
