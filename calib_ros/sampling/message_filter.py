@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from calib_ros.sampling.sources import Source
 from calib_ros.settings import EXCEPTION
 from calib_ros.values import MOST_NAMES
 
-JointLayout: TypeAlias = tuple[JointIndices, Index, str]
 OTHERS = 'none of the joints in the message'
 NOWHERE = -1  # column of a joint that needs no name
 
@@ -32,24 +31,19 @@ class JointNames:
 
     def __init__(self, names: Sequence[str], held: Mapping[int, float] | None = None) -> None:
         self._names, self.held = names, held or {}
-        self._layouts: dict[tuple[str, ...], JointLayout] = {}
         self._heard: dict[str, tuple[float, float]] = {}  # lowest and highest value by name
 
-    def layout(self, key: tuple[str, ...]) -> JointLayout:
+    def layout(self, key: Sequence[str]) -> tuple[JointIndices, Index, str]:
         """Return the joints of the chain in messages, the columns of their values, and any fault.
 
         Of held joints that are not named the column is NOWHERE.
         """
-        if key not in self._layouts:
-            if len(self._layouts) == MOST_NAMES:
-                self._layouts.clear()
-            known = {k: key.index(n) for k, n in enumerate(self._names) if n in key}
-            needed = known.keys() - self.held.keys()
-            known = dict(sorted((dict.fromkeys(self.held, NOWHERE) | known).items()))
-            twice = any(key.count(name) > 1 for name in self._names)
-            fault = 'a joint is named twice' if twice else '' if needed else OTHERS
-            self._layouts[key] = tuple(known), np.array([*known.values()], dtype=np.intp), fault
-        return self._layouts[key]
+        known = {k: key.index(name) for k, name in enumerate(self._names) if name in key}
+        fault = '' if known.keys() - self.held.keys() else OTHERS
+        if any(key.count(self._names[k]) > 1 for k in known):
+            fault = 'a joint is named twice'
+        known = dict(sorted((dict.fromkeys(self.held, NOWHERE) | known).items()))
+        return tuple(known), np.array([*known.values()], dtype=np.intp), fault
 
     def hear(self, names: Sequence[str], values: FloatArray) -> None:
         """Note the names and values (N, len(names)) of joint states, but of too many others."""
@@ -201,7 +195,7 @@ class MessageFilter:
         latest = -1
         for places, _, (stamps, (_, *names), numbers) in parts:
             self._names.hear(names, numbers)
-            columns, index, fault = self._names.layout(tuple(names))
+            columns, index, fault = self._names.layout(names)
             if fault:
                 self.miss(JOINTS, len(stamps), fault)
                 continue

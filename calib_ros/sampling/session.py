@@ -31,6 +31,7 @@ from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
 from calib_ros.settings import Settings
+from calib_ros.shown import some
 from calib_ros.values import require
 
 NOT_RECORDING = 'not recording: call ~/record with true'
@@ -174,7 +175,7 @@ class CalibrationSession:
     @property
     def _different(self) -> str:
         """Return that one device measured in different frames, if it matters."""
-        frames = ', '.join(name or 'one without name' for name in self._frames.different)
+        frames = ', '.join(some([name or 'one without name' for name in self._frames.different]))
         return frames and f'poses came in different frames ({frames})'
 
     @property

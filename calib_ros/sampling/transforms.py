@@ -74,10 +74,8 @@ class Links:
         self._routes: dict[Source, Route | str] = dict.fromkeys(sources, '')
         self._parents = defaultdict[str, list[Pair]](list)  # links by child frame
         self._known = False  # whether the routes are up to date
-        self._wanted: set[Pair] = set()
-        self._open = True  # whether a source's frames are not linked yet
         self.layouts: dict[int, list[MessageLayout]] = {}  # layouts by message length
-        self._held: deque[tuple[Pair, Readings]] = deque()
+        self._held: deque[Readings] = deque()
         self._let_go: Counter[Pair] = Counter()
 
     def take(
@@ -97,27 +95,28 @@ class Links:
         first, faults = min(int(each.places[0]) for each in (*moving, *still)), Counter[str]()
         found = [
             Part(np.full(len(waited.stamps_ns), first), s, self._reading(s, route, waited))
-            for link, waited in self._held
-            for s, route in self._of(link)
+            for waited in self._held
+            for s, route in self._of(waited.strings)
             if s in open_before
         ]
+        is_open = '' in self._routes.values()  # frames of a source are not linked yet
         for places, _, readings in moving:
-            link = readings.strings
-            if not (self._open or link in self._wanted):
+            measured = self._of(readings.strings)
+            if not (is_open or measured):
                 continue
             good, causes = usable(TRANSFORM, readings)
-            places, read, measured = places[good], readings.rows(good), self._of(link)
+            places, read = places[good], readings.rows(good)
             faults += Counter({cause: n * len(measured) for cause, n in causes.items()})
-            self._held.append((link, read))
+            self._held.append(read)
             found += [Part(places, s, self._reading(s, route, read)) for s, route in measured]
-        if not self._open:
+        if not is_open:
             lost_count = sum(n * len(self._of(link)) for link, n in self._let_go.items())
             faults += Counter({'buffer full before their frames were linked': lost_count})
             self._let_go.clear()
             self._held.clear()
-        while sum(len(waiting.stamps_ns) for _, waiting in self._held) > Settings.pose_buffer:
-            oldest, lost = self._held.popleft()
-            self._let_go[oldest] += len(lost.stamps_ns)
+        while sum(len(waiting.stamps_ns) for waiting in self._held) > Settings.pose_buffer:
+            lost = self._held.popleft()
+            self._let_go[lost.strings] += len(lost.stamps_ns)
         return found, faults
 
     def _fix(self, come: Readings) -> None:
@@ -136,7 +135,7 @@ class Links:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()
                 for each in [*self._moving][: MOST_ENTRIES // 2]:
-                    if each not in self._wanted:
+                    if not self._of(each):
                         del self._moving[each]
             self._moving[link] = Seen(0, first_ns, last_ns)
             self._known = False
@@ -198,9 +197,6 @@ class Links:
             for link in sorted({*self._fixed, *self._moving}):
                 self._parents[link[1]].append(link)
             self._routes = {source: self._route(source) for source in self.sources}
-            routes = self._routes.values()
-            self._wanted = {route.link for route in routes if isinstance(route, Route)}
-            self._open = '' in routes
             self._known = True
 
     def _route(self, source: Source) -> Route | str:
