@@ -138,8 +138,9 @@ def decode(
     problems: list[str] = []
     linked: dict[Links, tuple[list[Part], list[Part]]] = {}  # moving and still ones
     for stream, places, found in _read(batch, deserialise, pictures, miss, problems):
-        if stream.type != JOINT_STATE:
-            found = found._replace(strings=tuple(map(frame_name, found.strings)))
+        names = found.strings
+        if stream.type != JOINT_STATE and any(name[:1] == '/' for name in names):
+            found = found._replace(strings=tuple(map(frame_name, names)))
         part = Part(places, stream.source, found)
         if stream.links is None:
             parts.append(part)

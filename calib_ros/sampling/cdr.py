@@ -79,9 +79,10 @@ class Alike:
     def of(self, k: int) -> Readings:
         """Return the readings of item k."""
         strings, stamp, begin, kind, width = self.layout.items[k]
-        seconds = _numbers(self.rows, stamp, '<i4', 1)[:, 0].astype(np.int64)
-        stamps = seconds * 1_000_000_000 + _numbers(self.rows, stamp + 4, '<u4', 1)[:, 0]
-        return Readings(stamps, strings, _numbers(self.rows, begin, kind, width).astype(float))
+        times = _numbers(self.rows, stamp, '<i4', 2)  # seconds, and nanoseconds without sign
+        stamps = times[:, 0].astype(np.int64) * 1_000_000_000 + times.view('<u4')[:, 1]
+        numbers = _numbers(self.rows, begin, kind, width).astype(float, copy=False)
+        return Readings(stamps, strings, numbers)
 
 
 def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]) -> list[Alike]:
@@ -204,5 +205,5 @@ def _aligned(at: int, size: int) -> int:
 
 
 def _numbers(rows: NDArray[np.uint8], begin: int, kind: str, width: int) -> NDArray[Any]:
-    size = np.dtype(kind).itemsize * width
+    size = int(kind[2:]) * width
     return np.ascontiguousarray(rows[:, begin : begin + size]).view(kind)

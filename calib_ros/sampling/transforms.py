@@ -130,7 +130,7 @@ class Links:
             self._known = False
 
     def _move(self, come: Readings) -> None:
-        link, (first_ns, last_ns) = come.strings, come.stamps_ns[[0, -1]].tolist()
+        link, first_ns, last_ns = come.strings, int(come.stamps_ns[0]), int(come.stamps_ns[-1])
         if link not in self._moving:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()
