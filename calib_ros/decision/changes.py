@@ -38,6 +38,7 @@ from calib_ros.estimation.levels import CERTAIN, CONFIDENT, SCALE, SEVERAL, chan
 from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.sizes import SPREAD
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.effects import expected
 from calib_ros.kinematics.parameter import DH_KINDS, FRAME_KINDS, Parameter, parameters_of
 from calib_ros.kinematics.se3 import HALF_THE_DIGITS, FloatArray
 from calib_ros.settings import LEVER
@@ -53,6 +54,10 @@ SIZES = {'m': 1e-3, 'rad': 2e-3}
 way costs half a unit of log evidence."""
 SCALE_OF_DEVICE = Parameter('device', 'ratio')
 """Scale of all measured lengths: of the arm, and of the distance to it."""
+LOAD = 'load'
+"""Owner of what the arm bends under a load at its end."""
+OUTSIDE = (SCALE_OF_DEVICE.owner, LOAD)
+"""Owners of changes that are none of the arm."""
 ORDER = ('theta', 'd', 'a', 'b', 'alpha', 'beta')
 """Order in which a joint's parameters are named if two have the same effect."""
 
@@ -78,6 +83,8 @@ class Explanation(Shown):
 
     def in_words(self) -> str:
         """Return the changed parameter and its size, or the changed parameters."""
+        if self.owner == LOAD:
+            return 'the load of the arm'
         if len(self.names) > 1:
             return f'{self.owner} ({", ".join(dict.fromkeys(n.kind for n in self.names))})'
         what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
@@ -253,7 +260,8 @@ def likelier(
 
 
 def _sizes(names: Sequence[Parameter]) -> FloatArray:
-    return np.array([SCALE if n == SCALE_OF_DEVICE else SIZES[n.unit] for n in names])
+    known = SIZES | {SCALE_OF_DEVICE.unit: SCALE}
+    return np.array([known.get(name.unit) or expected(name) for name in names])
 
 
 class Effects:
@@ -287,6 +295,9 @@ class Effects:
         for frame in frames:
             own = tuple(name for name in parameters_of(frame) if name in self._columns)
             sets += [(frame, own)] if own else []
+        load = f'gravity_{chain.joint_names[-1]}'
+        if carried := tuple(name for name in names if name.kind == load):
+            sets.append((LOAD, carried))
         lengths = [name for name in self._columns if name.is_length]
         if scaled and lengths:
             grown = [chain.value(name) * self._columns[name] for name in lengths]

@@ -63,7 +63,7 @@ class Recalibration(Shown):
         most = max(ALIKE * self.before.rms_mm, 1e3 * SAME)  # simulated without noise
         agrees = self.after.rms_mm <= min(most, 1e3 * Settings.largest_error)
         fits = self.unexplained > changes.FALSE and agrees
-        return fits and self.determined and not (self.reused or self.scale)
+        return fits and self.determined and not (self.reused or self.outside)
 
     @property
     def determined(self) -> bool:
@@ -77,10 +77,15 @@ class Recalibration(Shown):
         return confirmed and known
 
     @property
-    def scale(self) -> Explanation | None:
-        """Return the change of the device's scale, if that explains most."""
+    def outside(self) -> Explanation | None:
+        """Return the change of the device's scale or of the load, if either explains most."""
         first = (reasons[0] for reasons in self.changed)
-        return next((e for e in first if e.names == (changes.SCALE_OF_DEVICE,)), None)
+        return next((e for e in first if e.owner in changes.OUTSIDE), None)
+
+    @property
+    def out_of_scale(self) -> bool:
+        """Tell whether that is the scale of the device."""
+        return self.outside is not None and self.outside.owner != changes.LOAD
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain values, without its figures."""
@@ -102,14 +107,18 @@ class Recalibration(Shown):
         if self.reused:
             why, _, step = reused_in_words(self.reused).rpartition(': ')
             return why, f'{step}, and give only those'
-        if self.scale is not None and self.unexplained > changes.FALSE:
-            return (
-                f'the scale of the measuring device changed, by {self.scale.size_in_words()}',
-                'check it with a known length, and the temperature and pressure set in it',
-            )
         if self.odd:
             why = f'{self.odd} contradicts all others, which would pass without it'
             return why, 'measure it again, or leave it out'
+        if (cause := self.outside) and self.unexplained > changes.FALSE:
+            if not self.out_of_scale:
+                why = 'the arm bends as under another load than in the earlier calibration'
+                return why, 'measure with that load, or identify again with this one'
+            return (
+                f'the scale of the measuring device changed, by {cause.size_in_words()}',
+                'check it with a known length, and the temperature and pressure set in it; or the '
+                'arm is warmer or colder than it was',
+            )
         if self.step:
             why = f'something moved while the new poses were measured: {self.step}'
             return why, 'measure again, or give only the poses from there on'

@@ -77,7 +77,7 @@ def recalibrate(
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
         raise InputError('the new poses do not fit the arm at all: check their units') from error
-    if found.accepted or found.reused or found.scale is not None:
+    if found.accepted or found.reused or found.out_of_scale:
         return found
     for number, pose, rest in _without_one(problem, arm):
         try:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Several or all joint zeros have changed at once, or both frames; eight poses tell."""
+"""Several or all joint zeros have changed at once, both frames, or the load; few poses tell."""
 
 from dataclasses import replace
 
@@ -84,6 +84,23 @@ def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):
     now = slipped(true, [0.0] * 5 + [4e-3])
     found = recalibrate(previous, seen(now, 8, 1, oriented), 0.1)
     assert 'wrist_3_joint' in owners(found.changed)[0]
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_another_load_is_no_change_of_the_arm(earlier, seed):
+    """Zeros imitated its bending near some poses, and made the arm worse elsewhere."""
+    true, previous, oriented = earlier
+    last = UR10E.joint_names[-1]
+    bent = {f'{joint}.gravity_{last}': 3e-4 for joint in UR10E.joint_names[1:4]}
+    now = true.with_effects(list(bent)).with_offsets(bent)
+    poses = seen(now, 12, seed, oriented)
+    found = recalibrate(previous, poses, 0.1)
+    assert not found.accepted
+    assert owners(found.changed)[0] >= {'load'}
+    assert found.outside is found.changed[0][0]
+    assert 'as under another load' in found.refusal()[0]
+    assert 'the load of the arm' in found.outside.in_words()
+    assert found.document()['refusal'].endswith('or identify again with this one')
 
 
 def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show():

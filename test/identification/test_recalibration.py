@@ -171,7 +171,7 @@ def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told)
     new = ('base',) * told
     found = recalibrate(previous, replace(seen, observations=grown), 0.1, new=new)
     assert not found.accepted
-    assert 1e6 * found.scale.change[0] == pytest.approx(ppm, abs=60.0)
+    assert 1e6 * found.outside.change[0] == pytest.approx(ppm, abs=60.0)
     assert f'scale of the measuring device changed, by {ppm:+.0f}'[:-3] in found.refusal()[0]
     assert not found.odd
     assert recalibrate(previous, seen, 0.1, new=new).accepted
