@@ -259,14 +259,15 @@ def _interval(
 def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tuple[int, ...]:
     """Return the configurations without which the others are within a limit exceeded with them.
 
-    Outliers, or all on one side of the moment that best divides errors of two sizes.
+    Outliers, or all on one side of the moment that best divides errors of two sizes. Without gross
+    errors the others need not decide.
     """
 
-    def limits(which: Index) -> tuple[float, float]:
+    def limits(which: Index) -> tuple[float, float, float]:
         if len(which) - lost < NEEDED:
-            return 0.0, np.inf
-        *_, (lower,), (upper,) = _interval(moments[which], lost, confidence)
-        return float(lower), float(upper)
+            return 0.0, np.inf, np.inf
+        rms, *_, (lower,), (upper,) = _interval(moments[which], lost, confidence)
+        return float(lower), rms, float(upper)
 
     squares = np.trace(moments, axis1=1, axis2=2)
     every, before = np.arange(len(squares)), np.arange(1, len(squares))
@@ -275,8 +276,8 @@ def _odd(moments: FloatArray, lost: int, limit: float, confidence: float) -> tup
     moment = 1 + int(np.argmin(before * sizes[0] + after * sizes[1]))
     outliers = np.flatnonzero(squares > OUTLIER**2 * np.median(squares))
     sides = [each for each in (every[:moment], every[moment:]) if limits(each)[0] > limit]
-    for bad in (outliers, *sides):
-        if limits(np.setdiff1d(every, bad))[1] <= limit < limits(every)[1]:
+    for bad, bound in ((outliers, 2), *((side, 2) for side in sides), (outliers, 1)):
+        if limits(np.setdiff1d(every, bad))[bound] <= limit < limits(every)[bound]:
             return tuple(bad.tolist())
     return ()
 

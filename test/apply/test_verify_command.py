@@ -123,6 +123,15 @@ def test_a_few_poses_among_many_that_exceed_the_limit_are_named(arm):
     assert 'poses 4, 18, 31 alone are up to 10.0' in text
 
 
+def test_a_gross_error_is_named_although_the_others_leave_the_verdict_open(arm):
+    errors = np.random.default_rng(0).normal(scale=5e-5, size=(12, 3))
+    assert verify(arm, [with_errors(arm, errors)], 1e-4).verdict == 'UNDECIDED'
+    errors[7] += [0.0, 0.01, 0.0]
+    text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
+    assert (found.verdict, found.odd) == ('FAIL', (7,))
+    assert 'pose 8 alone is ' in text
+
+
 @pytest.mark.parametrize(
     ('bad', 'words'),
     [
