@@ -210,6 +210,9 @@ class _Scan:
         left = np.zeros(len(self._names) + 1)
         left[: self._fitted], left[-1] = -self._root @ self._known, 1.0
         self._left = np.einsum('i,sij,j->s', left, whole, left)
+        back = extra @ left[[*range(self._fitted), -1]]  # a step may spare priors much
+        equations = float(self._equations.sum() + extra[:, :-1].any(axis=1).sum())
+        self._all = float(self._left.sum() + back @ back), equations - self._fitted
         usual = bool(self._left.sum() < SUSPICIOUS**2 * self._equations.sum())
         self.explained = bool(constant) and usual and fitted.noise.position >= SUSPICIOUS
 
@@ -230,9 +233,8 @@ class _Scan:
         near = self._best_of(some, 0.5 * EXPLAINED) if len(some) else None
         if near is None or near.stop == 0:
             return near if near is not None and near.share > EXPLAINED else None
-        before, after = some[some < near.stop], some[some > near.stop]
-        first = before.max(initial=LEAST_ASIDE)
-        last = after.min(initial=self._stops - LEAST_ASIDE)
+        first = some[some < near.stop].max(initial=LEAST_ASIDE)
+        last = some[some > near.stop].min(initial=self._stops - LEAST_ASIDE)
         return self._best_of(np.arange(first, last + 1), EXPLAINED)
 
     def _best_of(self, places: Index, least: float) -> _Found | None:
@@ -244,7 +246,7 @@ class _Scan:
         vector = products[:, :, -1] - cross @ self._known
         lengths = np.einsum('bii->bi', own)
         found: _Found | None = None
-        lowest, total = np.inf, float(self._left.sum())
+        lowest, (total, everything) = np.inf, self._all
         for group in self._groups:
             columns = [self._added.index(name) for name in group.names]
             root = inverse_root(matrix[:, columns][:, :, columns], lengths[:, columns])
@@ -259,14 +261,13 @@ class _Scan:
             rest = (1.0 - share[k]) / (freedom - rank[k])
             beyond = 1.0 - rest * freedom
             # over all sets: one with few equations may have no freedom left
-            whole = float(self._equations.sum()) - self._fitted - float(rank[k])
+            whole = everything - float(rank[k])
             squares = float(gain[k]) * whole / max(total - float(gain[k]), 1e-300)
             trials = self._stops * len(self._groups)
             by_chance = trials * chance_of(squares, max(int(rank[k]), 1), whole)
             criterion = equations * np.log1p(-share[k]) + rank[k] * np.log(equations)
             if beyond > least and by_chance < 1.0 - SURE and criterion < lowest:
-                lowest = criterion
-                size = root[k] @ along[k]
+                lowest, size = criterion, root[k] @ along[k]
                 found = _Found(group, int(places[k]), size, float(beyond), float(left * rest))
         return found
 

@@ -126,6 +126,15 @@ def test_what_follows_the_joints_is_no_step(design, count):
         assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
 
 
+def test_a_dozen_positions_show_no_step():
+    """A step of the base may spare priors more squares than nine degrees of freedom leave."""
+    for seed in (2, 3, 16, 18, 24):
+        rng = np.random.default_rng(seed)
+        true = faulty(UR10E, Cell(), rng)
+        seen = measure(true, UR10E.random_joints(12, rng), rng, *NOISE, oriented=False)
+        assert identify(Problem(UR10E, seen, **SIGMAS)).step is None
+
+
 def test_half_of_the_session_called_outliers_hides_no_step():
     true, seen = session(1, oriented=True)
     result = identify(Problem(UR10E, moved(seen, true, 'joint', 0.02, at=40), **SIGMAS))
