@@ -80,8 +80,8 @@ def draw_candidates(
         if drawn > 1000 * count:
             raise InputError(
                 f'the target can be measured at {len(found)} of {drawn} random poses only; '
-                f'{count} candidates are needed: widen what the device sees (--box, --cone), or '
-                'give a file of poses (--candidates)'
+                f'{count} candidates are needed: widen what the device sees (--box, --cone), turn '
+                'the target (--axis), or give a file of poses (--candidates)'
             )
         joints = design.chain.random_joints(10 * count, rng)
         drawn += len(joints)

@@ -157,7 +157,11 @@ FROM, HEAD = ('--candidates', 'q.csv'), 'q1,q2,q3,q4,q5,q6\n'
                 (('--velocity', 1, 2), '--velocity: give one value, or 6'),
                 (('--candidates', 'missing.csv'), 'cannot read missing.csv'),
                 (('--priors', 'elbow.a=1'), 'unknown parameter "elbow.a"'),
-                (('--box', 9, 9, 9, 10, 10, 10, '--draw', 50), 'random poses only'),
+                (
+                    ('--box', 9, 9, 9, 10, 10, 10, '--draw', 50),
+                    'random poses only; 50 candidates are needed: widen what the device sees '
+                    '(--box, --cone), turn the target (--axis)',
+                ),
                 (('--tracker', 3, 0, 1, '--cone', -10), 'between 0 and 180 degrees, not -10'),
                 (('--iso9283', '--poses', 20), '--poses does not apply to --iso9283'),
                 (('--iso9283', '--candidates', 'q.csv'), '--candidates does not apply'),
