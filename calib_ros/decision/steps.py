@@ -300,8 +300,6 @@ class _Scan:
     def drifts(self, found: _Found) -> bool:
         """Tell whether a slow drift of the same group explains more than the step."""
         slow = slow_cosines(self._stops)[1:]
-        if not len(slow):
-            return False
         columns = [self._names.index(name) for name in found.group.names]
         matrix = np.zeros((self._fitted + len(columns) * len(slow) + 1,) * 2)
         for rows, numbers in zip(self._rows, self._numbers, strict=True):

@@ -263,13 +263,14 @@ def test_exact_poses_have_no_step():
         assert identify(Problem(UR10E, seen)).step is None
 
 
-def test_nothing_moves_between_fewer_stops_than_a_step_has_on_both_sides():
+@pytest.mark.parametrize(('stops', 'found'), [(5, False), (9, True)])
+def test_nothing_moves_between_fewer_stops_than_a_step_has_on_both_sides(stops, found):
     rng = np.random.default_rng(5)
-    few = np.repeat(UR10E.random_joints(5, rng), 8, axis=0)
-    seen = measure(arm(rng), few, rng, *NOISE)
+    true, few = arm(rng), np.repeat(UR10E.random_joints(stops, rng), 8, axis=0)
+    seen = moved(measure(true, few, rng, *NOISE), true, 'tool', 0.02, at=32)
     problem = Problem(UR10E, seen, fixed=('*_joint.*',))
-    _, _, fit = fitting.fit(problem)
-    assert find_step(fit) is None
+    step = find_step(fitting.fit(problem)[2])
+    assert (step is not None and (step.kind, step.sample) == ('tool', 32)) == found
 
 
 @pytest.mark.parametrize(('seed', 'row'), [(8, -2), (11, 1)])
