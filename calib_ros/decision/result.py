@@ -68,18 +68,18 @@ class Identification(Shown):
     """The posterior of the arm, unmodelled effects included."""
     region: Region | None
     """Where the calibration may be used; None if nowhere."""
-    weak: tuple[str, ...] = ()
+    weak: tuple[str, ...]
     """Parameters that the poses hardly determine, held near nominal by a prior."""
+    step: Step | None
+    """What moved during the measurement (`steps.py`)."""
+    remarks: tuple[str, ...]
+    """What is suspicious despite good figures, and what to do (`plausibility.py`)."""
+    coupled: bool
+    """Whether unfitted couplings of the wrist explain most of the residuals."""
+    images: int
+    """Number of board images fitted."""
     verdicts: tuple[GroupVerdict, ...] = ()
     """Effects tried if the model was chosen."""
-    step: Step | None = None
-    """What moved during the measurement (`steps.py`)."""
-    remarks: tuple[str, ...] = ()
-    """What is suspicious despite good figures, and what to do (`plausibility.py`)."""
-    coupled: bool = False
-    """Whether unfitted couplings of the wrist explain most of the residuals."""
-    images: int = 0
-    """Number of board images fitted."""
 
     @property
     def accepted(self) -> bool:
