@@ -58,7 +58,7 @@ def row_loss(
         for s, pairs in paired.items():
             tables[s][inside[s]] = misses(found.chain, pairs, flange(found.chain, pairs))
         for before, after in product(SLIPS, SLIPS):
-            if before == after or (before and after):
+            if before and after:
                 continue
             row = _where(tables[before] <= largest, tables[after] <= largest)
             pieced = np.concatenate([tables[before][:row], tables[after][row:]])
