@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Public values on a screen."""
 
+import copy
 import importlib
 import pkgutil
 import re
@@ -82,6 +83,12 @@ def test_a_notebook_shows_the_verdict_and_its_reasons():
     shown = refused._repr_html_()
     assert 'not accepted' in shown
     assert 'no &lt;b&gt;gain' in shown
+    assert 'not accepted' in replace(refused, validation=None)._repr_html_()
+
+
+def test_a_refusal_keeps_its_rule_in_a_copy():
+    again = copy.deepcopy(Reason(Rule.GAIN, 'no gain', ' (by 3)'))
+    assert (again, again.rule, again.short) == ('no gain (by 3)', Rule.GAIN, 'no gain')
 
 
 def test_arrays_are_told_by_their_shape():

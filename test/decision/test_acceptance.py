@@ -52,6 +52,8 @@ def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_t
         strict = replace(problem, largest_error=1e-3 * share * held_out.figures[1].rms_mm)
         rules = [each.rule for each in refusals(strict, result, None, False, True)]
         assert rules == [Rule.LARGEST_ERROR] * refused
+    (scale,) = refusals(problem, result, None, False, True, -0.02)
+    assert 'shrink alike, by 2 %' in scale
 
 
 def test_the_loss_by_chance_is_that_of_a_paired_t_test(rng):

@@ -186,3 +186,6 @@ def test_a_joint_that_moves_in_outliers_only_is_named(rng):
     result = identify(Problem(UR10E, seen, **SIGMAS))
     assert {outlier.sample for outlier in result.outliers} == {17, 41}
     assert result.refusals[0].startswith('shoulder_lift_joint moves only in poses set aside')
+    still = np.where(np.arange(6) == 1, 0.3 + 1e-5 * np.sign(q - 0.3), q)  # but for the encoder
+    lost = replace(seen, joints=still, positions=np.where(q[:, [1]] == 0.3, seen.positions, 0.0))
+    assert 'moves only in' not in ''.join(identify(Problem(UR10E, lost, **SIGMAS)).refusals)

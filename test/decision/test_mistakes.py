@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import explained
-from calib_ros.decision.rotation_conventions import _angles
+from calib_ros.decision.rotation_conventions import misread
 from calib_ros.decision.suspects import _mirrored, _scaled, dead
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
@@ -349,12 +349,13 @@ def test_mistakes_are_named_where_some_orientations_are_missing():
     assert '--length mm' in str(explained(Problem(UR, partly)))
 
 
-@pytest.mark.parametrize('order', ['XYZ', 'ZXY'])
-def test_an_orientation_has_two_triples_of_angles(order, rng):
-    turns = Rotation.from_matrix(se3.exp_rotation(rng.normal(size=(20, 3))))
-    for angles in _angles(turns.as_matrix(), order):
-        again = Rotation.from_euler(order, angles[:, ['XYZ'.index(axis) for axis in order]])
-        np.testing.assert_allclose((again * turns.inv()).magnitude(), 0.0, atol=1e-7)
+@pytest.mark.parametrize(('read', 'meant'), [('XYZ', 'ZYX'), ('ZXY', 'XYZ'), ('XYZ', 'YXZ')])
+def test_angles_read_in_another_order_are_those_meant_in_every_pose(read, meant):
+    seen = seen_of()
+    start = f'the Euler angles are {meant} (', f'fixed axes), not {read} ('
+    (turn,) = (turn for what, _, turn in misread() if all(each in what for each in start))
+    wrong = rewritten(read, meant)(seen)
+    np.testing.assert_allclose(turn(wrong.rotations), seen.rotations, atol=1e-7)
 
 
 def test_good_results_are_not_searched(monkeypatch):

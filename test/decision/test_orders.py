@@ -14,6 +14,7 @@ from calib_ros import identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.mistakes import explained, explained_alone
 from calib_ros.estimation.problem import Problem
+from calib_ros.kinematics.chain import Chain, Joint
 
 
 @pytest.mark.parametrize('oriented', [True, False])
@@ -45,6 +46,24 @@ def test_a_coupled_joint_in_a_table_without_units_is_named(length, angle, remedy
     assert found.what == 'several mistakes at once'
     assert f'({remedy})' in found.remedy
     assert found.remedy.endswith('(--columns q3=q3+q2)')
+
+
+def test_swapped_ends_of_a_short_arm_are_named_once():
+    rows = ({'d': 0.5, 'a': 0.2, 'alpha': -np.pi / 2}, {'a': 0.7}, {'a': 0.6})
+    arm = Chain('short', 'standard', tuple(Joint(f'j{k}', **row) for k, row in enumerate(rows)))
+    rng = np.random.default_rng(1)
+    seen = measure(faulty(arm, Cell(), rng), rng.uniform(-2.0, 2.0, (40, 3)), rng, 5e-5, 2e-4)
+    (found,) = explained(Problem(arm, replace(seen, joints=seen.joints[:, ::-1]))).suspects
+    assert found.what == 'j0 and j2 are swapped'
+
+
+def test_messages_from_the_flange_in_millimetres_are_named_with_the_setting_and_the_rest():
+    arm, rng = load_chain('ur10e'), np.random.default_rng(1)
+    seen = measure(faulty(arm, Cell(), rng), arm.random_joints(40, rng), rng, 5e-5, 2e-4)
+    turned = replace(seen.inverted(), inverse=False)
+    wrong = replace(turned, positions=1e3 * turned.positions)
+    said = str(explained(Problem(arm, wrong, of_messages=True)))
+    assert 'set eye_in_hand=true in sources, correct the rest in the publisher' in said
 
 
 def test_rows_that_are_not_like_the_others_are_named():

@@ -58,6 +58,9 @@ def test_a_joint_that_only_goes_one_way_is_named():
         said = [each for each in identify(Problem(UR, one)).remarks if 'mix' in each]
         assert len(said) == bool(named)
         assert all(f'an error of {named}, moved in one direction' in each for each in said)
+    for few, told in ((np.arange(0, 40, 5), True), (np.arange(0, 40, 6), False)):  # 8 tell, not 7
+        remarks = identify(Problem(UR, steady.select(few))).remarks
+        assert any('mix the order' in each for each in remarks) == told
 
 
 @pytest.mark.parametrize('errors', [0.1, 1.0, 3.0])

@@ -10,7 +10,7 @@ from fits import UR10E, arm, rms
 
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.region import region_of_record
+from calib_ros.decision.region import packed, region_of_record, unpacked_matrix
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
@@ -53,6 +53,13 @@ def folder(local, tmp_path):
     (path / 'calibration.yaml').write_text(Calibration.of(local).dump())
     (path / 'result.json').write_text(json.dumps(as_document(local, {})))
     return path
+
+
+def test_a_covariance_without_some_directions_survives_its_record(rng):
+    root = 1e-4 * rng.normal(size=(6, 2))
+    square = root @ root.T
+    found = unpacked_matrix(packed(square), 6)
+    np.testing.assert_allclose(found, square, atol=1e-7 * square.max())
 
 
 @pytest.mark.parametrize('seed', range(2))

@@ -53,6 +53,8 @@ def test_figures_are_of_lengths_in_millimetres_milliradians_and_pixels():
     again = replace(comparison, repeated=repeated)
     assert again.deciding.tolist() == [True, False, True, False]
     assert (again.figures[0].count, again.figures_of_all[0].count) == (2, 3)
+    pair = np.array([10.0, 6.0])
+    assert again.figures[0].mean_plus_3_sigma_mm == pytest.approx(8.0 + 3.0 * pair.std(ddof=1))
     assert again.share_of_outliers == pytest.approx(1 / 3)
     assert replace(comparison, repeated=~which).outliers == 0
 

@@ -303,6 +303,8 @@ def test_the_usual_mistakes_are_named(kind, on_flange):
     wrong = replace(seen, **change(seen))
     found = explained(Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA))
     assert words in str(found)
+    if kind in ('board', 'mirrored'):
+        assert all(each.published == each.remedy for each in found.suspects)
     if kind == 'mount':
         assert ('leave out' in str(found)) == wrong.on_flange
         live = Problem(known(wrong.on_flange), wrong, sigma_pixel=SIGMA, of_messages=True)
