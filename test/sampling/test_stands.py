@@ -11,16 +11,19 @@ MOVING = 'the arm was moving'
 
 
 @pytest.mark.parametrize(
-    ('stand', 'until', 'newest', 'done', 'expected'),
+    ('stand', 'until', 'newest', 'done', 'sampled', 'expected'),
     [
-        ((2, 9), 10, 12, 0, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
-        ((2, 5), 5, 5, 0, [(2, MOVING, 0)]),  # one that goes on is waited for
-        ((2, 6), 4, 6, 0, [(2, MOVING, 0)]),
-        ((3, 8), 10, 12, 5, [(8, SAMPLED, 0), (10, MOVING, 0)]),  # of this one there is a sample
+        ((2, 9), 10, 12, 0, 0, [(2, MOVING, 0), (5, '', 2), (9, SAMPLED, 0), (10, MOVING, 0)]),
+        ((2, 5), 5, 5, 0, 0, [(2, MOVING, 0)]),  # one that goes on is waited for
+        ((2, 6), 4, 6, 0, 0, [(2, MOVING, 0)]),
+        ((3, 8), 10, 12, 5, 5, [(8, SAMPLED, 0), (10, MOVING, 0)]),  # there is a sample of it
+        ((3, 8), 10, 12, 5, 0, [(8, '', 5), (10, MOVING, 0)]),  # its begin was dealt with
     ],
 )
-def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(stand, until, newest, done, expected):
-    plan = Schedule(done * S, done * S)
+def test_a_stand_becomes_a_stop_of_the_longest_time_at_most(
+    stand, until, newest, done, sampled, expected
+):
+    plan = Schedule(done * S, sampled * S)
     stands, settings = S * np.array([stand]), Settings(shortest_stop=1.0, longest_stop=3.0)
     plan.of_stands(stands, until * S, newest * S, settings)
     found = zip(plan.ends, plan.why, plan.begins, strict=True)
@@ -72,3 +75,4 @@ def test_a_stop_shows_from_its_shortest_time_on_until_it_is_dealt_with():
     assert found == [False, True, True, True, True, False]
     assert seen_stops(stands, [15], 20, 4, 4) == [False]
     assert seen_stops(stands, [15], 19, 4, 4) == [True]
+    assert seen_stops(np.array([[0, 3]]), [9], 0, 4, 4) == [False]  # too short, now as then
