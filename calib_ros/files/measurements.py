@@ -113,16 +113,16 @@ class Measurements:
         """Yield the rows as samples."""
         for k, kind in enumerate(self.kind.tolist()):
             texts: dict[str, Any] = {
-                name: getattr(self, name)[1][getattr(self, name)[0][k]]
-                for name in ('session', 'device', 'target', 'frame_id')
+                name: words[codes[k]]
+                for name in ('session', 'device', 'target', 'frame_id', 'view')
+                for codes, words in (getattr(self, name),)
             }
             optional: dict[str, Any] = {
                 name: None if values is None or np.isnan(values[k]).any() else values[k]
                 for name in ('approach', 'velocity', 'acceleration', 'covariance')
                 for values in (getattr(self, name),)
             }
-            view = self.view[1][self.view[0][k]]
-            where = f'{self.path}, line {self.lines[k]}: view'
+            view, where = texts.pop('view'), f'{self.path}, line {self.lines[k]}: view'
             yield Sample(
                 int(self.stamps_ns[k]),
                 self.joints[k],
@@ -217,7 +217,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
     position = _block(columns, POSITION, placed)
     oriented, rotation = _turned(columns, _block(columns, QUATERNION, False), placed)
     signs = _block(columns, joint_columns(joints, 's'), False, LARGEST_RATE)
-    split = choices(columns, 'split', SPLITS, 'train or test')
+    split = _choices(columns, 'split', SPLITS, 'train or test')
     ones = np.ones(count, dtype=np.int64)
     return Measurements(
         columns.path,
@@ -238,7 +238,7 @@ def measurements(columns: Columns, joints: int) -> Measurements:
         columns.labels('target'),
         columns.labels('frame_id', frame_name),
         columns.labels('view'),
-        choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
+        _choices(columns, 'eye_in_hand', FLAGS, '0 or 1').astype(bool),
         split == 'test',
         split == 'removed',
         _one(columns, 'delay'),
@@ -285,7 +285,7 @@ def _check_header(columns: Columns, joints: int) -> None:
         )
 
 
-def choices(
+def _choices(
     columns: Columns, name: str, known: Mapping[str, object], what: str
 ) -> NDArray[np.generic]:
     """Return the meaning of the cells (N,) of a column with known values."""

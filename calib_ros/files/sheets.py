@@ -120,9 +120,9 @@ def _sheet(
     whole = list[Cells]()
     while (not whole or whole[-1][0] < HEAD_LINES) and (block := next(rows, None)) is not None:
         whole += block
-    # a workbook comes as one block
-    looked = [row for row in whole if row[0] <= HEAD_LINES or content.title]
-    head = [(line, [' '.join(cell.split()) for cell in cells]) for line, cells in looked]
+    head = whole  # all rows of a workbook
+    if not content.title:
+        head = [(n, [' '.join(c.split()) for c in cells]) for n, cells in whole if n <= HEAD_LINES]
     if not head:
         raise InputError(f'{path} has no rows')
     at, header = _header(path, head, names, known)
