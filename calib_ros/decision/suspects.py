@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, product
 from typing import TypeAlias
 
@@ -23,6 +24,7 @@ from calib_ros.shown import counted
 
 Sets: TypeAlias = tuple[Observations, ...]
 DataChange: TypeAlias = Callable[[Observations], Observations]
+Rescaled: TypeAlias = Callable[[float], DataChange]
 QUARTERS = {'+90': 0.5 * np.pi, '-90': -0.5 * np.pi, '+180': np.pi}
 """Zeros of joints [rad] that differ between conventions."""
 MIXED_UP_UNITS = (
@@ -99,6 +101,7 @@ def _of_places(chain: Chain) -> Iterator[Suspect]:
         what = f'the joint values are in {one}, not {other}'
         change = _of_kind(chain, 'revolute', size)
         yield Suspect(what, f'--joint-angle {unit}', (change,), part='measured')
+    yield from _of_lengths('linear joints', _linear(chain), partial(_of_kind, chain, 'prismatic'))
     yield from _of_joints(chain)
     yield from _of_one_unit(chain)
     yield from _of_arms(chain)
@@ -133,26 +136,31 @@ def _in_sources(on_flange: bool) -> str:
 
 def _units(chain: Chain) -> Iterator[Suspect]:
     """Yield units of lengths, and of angles at the same time."""
-    linear = [f'q{k}' for k, joint in enumerate(chain.joints, 1) if joint.type == 'prismatic']
-    whole = 'positions and linear joints' if linear else 'positions'
+    whole = 'positions and linear joints' if _linear(chain) else 'positions'
     degrees = _of_kind(chain, 'revolute', np.radians(1.0))
     for unit, size in SCALES.items():
         for way, option, factor in (
             (f'in {unit}, not metres', f'--length {unit}', size),
             (f'in metres, not {unit}', '--length m', 1.0 / size),
         ):
-            positions, travels = lengths = _lengths(chain, factor)
-            what = f'the {whole} are {way}'
+            what, lengths = f'the {whole} are {way}', _lengths(chain, factor)
             yield Suspect(what, option, lengths)
             both = f'{what} and the joint values in degrees'
             yield Suspect(both, f'{option} --joint-angle deg', (*lengths, degrees), 2)
-            if linear:
-                for name, columns, change in (
-                    ('positions', 'xyz', positions),
-                    ('linear joints', linear, travels),
-                ):
-                    option = ','.join(f'{each}={each}*{factor:g}' for each in columns)
-                    yield Suspect(f'the {name} are {way}', f'--columns {option}', (change,), 2)
+    if _linear(chain):
+        yield from _of_lengths('positions', 'xyz', _scaled)
+
+
+def _linear(chain: Chain) -> list[str]:
+    return [f'q{k}' for k, joint in enumerate(chain.joints, 1) if joint.type == 'prismatic']
+
+
+def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[Suspect]:
+    """Yield units of some lengths alone."""
+    for unit, size in SCALES.items() if columns else ():
+        for way, factor in ((f'{unit}, not metres', size), (f'metres, not {unit}', 1.0 / size)):
+            option = '--columns ' + ','.join(f'{each}={each}*{factor:g}' for each in columns)
+            yield Suspect(f'the {key} are in {way}', option, (change(factor),), 2, part='measured')
 
 
 def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:

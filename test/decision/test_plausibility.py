@@ -373,6 +373,16 @@ def test_backlash_is_not_taken_for_a_lag(size):
     assert identify(Problem(UR, replace(seen, approach=approach), effects=('backlash',))).accepted
 
 
+def test_linear_joints_in_millimetres_are_named_of_images_as_well():
+    rng, camera, rail = np.random.default_rng(3), Camera(), load_chain('ur10e_on_linear_axis')
+    true = before_camera(rail, camera, POINTS, True, rng)
+    seen = photograph(true, camera, POINTS, True, 25, rng)
+    sizes = [1e3 if joint.type == 'prismatic' else 1.0 for joint in rail.joints]
+    chain = rail.with_frame('tool', Frame(lens=camera.lens))
+    result = identify(Problem(chain, replace(seen, joints=seen.joints * sizes)))
+    assert 'the linear joints are in mm, not metres: correct it in --places' in result.refusals[0]
+
+
 @pytest.mark.parametrize('on_flange', [True, False])
 @pytest.mark.parametrize('size', [0.97, 1.004, 1.03])
 def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size):
