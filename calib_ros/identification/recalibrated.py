@@ -123,7 +123,13 @@ class Recalibration(Shown):
             why = f'something moved while the new poses were measured: {self.step}'
             return why, 'measure again, or give only the poses from there on'
         if self.unexplained <= changes.FALSE:
-            return 'no change of a few parameters explains the new poses', 'identify again'
+            step = 'identify again'
+            if self.before.rms_mm > 1e3 * Settings.largest_error:
+                step = (
+                    'if the device or the target was moved, give --new-base or --new-tool; check '
+                    f'units, columns and rows of the measurements; else {step}'
+                )
+            return 'no change of a few parameters explains the new poses', step
         if not self.determined:
             what = 'what has changed' if self.changed else 'where the new frames are'
             step = 'measure more poses, all over the joint range'

@@ -167,6 +167,15 @@ def test_too_few_poses_for_a_new_frame_are_refused(earlier):
         recalibrate(previous, few, 0.1, new=new)
 
 
+def test_a_device_that_stands_far_away_asks_for_its_new_frame(earlier):
+    """The remedy was to identify again."""
+    true, previous, oriented = earlier
+    there = replace(true, base=random_frame(np.random.default_rng(1), 2.0))
+    why, step = recalibrate(previous, seen(there, 8, 1, oriented), 0.1).refusal()
+    assert why == 'no change of a few parameters explains the new poses'
+    assert step.startswith('if the device or the target was moved, give --new-base or --new-tool')
+
+
 @pytest.mark.parametrize('new', [('base',), ('tool',), ('base', 'tool')])
 def test_new_frames_that_fit_their_poses_exactly_confirm_nothing(earlier, new):
     """One pose places a frame, three positions both, whatever the arm: none is left to judge."""
