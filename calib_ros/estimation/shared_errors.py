@@ -343,45 +343,41 @@ def _successive(
     kernels: Mapping[int, Sequence[tuple[float, float]]],
 ) -> dict[int, FloatArray]:
     """Return by part J^T K J of errors fading in succession, for (length, size) each."""
-    size = len(names)
-    found = {part: np.zeros((size, size)) for part in kernels}
+    found = {part: np.zeros((len(names), len(names))) for part in kernels}
     for samples in system.sets if kernels else ():
-        ends: dict[int, tuple[int, FloatArray]] = {}
+        past, last = dict[int, FloatArray](), 0
         for numbers, sums in samples.sums(chain, names, samples.observations.stops):
             for part in kernels.keys() & range(len(sums)):
-                rows = sums[part][:-1].reshape(-1, len(numbers))
-                none = numbers[0], np.zeros((len(rows), len(kernels[part])))
-                ends[part] = _fading(
-                    found[part], rows, numbers, kernels[part], ends.get(part, none)
-                )
+                rows, own = sums[part][:-1], kernels[part]
+                products, past[part] = _fading(rows, numbers - last, own, past.get(part))
+                found[part] += products
+            last = int(numbers[-1])
     return found
 
 
 def _fading(
-    found: FloatArray,
     rows: FloatArray,
     time: Index,
     kernels: Sequence[tuple[float, float]],
-    end: tuple[int, FloatArray],
-) -> tuple[int, FloatArray]:
-    """Add J^T K J of rows (P c, n) of stops at times (n,) to `found` (P, P); return the new end.
+    before: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return J^T K J of rows (P, c, n) of stops at times (n,), and their faded sums (P c, K).
 
     Runs of stops are multiplied with a root of the sum of K kernels, and with what is left of all
-    stops before: their faded sums (P c, K) at the `end`, after a time.
+    stops before: their sums, `before` those at time zero.
     """
     lengths, sizes = np.transpose(kernels)
-    last, before = end
-    turned, here, past = np.empty_like(rows), [], []
+    flat, last = rows.reshape(-1, len(time)), 0
+    past = [np.zeros((len(flat), len(sizes))) if before is None else before]
+    turned, here = np.empty_like(flat), []
     for first in range(0, len(time), SOME_POSES // 4):
         run = np.s_[first : first + SOME_POSES // 4]
-        then, own = time[run, np.newaxis], rows[:, run]
+        then, own = time[run, np.newaxis], flat[:, run]
         fade = np.exp(-np.abs(then - time[run])[..., np.newaxis] / lengths)
         turned[:, run] = own @ np.linalg.cholesky(fade @ sizes)
         here.append(own @ (np.exp((last - then) / lengths) * sizes))
-        past.append(before)
-        before = before * np.exp((last - then[-1]) / lengths) + own @ fade[-1]
+        past.append(past[-1] * np.exp((last - then[-1]) / lengths) + own @ fade[-1])
         last = int(then[-1, 0])
-    one, other = (np.concatenate(each, axis=1).reshape(len(found), -1) for each in (here, past))
+    one, other = (np.concatenate(x, axis=1).reshape(len(rows), -1) for x in (here, past[:-1]))
     cross = one @ other.T
-    found += gram(turned.reshape(len(found), -1)) + cross + cross.T
-    return last, before
+    return gram(turned.reshape(len(rows), -1)) + cross + cross.T, past[-1]
