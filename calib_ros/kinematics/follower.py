@@ -37,7 +37,6 @@ from calib_ros.kinematics.newton import Minimum, NormalBatch, minimise_batch
 from calib_ros.kinematics.se3 import (
     HALF_THE_DIGITS,
     ROUNDING,
-    ROUNDS,
     Flags,
     FloatArray,
     Index,
@@ -203,7 +202,7 @@ class Follower:
             return NormalBatch(np.einsum('ikb,jkb->ijb', columns, columns) + soft, slope, cost)
 
         fall, longest = (ROUNDING, np.inf) if settle else (0.0, 1.0)
-        return minimise_batch(linearise, task.start, fall=fall, longest=longest, rounds=ROUNDS)
+        return minimise_batch(linearise, task.start, fall=fall, longest=longest)
 
     def _linearise(
         self, task: _Task, x: FloatArray, weight: float
