@@ -81,7 +81,7 @@ class Alike:
         strings, stamp, begin, kind, width = self.layout.items[k]
         times = _numbers(self.rows, stamp, '<i4', 2)  # seconds, and nanoseconds without sign
         stamps = times[:, 0].astype(np.int64) * 1_000_000_000 + times.view('<u4')[:, 1]
-        numbers = _numbers(self.rows, begin, kind, width).astype(float, copy=False)
+        numbers = _numbers(self.rows, begin, kind, width).astype(float)  # a copy
         return Readings(stamps, strings, numbers)
 
 

@@ -32,6 +32,7 @@ def decode(kind, blobs):
 def assert_decoded(kind, blobs):
     """At once as one by one."""
     found = decode(kind, blobs)
+    assert found.numbers.flags.writeable
     for k, blob in enumerate(blobs):
         ((stamp_ns, strings, numbers),) = readings_of(kind, TYPESTORE.deserialize_cdr(blob, kind))
         assert (stamp_ns, strings) == (found.stamps_ns[k], found.strings)
