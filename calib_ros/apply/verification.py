@@ -189,7 +189,7 @@ def verify(
         freedom=float(freedom[0]),
         verdict=STANDS.get(verdict, verdict) if tolerance is None else verdict,
         needed=needed,
-        common=left / rms if left and not new_base else 1.0,
+        common=1.0 if new_base or np.isinf(left) else left / rms,
         by_program=commanded is not None,
         fitted=fitted,
         reused=reused,
@@ -209,8 +209,8 @@ def _compared(
 ) -> tuple[Comparison, float, bool]:
     """Return the residuals, and their RMS [m] over configurations (N,) without a common motion.
 
-    The latter is 0 for pixels, which have no positions. And whether all were measured at the
-    commanded joint values, not at corrected ones.
+    The latter is infinite for pixels, which have no positions. And whether all were measured at
+    the commanded joint values, not at corrected ones.
     """
     before, after = arm.before, arm.chain
     wanted, uncorrected = sets, False
@@ -225,7 +225,7 @@ def _compared(
         uncorrected = not any(corrected.any() for _, corrected in found)
     before, after = _in_new_frames(before, sets, fitted), _in_new_frames(after, wanted, fitted)
     reached = compare(before, after, wanted).after
-    left = 0.0
+    left = np.inf
     if all(each.pixels is None for each in sets):
         shaped = compare(before, _rebased(after, wanted), wanted).after
         left = _rms(moments_of(shaped.position, group), IN_A_FRAME // 3)
