@@ -31,7 +31,7 @@ class JointNames:
 
     def __init__(self, names: Sequence[str], held: Mapping[int, float] | None = None) -> None:
         self._names, self.held = names, held or {}
-        self._heard: dict[str, tuple[float, float]] = {}  # lowest and highest value by name
+        self._heard: dict[str, tuple[float, float]] = {}  # lowest and highest value of others
 
     def layout(self, key: Sequence[str]) -> tuple[JointIndices, Index, str]:
         """Return the joints of the chain in messages, the columns of their values, and any fault.
@@ -45,13 +45,18 @@ class JointNames:
         known = dict(sorted((dict.fromkeys(self.held, NOWHERE) | known).items()))
         return tuple(known), np.array([*known.values()], dtype=np.intp), fault
 
-    def hear(self, names: Sequence[str], values: FloatArray) -> None:
-        """Note the names and values (N, len(names)) of joint states, but of too many others."""
-        lows, highs = np.fmin.reduce(values).tolist(), np.fmax.reduce(values).tolist()
-        for name, low, high in zip(names, lows, highs, strict=True):
-            if name in self._heard or name in self._names or len(self._heard) < MOST_NAMES:
-                before = self._heard.get(name, (np.inf, -np.inf))
-                self._heard[name] = min(before[0], low), max(before[1], high)
+    def hear(self, names: Sequence[str], numbers: FloatArray) -> None:
+        """Note the names of joint states, and values (N, len(names)) of others than the chain's.
+
+        Beyond MOST_NAMES others are not noted.
+        """
+        for name, values in zip(names, numbers.T, strict=True):
+            low, high = self._heard.get(name, (np.inf, -np.inf))
+            if name in self._names:
+                self._heard[name] = low, high
+            elif name in self._heard or len(self._heard) < MOST_NAMES:
+                ends = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))
+                self._heard[name] = min(low, ends[0]), max(high, ends[1])
 
     @property
     def never(self) -> tuple[str, ...]:
