@@ -29,10 +29,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
-from calib_ros.decision.acceptance import out_of_scale
+from calib_ros.decision.acceptance import out_of_scale, percent
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.printed_board import stretched
 from calib_ros.decision.reasons import Reason, Rule
@@ -42,7 +43,16 @@ from calib_ros.decision.steps import EXPLAINED
 from calib_ros.errors import CalibrationError, InputError
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
-from calib_ros.estimation.levels import ALIKE, CLEARLY, NEARER, SURE, TELLING, chance_of
+from calib_ros.estimation.levels import (
+    ALIKE,
+    CLEARLY,
+    CONFIDENT,
+    NEARER,
+    PRINTED,
+    SURE,
+    TELLING,
+    chance_of,
+)
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.sizes import TYPICAL
@@ -72,11 +82,11 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     `another` is false if a mistake is already named, which comes first.
     """
     if any(each.socket or each.plane for each in problem.sets):  # shows only the scale of a bar
-        refused = _scale(result) if problem.separations else []
+        refused = _scale(problem, result) if problem.separations else []
         return replace(result, refusals=(*result.refusals, *refused))
     lens, imitated = _lens(problem, result) if another else ('', False)
     board = '' if lens else stretched(problem, result)
-    sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(result)]
+    sigmas, refusals = _sigmas(problem, result), [*result.refusals, *_scale(problem, result)]
     if board and all(each.pixels is not None for each in problem.sets):
         refusals.insert(0, Reason(Rule.SCALE, board))
         board = ''
@@ -96,11 +106,29 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
     return _lag(problem, replace(result, remarks=remarks, refusals=tuple(refusals)))
 
 
-def _scale(result: Identification) -> Iterator[Reason]:
-    """Yield that harm by a device out of scale is too likely, if nothing else refuses."""
-    region = result.region
-    if not result.refusals and region and region.by_scale >= HARMFUL:
-        yield Reason(Rule.SCALE, out_of_scale(result.posterior.scale))
+def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
+    """Yield that a device out of scale does harm or is too likely to, if nothing else refuses.
+
+    Also if its scale was checked, but all lengths grew alike, and by more than a print may be off.
+    """
+    region, found = result.region, result.posterior
+    if result.refusals:
+        return
+    if region and region.by_scale >= HARMFUL:
+        yield Reason(Rule.SCALE, out_of_scale(found.scale))
+    if not problem.sigma_scale:
+        return
+    own = [Parameter(name).of_dh and Parameter(name).is_length for name in found.names]
+    grown = (found.offsets + found.shift)[own]
+    lengths = np.array([problem.model.value(name) for name in compress(found.names, own)])
+    scale = float(grown @ lengths) / max(float(lengths @ lengths), 1e-300)
+    if abs(scale) > PRINTED and scale * float(grown @ lengths) > CONFIDENT * float(grown @ grown):
+        text = (
+            f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by '
+            f'{percent(abs(scale))} %, more than sigma_scale allows: measure a known length, or '
+            'the printed board, again'
+        )
+        yield Reason(Rule.SCALE, text)
 
 
 def _apart(chain: Chain, found: Chain, joints: FloatArray) -> float:

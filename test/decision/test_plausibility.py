@@ -1,6 +1,5 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,13 +8,13 @@ import pytest
 from fits import SIGMAS, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
-from calib_ros.apply.simulation import Camera, Cell, before_camera, faulty, measure, photograph
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.plausibility import _motion
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.kinematics import effects
-from calib_ros.kinematics.chain import Frame, Joint
+from calib_ros.kinematics.chain import Joint
 
 UR = load_chain('ur10e')
 NOT_OF_ONE_ARM = 'one arm does not fit all sessions'
@@ -98,21 +97,6 @@ def test_a_session_that_cannot_be_fitted_alone_is_of_the_same_arm():
     result = identify(replace(problem, sigma_position=1e-5, sigma_orientation=4e-5))
     assert not result.noise.consistent
     assert result.refusals == ()
-
-
-@pytest.mark.parametrize('seed', [0, 1])
-def test_images_of_two_robots_are_not_averaged(seed):
-    """Of 80 images a few points each, alone, would not fit."""
-    rng, camera = np.random.default_rng(3), Camera()
-    first, second = (
-        photograph(before_camera(arm(k), camera, POINTS, False, rng), camera, POINTS, False, *many)
-        for k, many in ((0, (80, rng, 0.1)), (seed, (80, rng, 0.1)))
-    )
-    second = replace(second, base='base_B', tool='tool_B')
-    chain = UR.with_frame('base', Frame(lens=camera.lens))
-    chain = chain.with_frame('base_B', Frame(lens=camera.lens))
-    result = identify(Problem(chain, first, more=[second], sigma_pixel=0.1))
-    assert any(NOT_OF_ONE_ARM in each for each in result.refusals) == (seed != 0)
 
 
 def test_the_share_explained_is_that_of_least_squares():
@@ -265,66 +249,6 @@ def test_a_scale_that_leaves_no_region_is_the_reason(scale):
     assert identify(replace(problem, sigma_scale=1e-4)).accepted
 
 
-POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
-
-
-@pytest.mark.parametrize('on_flange', [True, False])
-@pytest.mark.parametrize('errors', [0.0, 0.5])
-def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, errors):
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3, errors), camera, POINTS, on_flange, rng)
-    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
-    off = camera.lens.moved({'fx': 13.5, 'fy': 13.5, 'cx': 8.0, 'cy': -6.0})
-    near = camera.lens.moved({'fx': 4.0, 'fy': 4.0, 'cx': 3.0, 'cy': -2.0})
-    told = {'--lens fitted': False, 'lens=fitted in sources': True}
-    for lens in (camera.lens, near, off, replace(off, fixed=False)):
-        chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=lens))
-        for words, of_messages in told.items():
-            result = identify(Problem(chain, seen, sigma_pixel=0.1, of_messages=of_messages))
-            refused, remarked = (
-                [str(each) for each in said if words in str(each)]
-                for said in (result.refusals[:1], result.remarks)
-            )
-            harmful = lens is off or (lens is near and errors == 0.0)
-            assert bool(refused) == harmful
-            assert bool(remarked) == (lens is near and errors > 0.0)
-            assert result.accepted == (errors > 0.0 and not harmful)
-
-
-def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little():
-    """An arm follows so much of a wrong lens that less than half is left for other intrinsics."""
-    rng, camera = np.random.default_rng(5), Camera()
-    true = before_camera(arm(5, 0.2), camera, POINTS, False, rng)
-    seen = photograph(true, camera, POINTS, False, 25, rng, 0.1)
-    off = camera.lens.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 3.0))
-    for lens, refused in ((camera.lens, False), (off, True)):
-        chain = UR.with_frame('base', Frame(lens=lens))
-        result = identify(Problem(chain, seen, sigma_pixel=0.1))
-        assert result.accepted == (not refused)
-        assert any('--lens fitted' in each for each in result.refusals) == refused
-
-
-@pytest.mark.parametrize('on_flange', [True, False])
-def test_a_board_that_is_stretched_is_refused(on_flange):
-    """Printed 0.3 % wider it left 1.5 mm of 2.2 mm, where 0.24 mm were expected."""
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
-    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
-    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
-    for stated, said in (
-        ([1.0, 1.0, 1.0], ''),
-        ([1.005, 1.005, 1.0], ''),
-        ([1.005, 1.0, 1.0], 'narrower'),
-        ([1.0, 1.005, 1.0], 'wider'),
-    ):
-        for sigma in (0.0, 1e-3):  # one scale does not make both sides right
-            stretched = replace(seen, points=seen.points * stated)
-            refusals = identify(Problem(chain, stretched, sigma_scale=sigma)).refusals
-            told = [each for each in refusals if 'for its height than stated' in each]
-            assert bool(told) == bool(said)
-            assert all(re.match(rf'the board is 0\.[345]\d? % {said}', each) for each in told)
-
-
 @pytest.mark.parametrize(('count', 'named'), [(30, 0), (200, 100)])
 def test_few_samples_show_no_errors_of_time(count, named):
     """Of 30 the fastest third is 1.5 times worse by chance in some sessions."""
@@ -371,30 +295,3 @@ def test_backlash_is_not_taken_for_a_lag(size):
     (told,) = result.remarks
     assert told.startswith('the joints have play, which explains 100 %')
     assert identify(Problem(UR, replace(seen, approach=approach), effects=('backlash',))).accepted
-
-
-def test_linear_joints_in_millimetres_are_named_of_images_as_well():
-    rng, camera, rail = np.random.default_rng(3), Camera(), load_chain('ur10e_on_linear_axis')
-    true = before_camera(rail, camera, POINTS, True, rng)
-    seen = photograph(true, camera, POINTS, True, 25, rng)
-    sizes = [1e3 if joint.type == 'prismatic' else 1.0 for joint in rail.joints]
-    chain = rail.with_frame('tool', Frame(lens=camera.lens))
-    result = identify(Problem(chain, replace(seen, joints=seen.joints * sizes)))
-    assert 'the linear joints are in mm, not metres: correct it in --places' in result.refusals[0]
-
-
-@pytest.mark.parametrize('on_flange', [True, False])
-@pytest.mark.parametrize('size', [0.97, 1.004, 1.03])
-def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size):
-    """More poses, which were asked for, do not make a board known."""
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
-    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
-    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
-    seen = replace(seen, points=seen.points * size)
-    (refusal,) = identify(Problem(chain, seen, sigma_pixel=0.1)).refusals
-    assert refusal.rule is Rule.SCALE
-    found = re.search(r'(grow|shrink) alike, by (\S+) %, as if the board', refusal)
-    assert found
-    grown = {'grow': 1.0, 'shrink': -1.0}[found[1]] * float(found[2])
-    assert grown == pytest.approx(100.0 * (size - 1.0), abs=0.15)
