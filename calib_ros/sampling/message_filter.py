@@ -34,7 +34,7 @@ class JointNames:
         self._heard: dict[str, tuple[float, float]] = {}  # lowest and highest value of others
 
     def layout(self, key: Sequence[str]) -> tuple[JointIndices, Index, str]:
-        """Return the joints of the chain in messages, the columns of their values, and any fault.
+        """Return the joints of the chain in messages, the columns (K,) of them, and any fault.
 
         Of held joints that are not named the column is NOWHERE.
         """
@@ -46,7 +46,7 @@ class JointNames:
         return tuple(known), np.array([*known.values()], dtype=np.intp), fault
 
     def hear(self, names: Sequence[str], numbers: FloatArray) -> None:
-        """Note the names of joint states, and values (N, len(names)) of others than the chain's.
+        """Note the k names of joint states, and values (N, k) of others than the chain's.
 
         Beyond MOST_NAMES others are not noted.
         """
