@@ -34,7 +34,7 @@ from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter
-from calib_ros.kinematics.se3 import FloatArray
+from calib_ros.kinematics.se3 import ROUNDING, FloatArray
 from calib_ros.shown import Shown
 
 Mixed: TypeAlias = tuple[float, FloatArray, FloatArray]
@@ -139,6 +139,7 @@ def posterior_of(
     fit, and noise of size `noise` [sigma given]. `rounding` are standard deviations of parameters
     that rounded joint values move too. Plausible sizes and the device only count if `judging`.
     """
+    noise = max(noise, ROUNDING)  # parameters that follow all exactly leave none
     problem, names, system = fitted.problem, fitted.names, fitted.system
     nominal, every = problem.model, (*names, *more)
     arm = np.s_[: len(every)]  # all columns but the scale of the device

@@ -1,6 +1,7 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -212,7 +213,8 @@ def test_what_a_redundant_arm_reaches_within_its_limits_is_not_refused(name):
 
 
 def test_a_sample_that_does_not_converge_is_refused(monkeypatch):
-    monkeypatch.setattr(follower, 'ROUNDS', 1)
+    once = partial(follower.minimise_batch, rounds=1)
+    monkeypatch.setattr(follower, 'minimise_batch', once)
     tolerant = Compensator(UR, UR_TRUE, largest_position_error=1.0, largest_orientation_error=1.0)
     result = compensate(tolerant, regular(UR, 3))
     assert not result.converged.any()
