@@ -35,6 +35,11 @@ def rounded(value: float) -> str:
     return f'{value:.{max(3, digits)}f}'
 
 
+def sentence(text: str) -> str:
+    """Return a text with its capital letter and full stop; a question keeps its mark."""
+    return f'{text[0].upper()}{text[1:]}{"" if text.endswith("?") else "."}'
+
+
 def counted(count: int, what: str) -> str:
     """Return a number of things: 1 pose, 2 poses."""
     return f'{count} {what}{"s" * (count != 1)}'

@@ -24,7 +24,14 @@ from calib_ros.progress import share_of
 from calib_ros.report.documents import verification_document
 from calib_ros.report.page import markdown
 from calib_ros.report.poses import poses_to_verify
-from calib_ros.report.verdicts import each_in_words, likely, remarks, standing, verification_report
+from calib_ros.report.verdicts import (
+    each_in_words,
+    likely,
+    not_steps,
+    remarks,
+    standing,
+    verification_report,
+)
 from calib_ros.report.words import change
 from calib_ros.sampling.dataset import dataset_of
 from calib_ros.shown import rounded
@@ -84,11 +91,14 @@ def _verified(options: argparse.Namespace, screen: Screen, contents: common.Cont
 def show(found: Verification, screen: Screen) -> None:
     """Print a verdict, six rows, the poses if few, and what to do."""
     before, after = found.comparison.figures
-    tolerance = 'none given (--tolerance MM)'
+    tolerance = limit = ''
     if found.tolerance is not None:
         tolerance = f'RMS {1e3 * found.tolerance:g} mm'
-    elif found.limit is not None:
-        tolerance += f': {rounded(1e3 * found.limit)} mm, at most {ALIKE:g} x expected error'
+    elif found.limit is None:
+        tolerance = 'none given (--tolerance MM)'
+    else:
+        limit = f'RMS {rounded(1e3 * found.limit)} mm: at most {ALIKE:g} times the expected error'
+        limit += ' (--tolerance MM: your own)'
     state, steps = standing(found)
     screen.title(state.heading, GOOD_OR_BAD.get(state.state))
     screen.table(
@@ -99,12 +109,14 @@ def show(found: Verification, screen: Screen) -> None:
             'orientation error': change((before, after), 'mrad') or 'not measured',
             'poses like these': f'RMS {likely(found)}',
             'tolerance': tolerance,
+            'limit': limit,
         }
     )
     if found.each:
         screen.say('\n'.join(['position error [mm] by pose', *each_in_words(found)]))
-    screen.reasons += remarks(found)
-    for remark in remarks(found):
+    said = not_steps(remarks(found), steps)
+    screen.reasons += said
+    for remark in said:
         screen.bullet(remark)
     if state.state in ('bad', 'open'):
         screen.bullet('what to do:', steps)

@@ -27,7 +27,7 @@ from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.settings import Settings
-from calib_ros.shown import some
+from calib_ros.shown import sentence, some
 
 NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
@@ -125,8 +125,7 @@ def _text(
 
 def doubts(result: Identification) -> tuple[str, ...]:
     """Return the checks to make before using an accepted result."""
-    ends = ((each, '' if each.endswith('?') else '.') for each in result.remarks)
-    return tuple(f'Check before you use it: {each}{end}' for each, end in ends)
+    return tuple(sentence(f'Check before you use it: {each}') for each in result.remarks)
 
 
 def _within(judged: Comparison, tolerance: float | None) -> str:
@@ -181,7 +180,7 @@ def _steps(
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': beyond,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,
-        f'{BRING[0].upper()}{BRING[1:]}.': True,
+        sentence(BRING): True,
         'Then measure at least five new poses (calib_ros plan --iso9283) and judge the corrected '
         'arm: calib_ros verify.': True,
         'To use it beyond the measured poses, measure there too: calib_ros compensate refuses '

@@ -22,12 +22,13 @@ from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
-from calib_ros.shown import rounded, some
+from calib_ros.shown import rounded, sentence, some
 
 SOMETHING_MOVED = (
     'Check that measuring device, target and robot have not moved since the calibration; if one '
     'has, use --new-base or --new-tool.'
 )
+ACTIVE = 'Check that the correction is active in the controller.'
 COMPUTED = (
     '"Before" is not measured but computed: the nominal arm in its best frames, at the same '
     'joint values.'
@@ -42,7 +43,7 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
         Headline('bad', 'FAIL: the arm exceeds the tolerance'),
         (
             SOMETHING_MOVED,
-            'Check that the correction is active in the controller (--commanded shows it).',
+            ACTIVE,
             'Calibrate again with new poses; try --model auto.',
         ),
     ),
@@ -82,6 +83,9 @@ def standing(found: Verification) -> tuple[Headline, tuple[str, ...]]:
     state, steps = STANDINGS[found.verdict]
     if not found.by_program:  # nor whether the correction reaches the arm
         state = replace(state, heading=state.heading.replace('the arm', 'the calibration'))
+        steps = tuple(each for each in steps if each != ACTIVE)
+    if state.state in ('bad', 'open') and (why := causes(found)):
+        steps = tuple(map(sentence, why))
     return state, steps
 
 
@@ -125,29 +129,43 @@ def caveats(found: Verification) -> list[str]:
 
 def remarks(found: Verification) -> list[str]:
     """Return remarks on the figures, and what to do."""
-    return [*caveats(found), *hints(found)]
+    return [*caveats(found), *hints(found), *causes(found)]
+
+
+def not_steps(lines: Sequence[str], steps: Sequence[str]) -> list[str]:
+    """Return the remarks that are not among the steps."""
+    return [each for each in lines if sentence(each) not in steps]
 
 
 def hints(found: Verification) -> list[str]:
-    """Return what was refitted, and possible causes of the error."""
+    """Return what was refitted, and what else the figures tell."""
     lines = []
     if found.fitted:
         lines.append(f'{" and ".join(found.fitted)} refitted, before and after alike')
     if found.verdict == 'UNDECIDED':
         enough = f'about {found.needed}' if found.needed else f'not even {DECIDING}'
         lines.append(f'{enough} poses with the same RMS error would decide')
+    before, rms = (each.rms_mm for each in found.comparison.figures)
+    if rms > before and not (found.mistake or found.uncorrected or causes(found)):
+        lines.append('the nominal arm would be nearer: is the calibration that of this robot?')
+    return lines
+
+
+def causes(found: Verification) -> list[str]:
+    """Return what explains the error, each with what to do about it; empty if nothing does."""
+    lines = []
+    if found.mistake:
+        return lines
     if found.uncorrected and found.verdict in ('FAIL', 'does not hold'):
         lines.append(
             'the arm stood at the joint values of --commanded themselves: either the correction '
             'is not active, or this is the corrected program: give the program as it was before '
             'calib_ros compensate'
         )
-    before, rms = (1e-3 * each.rms_mm for each in found.comparison.figures)
-    if found.mistake:
-        return lines
+    rms, common = 1e-3 * found.comparison.figures[1].rms_mm, 100.0 * found.common
     if found.step or found.odd:
-        moved = [f'something moved while you measured: {found.step}'] if found.step else []
-        lines += moved + ([_apart(found)] if found.odd else [])
+        lines += [f'something moved while you measured: {found.step}'] if found.step else []
+        lines.append(_apart(found) if found.odd else 'put right what moved, and measure again')
     elif (found.common if found.common < NEARER else 1.0) * rms > Settings.largest_error:
         lines.append(
             'no arm is so far off: check units and columns of the measurements (--length, '
@@ -156,12 +174,10 @@ def hints(found: Verification) -> list[str]:
         )
     elif found.common < NEARER:
         lines.append(
-            'one common shift and turn of all positions explains the error, except '
-            f'{100.0 * found.common:.2g} % of it: was the measuring device moved? If on purpose, '
-            'give --new-base, and --new-tool for a new target'
+            f'one common shift and turn of all positions explains all but {common:.2g} % of the '
+            'error: was the measuring device moved? If so, verify again with --new-base (and '
+            '--new-tool for a new target); if not, find out what moved'
         )
-    elif rms > before and not found.uncorrected:
-        lines.append('the nominal arm would be nearer: is the calibration that of this robot?')
     return lines
 
 
@@ -175,8 +191,9 @@ def _apart(found: Verification) -> str:
         names = f'poses {first} to {last} alone are up to'
     far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
-        f'{names} {rounded(far)} mm off; the others are within the limit: measure again, or find '
-        'what moved, was changed or was hit; an arm may also be worse in a part of its range'
+        f'{names} {rounded(far)} mm off; the others are within the limit: measure again; if the '
+        'error stays, find what moved, was changed or was hit; an arm may also be worse in a part '
+        'of its range'
     )
 
 
@@ -199,7 +216,7 @@ def verification_report(
             f'{what}: {size} mm. If the whole interval is within it: '
             f'{good}; beyond it: {bad}; else UNDECIDED.'
         )
-    text += (f'{each[0].upper()}{each[1:]}.' for each in caveats(found))
+    text += map(sentence, caveats(found))
     state, steps = standing(found)
     gain = sections.gain(found.comparison, intervals=False)
     different = 'Different poses', f'{found.configurations:,}'
@@ -217,7 +234,7 @@ def verification_report(
         ),
         picture=sections.distribution(poses),
         steps=steps,
-        remarks=(*warnings, *hints(found)),
+        remarks=(*warnings, *not_steps(hints(found) + causes(found), steps)),
         identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(

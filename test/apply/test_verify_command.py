@@ -206,6 +206,28 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
             assert words in told
 
 
+def test_a_named_cause_is_the_next_step_and_said_once(cell, arm):
+    """A gross error or a moved device asks for no new calibration."""
+    seen = measured(cell[0], UR.random_joints(20, np.random.default_rng(3)), 1)
+    gross = seen.positions + 0.03 * (np.arange(20)[:, np.newaxis] == 7)
+    turned = measured(cell[0].with_offsets({'elbow_joint.theta': 0.003}), seen.joints[::3], 3)
+    for changed, first in (
+        (replace(seen, positions=gross), 'Pose 8 alone is'),
+        (replace(seen, positions=seen.positions + 0.003), 'One common shift and turn'),
+        (turned, 'Check that measuring device'),
+    ):
+        found = verify(arm, [changed], 2e-4)
+        state, steps = standing(found)
+        assert (state.state, steps[0].startswith(first)) == ('bad', True), steps
+        named = changed is not turned
+        assert any('Calibrate again' in each for each in steps) is not named
+        assert not any('active' in each for each in steps)  # it plays no part
+        page = verification_report(
+            arm.chain, found, poses_to_verify(arm.chain, [changed], found.comparison), Origin()
+        )
+        assert (page.steps, page.remarks) == (steps, ())
+
+
 def test_with_quiet_a_bad_verdict_tells_its_reasons(cell, folder, run):
     seen = measured(cell[0], UR.random_joints(10, np.random.default_rng(3)), 1)
     write_csv(folder / 'measured.csv', rows_of(seen, 0))
