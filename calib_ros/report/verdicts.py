@@ -153,7 +153,7 @@ def hints(found: Verification) -> list[str]:
 
 def causes(found: Verification) -> list[str]:
     """Return what explains the error, each with what to do about it; empty if nothing does."""
-    lines = []
+    lines: list[str] = []
     if found.mistake:
         return lines
     if found.uncorrected and found.verdict in ('FAIL', 'does not hold'):
