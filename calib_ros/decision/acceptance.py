@@ -82,7 +82,7 @@ def _of_the_fit(
     limits = (problem.largest_length, problem.largest_angle)
     if beyond := [p for p in result.parameters if p.beyond(*limits)]:
         far = some([f'{p.name} by {1e3 * p.offset:.0f} m{p.name.unit}' for p in beyond])
-        text = f'{", ".join(far)} off, more than even a faulty robot of this kind'
+        text = f'off by more than even a faulty robot of this kind: {", ".join(far)}'
         yield Reason(Rule.COMMON_SENSE, text)
 
 
