@@ -32,7 +32,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.progress import share_of
 from calib_ros.report import documents, words
-from calib_ros.report.advice import FAR, Advice
+from calib_ros.report.advice import BRINGS, FAR, Advice
 from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import (
@@ -283,7 +283,9 @@ def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) 
             screen.bullet(f'{each.heading}: {each.refusal}', each.steps)
     if not all(each.steps for each in reasons):
         screen.bullet('What else was found probably follows from it: the report (--out) lists it')
-    elif 1.0 < result.noise.position < FAR and not result.noise.consistent:
+        return
+    explained = BRINGS.keys() & {each.rule for each in result.refusals}
+    if not explained and 1.0 < result.noise.position < FAR and not result.noise.consistent:
         screen.bullet(words.scatter_in_words(result.noise))
 
 

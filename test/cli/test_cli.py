@@ -21,6 +21,7 @@ from calib_ros.cli.common import SETTINGS, Status
 from calib_ros.cli.identify import RESULT_FILES
 from calib_ros.cli.main import main
 from calib_ros.identification.calibration import load_calibration
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import dump_chain, load_chain
 from calib_ros.settings import Settings
 
@@ -320,3 +321,14 @@ def test_a_device_that_a_calibration_does_not_know_has_no_frame_of_another(of_tw
     status, _, err = run('verify', *judged, '--new-base')
     assert status == 1
     assert 'not base (optitrack) and tool: measure with the same device and target' in err
+
+
+def test_a_loose_target_is_not_blamed_on_the_device_as_well(run, tmp_path):
+    moved = se3.transform(np.eye(3), np.full(3, 1.2e-3))
+    loose = replace(TRUE, tool=replace(TRUE.tool, matrix=TRUE.tool.matrix @ moved))
+    rows = rows_of(measured(), 0)[:20] + rows_of(measured(loose), 0)[20:]
+    write_csv(tmp_path / 'cell.csv', rows)
+    status, out, _ = run('identify', 'cell.csv', '--chain', 'ur5e')
+    assert status == Status.NOT_ACCEPTED
+    assert 'Something moved while you measured: the target' in out
+    assert 'device noise' not in ' '.join(out.split())
