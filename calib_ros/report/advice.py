@@ -101,6 +101,10 @@ LEFT = (
     'The remaining error corresponds to a device noise of {:.2g} mm in each direction; '
     'sigma_position is {:.2g} mm.'
 )
+DRIFTS = (
+    'Poses measured in succession have similar errors, as if the device drifted: let it warm up '
+    'as long as its manual says, then measure all poses again in random order.'
+)
 FINER = (
     'If the device is accurate to less than {:.2g} mm by its data sheet, state that '
     '(--sigma-position, in metres): the measurements scatter by only {:.2g} mm.'
@@ -110,12 +114,16 @@ FINER = (
 
 @dataclass(frozen=True)
 class Situation:
-    """Different poses, residual over stated noise, that noise [m], and whether model is auto."""
+    """Different poses, residual over stated noise, that noise [m], and what else is known.
+
+    Whether model is auto, and whether poses share errors in succession only.
+    """
 
     poses: int = ENOUGH
     left: float = 1.0
     sigma: float | None = None
     auto: bool = False
+    drifts: bool = False
 
     def said_of(self, one: Advice) -> Advice:
         """Return the advice on an unproven correction that suits the situation."""
@@ -147,11 +155,15 @@ def advice(reasons: Sequence[Reason], situation: Situation = Situation()) -> tup
         if rule is Rule.MISTAKE:
             short = f'{heading}: {"; ".join(each.short for each in texts)}'
         refusal = replace(rules()[rule], refusal='; '.join(texts), in_short=short)
-        if situation.auto:
-            steps = tuple(each for each in refusal.steps if 'model to auto' not in each)
-            refusal = replace(refusal, steps=steps)
+        needless = ['model to auto'] * situation.auto
+        needless += ['publisher'] * ('publisher' not in refusal.refusal)
+        steps = (each for each in refusal.steps if not any(word in each for word in needless))
+        refusal = replace(refusal, steps=tuple(steps))
         if rule in {Rule.GAIN, Rule.REGION}:
             refusal = situation.said_of(refusal)
+        if rule is Rule.GAIN and situation.drifts:
+            again = rules()[Rule.DRIFT].again
+            refusal = replace(refusal, steps=(DRIFTS, *refusal.steps), again=again)
         if rule is Rule.REGION and situation.sigma and situation.left * ALIKE < 1.0:
             finer = FINER.format(1e3 * situation.sigma, 1e3 * situation.left * situation.sigma)
             refusal = replace(refusal, steps=(finer, *refusal.steps))

@@ -158,7 +158,8 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
     numbers = (each.after.configurations for each in (result.fitted, *held_out))
     poses = sum(map(distinct, numbers))
     sigma = None if result.images else result.noise.given.get('sigma_position')
-    return advice(result.refusals, Situation(poses, noise, sigma, bool(result.verdicts)))
+    auto, drifts = bool(result.verdicts), words.drifts(result.noise)
+    return advice(result.refusals, Situation(poses, noise, sigma, auto, drifts))
 
 
 def _steps(

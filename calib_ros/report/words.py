@@ -241,10 +241,16 @@ def scatter_in_words(noise: Noise) -> str:
 
 
 def drift_in_words(noise: Noise) -> str:
-    """Return the evidence for drift: errors shared in succession only."""
-    return neighbours_in_words(noise) if noise.shared == ('successive',) else ''
+    """Return the evidence for drift, and how to avoid it next time; empty if there is none."""
+    return f'{neighbours_in_words(noise)} {STEADY}' if drifts(noise) else ''
 
 
+def drifts(noise: Noise) -> bool:
+    """Tell whether poses share errors in succession only."""
+    return noise.shared == ('successive',)
+
+
+STEADY = 'Let the device warm up as long as its manual says, and measure in random order.'
 NEIGHBOURS = {'successive': 'measured in succession', 'near': 'near each other in joint space'}
 
 
@@ -254,7 +260,7 @@ def neighbours_in_words(noise: Noise) -> str:
         return 'No test finds errors shared by neighbouring poses.'
     parts = [f'{NEIGHBOURS[kind]} ({getattr(noise, kind):.2f})' for kind in noise.shared]
     text = (
-        f'The errors of poses {" and ".join(parts)} are correlated (coefficient in brackets): '
+        f'Poses {" and ".join(parts)} have similar errors (correlation in brackets): '
         'the device drifts, or the arm has errors that this model lacks.'
     )
     if (times := f'{noise.widened:.2f}') != '1.00':

@@ -52,6 +52,26 @@ def test_no_gain_is_told_by_how_much_was_measured_and_what_is_left():
     assert 'noise of 0.46 mm in each direction; sigma_position is 0.1 mm' in enough.meaning
 
 
+def test_errors_shared_in_succession_ask_for_random_order_first():
+    """A good arm seen by a device that drifts was told to look for errors of its gears."""
+    here = advice.Situation(poses=40, drifts=True)
+    (told,) = advice.advice([Reason(Rule.GAIN, 'little gain')], here)
+    assert told.steps == (advice.DRIFTS, *advice.rules()[Rule.GAIN].steps)
+    assert told.again == advice.rules()[Rule.DRIFT].again
+    rows, share = measured(chain=UR, count=40), np.linspace(0.0, 1.0, 40)[:, np.newaxis]
+    moved = replace(rows, positions=rows.positions + share * np.array([1.5e-3, 1e-3, -8e-4]))
+    problem = Problem(UR, moved)
+    report = report_of(problem, identify(problem))
+    assert report.advice[0].steps[0] == advice.DRIFTS
+    assert report.steps == (told.again,)
+
+
+@pytest.mark.parametrize(('text', 'count'), [('--length mm', 2), ('correct the publisher', 3)])
+def test_publishers_are_told_of_only_if_one_is_wrong(text, count):
+    (told,) = advice.advice([Reason(Rule.MISTAKE, f'the positions are in mm: {text}')])
+    assert len(told.steps) == count
+
+
 @pytest.mark.parametrize('poses', [14, 50])
 def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
     """The stated sigma may alone make a correction uncertain that held-out poses confirm."""
