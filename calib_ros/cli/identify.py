@@ -142,7 +142,7 @@ def _show_update(found: Recalibration, screen: Screen) -> None:
         screen.bullet(why, (step,))
     elif not found.changed:
         screen.bullet('unchanged within the uncertainty')
-    if found.accepted or not found.determined:
+    if found.accepted or not (found.determined or found.odd):
         perhaps = 'perhaps ' if why else ''
         for reasons in found.changed:
             screen.bullet(perhaps + reason_in_words(reasons))

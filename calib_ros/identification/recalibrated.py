@@ -108,7 +108,7 @@ class Recalibration(Shown):
             why, _, step = reused_in_words(self.reused).rpartition(': ')
             return why, f'{step}, and give only those'
         if self.odd:
-            why = f'{self.odd} contradicts all others, which would pass without it'
+            why = f'{self.odd} contradicts all others: without it they would be accepted'
             return why, 'measure it again, or leave it out'
         if (cause := self.outside) and self.unexplained > changes.FALSE:
             if not self.out_of_scale:

@@ -332,3 +332,16 @@ def test_a_loose_target_is_not_blamed_on_the_device_as_well(run, tmp_path):
     assert status == Status.NOT_ACCEPTED
     assert 'Something moved while you measured: the target' in out
     assert 'device noise' not in ' '.join(out.split())
+
+
+def test_one_gross_pose_leaves_no_doubt_about_the_arm(run, written, tmp_path):
+    rows = rows_of(measured(seed=25, count=20), 0)
+    rows[7]['x'] += 0.03
+    write_csv(tmp_path / 'new.csv', rows)
+    given = ('identify', 'new.csv', '--chain', 'ur5e', '--previous', written[0])
+    status, out, _ = run(*given)
+    assert status == Status.NOT_ACCEPTED
+    assert 'pose 8 contradicts all others: without it they would be accepted' in out
+    assert 'perhaps changed' not in out
+    write_csv(tmp_path / 'new.csv', rows[:7] + rows[8:])
+    assert run(*given)[0] == 0
