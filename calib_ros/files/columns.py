@@ -274,11 +274,16 @@ def csv_blocks(
     as_text(data, str(path), ColumnsError)
     lines = chain(csv_lines(data, str(path)), ['\n'])  # no row, unless a quotation mark is open
     reader = csv.reader(lines, delimiter=separator, strict=strict)
-    before = line = 0
+    before = line = width = 0
     block = list[Cells]()
     try:
         for row in reader:
             before, line = line, reader.line_num
+            hidden = sum(cell.count(separator) for cell in row) if line - before > 1 else 0
+            if hidden and hidden + len(row) - 1 == (line - before) * (width - 1):
+                line = before
+                raise csv.Error('whole rows are within quotation marks')
+            width = len(row) or width
             if any(row):
                 block.append((above + line, row))
             if len(block) * len(row) >= MOST_ENTRIES:  # cells that fit the caches

@@ -63,6 +63,27 @@ def test_an_open_quotation_mark_hides_no_rows(tmp_path, cell):
             read_table(path, 2, foreign=foreign)
 
 
+@pytest.mark.parametrize('again', ['7,"', '",'])
+def test_ditto_marks_hide_no_rows(tmp_path, again):
+    """Two of them are quotation marks around the rows between."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5,a\n1,2,3,4,5,"\n1,2,3,4,6,\n1,2,3,4,{again}\n')
+    for foreign in (None, Foreign(Layout())):
+        with pytest.raises(
+            InputError, match=r'from line 3: whole rows are within quotation marks'
+        ):
+            read_table(path, 2, foreign=foreign)
+
+
+def test_a_note_of_several_lines_is_one_cell(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(
+        PLAIN.replace('q1', 'note,q1', 1).replace('\n', '\n"hot, windy,\n12"" tool",', 3)
+    )
+    for foreign in (None, Foreign(Layout(separator='comma'))):
+        assert_same(read_table(path, 2, foreign=foreign), None)
+
+
 def test_a_number_of_a_column_that_is_not_there_is_told(tmp_path):
     path = tmp_path / 'cell.csv'
     path.write_text(PLAIN)
