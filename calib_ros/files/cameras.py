@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib_ros.atomic import given_path
-from calib_ros.errors import CalibrationError, ConfigError, InputError, UnknownNameError
+from calib_ros.errors import (
+    MOST_ENTRIES,
+    CalibrationError,
+    ConfigError,
+    InputError,
+    UnknownNameError,
+)
 from calib_ros.files.boards import read_board
 from calib_ros.files.detector import Detector, Image, opencv
 from calib_ros.files.lenses import lens_of
@@ -66,7 +72,7 @@ class BoardCamera:
         new = _Told(head_of(info)[0], lens, (info.height, info.width))
         k = bisect.bisect_right(self._told, new.stamp_ns, key=_stamp)
         if not k or self._told[k - 1][1:] != new[1:]:
-            self._told = (*self._told[:k], new, *self._told[k:])
+            self._told = (*self._told[:k], new, *self._told[k:])[-MOST_ENTRIES:]
 
     def look(self, message: Any) -> View | Flaw:
         """Return the corners in an Image or CompressedImage, or why it is not used.

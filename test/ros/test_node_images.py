@@ -261,6 +261,17 @@ def test_memory_for_images_is_bounded(monkeypatch):
     assert np.diff(list(kept._kept)).max() < 40  # old ones are among them
 
 
+def test_memory_for_what_camera_infos_said_is_bounded(board):
+    """Autofocus changes the lens with every image."""
+    (camera,) = cameras_of(sources(board, Image)).values()
+    for k in range(1, 2500):
+        info = CameraInfo(header=header(k, 'camera'))
+        info.k = [float(k), 0.0, 320.0, 0.0, 800.0, 240.0, 0.0, 0.0, 1.0]
+        camera.learn(info)
+    assert len(camera._told) <= 1000
+    assert camera._told[-1].stamp_ns == k
+
+
 @pytest.mark.parametrize(
     ('change', 'said'),
     [
