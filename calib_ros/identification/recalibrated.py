@@ -20,6 +20,8 @@ from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.values import SAME
 
+ANEW = 'measure 30 poses or more and identify them without --previous'
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recalibration(Shown):
@@ -113,7 +115,7 @@ class Recalibration(Shown):
         if (cause := self.outside) and self.unexplained > changes.FALSE:
             if not self.out_of_scale:
                 why = 'the arm bends as under another load than in the earlier calibration'
-                return why, 'measure with that load, or identify again with this one'
+                return why, f'measure with that load, or, with this one, {ANEW}'
             return (
                 f'the scale of the measuring device changed, by {cause.size_in_words()}',
                 'check it with a known length, and the temperature and pressure set in it; or the '
@@ -123,7 +125,7 @@ class Recalibration(Shown):
             why = f'something moved while the new poses were measured: {self.step}'
             return why, 'measure again, or give only the poses from there on'
         if self.unexplained <= changes.FALSE:
-            step = 'identify again'
+            step = ANEW
             if self.before.rms_mm > 1e3 * Settings.largest_error:
                 step = (
                     'if the device or the target was moved, give --new-base or --new-tool; check '

@@ -55,7 +55,8 @@ STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
         Headline('bad', 'The calibration no longer holds'),
         (
             SOMETHING_MOVED,
-            'Calibrate again with new poses, or update it with --previous and a few.',
+            'Calibrate again with new poses, or update the calibration with a few (identify '
+            '--previous).',
         ),
     ),
     'holds': (

@@ -11,6 +11,7 @@ from fits import NOISE, SCARA, SIGMAS, UR10E, rms
 from calib_ros import Calibration, Problem, difference, identify, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.errors import InputError
+from calib_ros.identification.recalibrated import ANEW
 from calib_ros.kinematics.chain import Chain, Joint
 
 ALL = np.radians([0.1, -0.15, 0.08, 0.2, -0.12, 0.05])
@@ -100,7 +101,7 @@ def test_another_load_is_no_change_of_the_arm(earlier, seed):
     assert found.outside is found.changed[0][0]
     assert 'as under another load' in found.refusal()[0]
     assert 'the load of the arm' in found.outside.in_words()
-    assert found.document()['refusal'].endswith('or identify again with this one')
+    assert found.document()['refusal'].endswith(f'or, with this one, {ANEW}')
 
 
 def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show():

@@ -16,6 +16,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision.changes import SCALE_OF_DEVICE, Explanation
 from calib_ros.errors import InputError
 from calib_ros.identification.calibration import parse_calibration
+from calib_ros.identification.recalibrated import ANEW
 from calib_ros.identification.recalibration import years_since
 
 Q = UR10E.random_joints(300, np.random.default_rng(99))
@@ -254,7 +255,7 @@ def test_another_arm_is_not_mended_by_8_poses(earlier):
     other = replace(faulty(UR10E, Cell(), rng), base=true.base, tool=true.tool)
     found = recalibrate(previous, problem(other, 8, 1), 0.1)
     assert not found.accepted
-    assert found.refusal()[1] == 'identify again'
+    assert found.refusal()[1] == ANEW
 
 
 def test_new_poses_in_other_units_are_named(earlier):
