@@ -90,7 +90,7 @@ class Sector:
 
 
 SIDES = ('ahead (+x)', 'left (+y)', 'behind (-x)', 'right (-y)')
-RADII = ('close in', 'half way out', 'far out')
+RADII = ('close in', 'halfway out', 'far out')
 HEIGHTS = ('low', 'at middle height', 'high')
 
 

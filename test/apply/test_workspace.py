@@ -93,7 +93,7 @@ def test_the_worst_region_is_found_and_named(rng):
     bad = (positions[:, 0] < -0.6) & (np.abs(positions[:, 1]) < 0.3) & (positions[:, 2] > 0.5)
     found = regions(positions, np.where(bad, 2.0, 0.5))
     worst = found[0]
-    assert worst.words in ('far out, high, behind (-x)', 'half way out, high, behind (-x)')
+    assert worst.words in ('far out, high, behind (-x)', 'halfway out, high, behind (-x)')
     assert worst.rms > 1.2
     assert [region.rms for region in found] == sorted((r.rms for r in found), reverse=True)
     assert sum(region.poses for region in found) == len(positions)
