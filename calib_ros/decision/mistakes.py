@@ -159,9 +159,11 @@ def _told(problem: Problem, found: Explained) -> Explained:
 
 def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
-    sets = (each for each in problem.all_sets if each.distances is None and each.pixels is None)
-    found = filter(None, (_of_rows(problem, chain, each) for each in sets))
-    return next((_told(problem, each) for each in found), None)
+    sets = [each for each in problem.all_sets if each.distances is None and each.pixels is None]
+    for each in sets:
+        if found := _of_rows(problem, chain, each):
+            return _told(problem, replace(found, where=_among(sets, each) + found.where))
+    return None
 
 
 def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
@@ -175,7 +177,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
         return None
     for name in (seen.base, seen.tool):
         chain = chain.with_frame(name, replace(chain.frame(name), fixed=True))
-    if (given := trial_of(chain, (seen.select(rows),))) is None:
+    if (given := trial_of(chain, (seen.select(rows).spread(),))) is None:
         return None
     found = _named(problem, chain, given.sets, given, of_rows=True)
     if found is None or len(rows) == len(seen):
@@ -199,10 +201,17 @@ def _unlike(problem: Problem, chain: Chain, sets: Sets) -> tuple[Sets, str]:
     worst = max(wrong or range(len(sets)), key=lambda k: len(sets[k]))
     if not 0 < len(wrong) < len(sets):
         return (sets[worst],), ''
+    return (sets[worst],), _among(sets, sets[worst])
+
+
+def _among(sets: Sequence[Observations], one: Observations) -> str:
+    """Return which of several sets one is, by the frames that not all share."""
+    if len(sets) == 1:
+        return ''
     shared = set.intersection(*({each.base, each.tool} for each in sets))
-    own = ', '.join(sorted({sets[worst].base, sets[worst].tool} - shared))
-    which = f'with {own}' if own else f'of {len(sets[worst])} poses'
-    return (sets[worst],), f'in the measurements {which} alone, '
+    own = ', '.join(sorted({one.base, one.tool} - shared))
+    which = f'with {own}' if own else f'of {len(one)} poses'
+    return f'in the measurements {which} alone, '
 
 
 def _of_images(problem: Problem) -> bool:

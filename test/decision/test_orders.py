@@ -11,8 +11,10 @@ import pytest
 from fits import NOISE, SIGMAS
 
 from calib_ros import identify, load_chain
-from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision import mistakes, trials
 from calib_ros.decision.mistakes import explained, explained_alone
+from calib_ros.estimation.observations import SOME_POSES
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.chain import Chain, Joint
 
@@ -120,3 +122,35 @@ def test_rows_of_a_lost_target_are_gross_errors_only(rows, oriented):
     result = identify(Problem(arm, replace(seen, positions=positions), **SIGMAS))
     assert result.accepted
     assert len(result.outliers) == rows.stop - rows.start
+
+
+def test_rows_of_one_of_several_sets_are_told_with_its_device():
+    """Of two devices nobody knew which rows were meant."""
+    arm, rng = load_chain('ur10e'), np.random.default_rng(2)
+    true = faulty(arm, Cell(), rng).with_frame('second', random_frame(rng, 2.0))
+    one, other = (arm.random_joints(40, rng) for _ in range(2))
+    first = measure(true, one, rng, 5e-5, 2e-4)
+    there = measure(replace(true, base=true.frame('second')), other, rng, 5e-5, 2e-4)
+    mixed = np.where(np.arange(40)[:, np.newaxis] < 3, 1e3, 1.0) * there.positions
+    second = replace(there, base='second', positions=mixed)
+    problem = Problem(arm.with_frame('second', true.frame('second')), first, more=(second,))
+    found = str(explained_alone(problem, true))
+    assert found.startswith('in the measurements with second alone, in poses 1 to 3 of 40 alone')
+
+
+def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):
+    """Half a table of 60,000 rows in mm took 19 s."""
+    arm, rng, tried = load_chain('ur10e'), np.random.default_rng(2), []
+
+    def spy(chain, sets, *more):
+        tried.extend(map(len, sets))
+        return trials.trial_of(chain, sets, *more)
+
+    monkeypatch.setattr(mistakes, 'trial_of', spy)
+    true, q = faulty(arm, Cell(), rng), arm.random_joints(5 * SOME_POSES, rng)
+    seen = measure(true, q, rng, 5e-5, 2e-4)
+    late = np.arange(len(q))[:, np.newaxis] >= SOME_POSES
+    seen = replace(seen, positions=np.where(late, 1e3, 1.0) * seen.positions)
+    found = str(explained_alone(Problem(arm, seen), true))
+    assert found.startswith(f'in poses {SOME_POSES + 1} to {len(q)} of {len(q)} alone, the ')
+    assert max(tried) <= SOME_POSES
