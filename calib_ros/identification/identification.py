@@ -63,7 +63,7 @@ def identify(
         return _identified(problem, simpler, progress)
     except np.linalg.LinAlgError as err:
         if found := mistakes.explained(problem):
-            raise InputError(f'the measurements do not fit the arm at all: {found}') from err
+            raise InputError(f'the measurements do not fit the arm: {found}') from err
         raise InputError(
             'the fit found no stable solution: check the arm, joint values and units, or measure '
             'more poses all over the workspace'

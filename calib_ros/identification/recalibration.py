@@ -72,7 +72,7 @@ def recalibrate(
     """
     require(Calibration, previous=previous)
     if mistake := mistakes.explained(problem, far=True):
-        raise InputError(f'the new poses do not fit the arm at all: {mistake}')
+        raise InputError(f'the new poses do not fit the arm: {mistake}')
     try:
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
@@ -92,7 +92,7 @@ def recalibrate(
             return replace(found, odd=f'{held_out}pose {pose + 1}{where}')
     if found.unexplained <= changes.FALSE:
         if mistake := mistakes.explained_alone(problem, arm):
-            raise InputError(f'the new poses do not fit the arm at all: {mistake}')
+            raise InputError(f'the new poses do not fit the arm: {mistake}')
         return replace(found, step=previous.step(problem.all_sets))
     return found
 
