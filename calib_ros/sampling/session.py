@@ -208,7 +208,9 @@ class CalibrationSession:
         if left_out := len(self.samples) - len(usable):
             notes['poses left out, in another frame or of a target measured once'] += left_out
         if missed := self._names.missed:
-            notes[f'joint that moves but is not in the chain: {", ".join(missed)}'] = len(missed)
+            notes[f'joint that moves but is not in the chain: {", ".join(some(missed))}'] = len(
+                missed
+            )
         return Account(
             joint_states=self.received[JOINTS],
             poses=self.received[POSES],
