@@ -50,13 +50,19 @@ class JointNames:
 
         Beyond MOST_NAMES others are not noted.
         """
-        for name, values in zip(names, numbers.T, strict=True):
-            low, high = self._heard.get(name, (np.inf, -np.inf))
-            if name in self._names:
-                self._heard[name] = low, high
-            elif name in self._heard or len(self._heard) < MOST_NAMES:
-                ends = float(np.fmin.reduce(values)), float(np.fmax.reduce(values))
-                self._heard[name] = min(low, ends[0]), max(high, ends[1])
+        others = []
+        for k, name in enumerate(names):
+            own = name in self._names
+            if own or name in self._heard or len(self._heard) < MOST_NAMES:
+                self._heard.setdefault(name, (np.inf, -np.inf))
+                others += [] if own else [k]
+        if not others:
+            return
+        values = numbers[:, others]
+        lowest, highest = np.fmin.reduce(values).tolist(), np.fmax.reduce(values).tolist()
+        for k, least, most in zip(others, lowest, highest, strict=True):
+            low, high = self._heard[names[k]]
+            self._heard[names[k]] = min(low, least), max(high, most)
 
     @property
     def never(self) -> tuple[str, ...]:
