@@ -45,6 +45,7 @@ from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import (
     ALIKE,
+    CERTAIN,
     CLEARLY,
     CONFIDENT,
     NEARER,
@@ -109,7 +110,8 @@ def remarked(problem: Problem, result: Identification, another: bool = True) -> 
 def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
     """Yield that a device out of scale does harm or is too likely to, if nothing else refuses.
 
-    Also if its scale was checked, but all lengths grew alike, and by more than a print may be off.
+    Also if its scale was checked, but all lengths grew alike, and by more than a print may be off
+    and `sigma_scale` allows.
     """
     region, found = result.region, result.posterior
     if result.refusals:
@@ -122,7 +124,13 @@ def _scale(problem: Problem, result: Identification) -> Iterator[Reason]:
     grown = (found.offsets + found.shift)[own]
     lengths = np.array([problem.model.value(name) for name in compress(found.names, own)])
     scale = float(grown @ lengths) / max(float(lengths @ lengths), 1e-300)
-    if abs(scale) > PRINTED and scale * float(grown @ lengths) > CONFIDENT * float(grown @ grown):
+    alike, whole, freedom = scale * float(grown @ lengths), float(grown @ grown), len(grown) - 1
+    if abs(scale) <= max(PRINTED, problem.sigma_scale) or alike <= CONFIDENT * whole:
+        return
+    # a few lengths of an arm may be so by chance; a print is more likely to be off
+    squares = alike * freedom / max(whole - alike, 1e-300)
+    certain = chance_of(squares, 1, max(freedom, 1)) < 1.0 - CERTAIN
+    if certain or all(each.pixels is not None for each in problem.sets):
         text = (
             f'all lengths of the arm {"grow" if scale > 0.0 else "shrink"} alike, by '
             f'{percent(abs(scale))} %, more than sigma_scale allows: measure a known length, or '
