@@ -182,8 +182,7 @@ def posterior_of(
     wider = [solved(matrix, vector, each) for each in precisions if near]
     parts = zip(weights, wider, strict=False)
     doubted = tuple((w, centre[arm], root[arm] @ root[arm].T) for w, (centre, root) in parts)
-    if unknown and not rival:
-        out = float(wider[0][0][-1])
+    out = float(wider[0][0][-1]) if unknown and not rival else out
     found = offsets[arm], mean - offsets[arm], covariance, device, priors, evidence.named(size)
     posterior = Posterior(chain, every, *found, doubted, rival, out)
     return posterior if fitted.held is None else posterior.held_at(*fitted.held)
