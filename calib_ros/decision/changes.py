@@ -9,21 +9,24 @@ x ~ N(0, K), such as the uncertainty of an earlier calibration, are marginalised
     A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
 An explanation is x = G z: one parameter, all of a joint (a bent link) or of a frame (a moved
-device or target), or the scale of the device has changed. It reduces chi-squared, with as many
-degrees of freedom as z, by
+device or target), a shift of a frame, or the scale of the device has changed. It reduces
+chi-squared, with as many degrees of freedom as z, by
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
 A change is claimed if chance gains as much, over all explanations tried, with probability FALSE at
 most (Bonferroni). Explanations are compared by their evidence with z ~ N(0, s^2 S), S the typical
 size of changes, which penalises additional parameters (MacKay 1992). A motor that is a turn off,
-or a belt a tooth, changes far more: s is the likeliest of 1, SPREAD and SPREAD^2. Those with a
-share above 1 - CONFIDENT are indistinguishable from the best.
+or a belt a tooth, changes far more: s is the likeliest of 1, SPREAD and SPREAD^2. Each joint and
+each frame is as likely as another beforehand, however many explanations it has (the many of joints
+would outweigh a frame that has moved); load and scale are as likely as one parameter of a joint.
+Those with a share above 1 - CONFIDENT are indistinguishable from the best.
 """
 
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -194,7 +197,12 @@ def reasons_of(
     """
     if not columns.sets:
         return ()
-    logs = [columns.evidence(information, names)[0] for _, names in columns.sets]
+    tried = Counter(owner for owner, _ in columns.sets)
+    tried |= Counter(dict.fromkeys(OUTSIDE, max(tried.values())))
+    logs = [
+        columns.evidence(information, names)[0] - np.log(tried[owner])
+        for owner, names in columns.sets
+    ]
     found = [
         _explanation(information, columns, freedom, *each, share)
         for each, share in zip(columns.sets, special.softmax(logs).tolist(), strict=True)
@@ -294,7 +302,8 @@ class Effects:
             sets += [(joint, own)] if len(own) > 1 else []
         for frame in frames:
             own = tuple(name for name in parameters_of(frame) if name in self._columns)
-            sets += [(frame, own)] if own else []
+            shifts = tuple(name for name in own if name.is_length)
+            sets += [(frame, some) for some in dict.fromkeys((own, shifts)) if some]
         load = f'gravity_{chain.joint_names[-1]}'
         if carried := tuple(name for name in names if name.kind == load):
             sets.append((LOAD, carried))
