@@ -359,7 +359,7 @@ def test_a_fit_that_runs_away_ends_in_words(monkeypatch):
     one, others = np.split(np.arange(len(seen)), [len(POINTS)])  # one image fits any
     for given, more, words in (
         (seen, (), 'no stable solution: check the arm'),
-        (large, (), 'at all: the board is stated 1000 times'),
+        (large, (), 'fit the arm: the board is stated 1000 times'),
         (large.select(one), (large.select(others),), 'of 29 poses alone, the board'),
     ):
         with pytest.raises(InputError, match=words):
