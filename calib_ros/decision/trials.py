@@ -75,8 +75,8 @@ def trial_of(chain: Chain, sets: Sets, bare: Bare | None = None) -> Trial | None
         away = misses(best.chain, alone, arm)  # a gross error would hide a mistake
         usual = away <= np.quantile(away, 1.0 - MOST_OUTLIERS)
         if np.count_nonzero(usual) >= 2 * IN_A_FRAME:  # base and tool explain fewer
-            again = _nearest(own, alone, arm, usual)
-            best = best if again is None or best.error <= again.error else again
+            found = best, _nearest(own, alone, arm, usual)
+            best = min(filter(None, found), key=lambda one: one.error)
         places = arm[:, :3, 3]
         seen = places if each.socket else each.positions  # sockets measure nothing
         spreads.append(min(float(np.sqrt(one.var(axis=0).sum())) for one in (places, seen)))

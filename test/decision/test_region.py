@@ -10,7 +10,8 @@ from fits import UR10E, arm, rms
 
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision.region import packed, region_of_record, unpacked_matrix
+from calib_ros.decision import region
+from calib_ros.decision.region import packed, region_of, region_of_record, unpacked_matrix
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
@@ -29,8 +30,11 @@ def around(seed, reach, count=60):
 
 
 def identified(true, q, seed=0):
-    seen = measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
-    return identify(Problem(UR10E, seen))
+    return identify(Problem(UR10E, measured(true, q, seed)))
+
+
+def measured(true, q, seed=0):
+    return measure(true, q, np.random.default_rng(seed + 7), 5e-5, 2e-4)
 
 
 def with_a_still_joint(seed, reach):
@@ -150,6 +154,30 @@ def test_a_coupling_that_hardly_shows_near_a_posture_is_not_fitted_for_elsewhere
     assert len(near) > 200
     used = np.concatenate([used, near])
     assert rms(found.chain, true, used) < rms(found.before, true, used)
+
+
+@pytest.mark.parametrize(('near', 'inside'), [(0.3, 0.0), (0.0, 0.3)])
+def test_the_risk_is_the_larger_one_of_the_poses_and_of_those_known_as_well(
+    local, near, inside, monkeypatch
+):
+    """That by the scale of the device counts as far as a scale is likely, in log odds."""
+    sets, sizes = [measured(arm(0), UR10E.random_joints(60, np.random.default_rng(0)))], []
+    posterior = replace(local.posterior, rival=None)
+    rival = 0.5, np.full_like(posterior.offsets, 7.0), posterior.covariance
+    harmful = [False]
+
+    def risk(judge, which, around, doubts):
+        sizes.append(np.trace(which))
+        found = near if sizes[-1] == sizes[0] else inside
+        return found if harmful[0] or (doubts[1] == 7.0).all() else 0.0
+
+    monkeypatch.setattr(region._Judge, 'risk', risk)
+    assert region_of(posterior, sets, np.inf).by_scale == 0.0
+    odds = region.UNUSUAL / (1.0 - region.UNUSUAL) * np.exp(0.5)
+    found = region_of(replace(posterior, rival=rival), sets, np.inf)
+    assert found.by_scale == pytest.approx(0.3 * odds / (1.0 + odds))
+    harmful[0] = True
+    assert region_of(posterior, sets, np.inf) is None
 
 
 def test_what_a_still_joint_leaves_open_is_not_covered(local):

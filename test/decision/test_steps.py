@@ -12,6 +12,7 @@ from fits import NOISE, SIGMAS, UR10E, along_path
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision import steps
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
@@ -212,6 +213,20 @@ def test_poses_of_several_targets_are_told_by_their_lines():
     odd = replace(odd, tool='tool_1')
     result = identify(Problem(UR10E, even, **SIGMAS, more=(odd,)))
     assert f'before line {AT + 1} (if rows are in the order of' in str(result.step)
+
+
+def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
+    """Else it might use the freedom of parameters that are held."""
+    true, seen = session(3, errors=0.0)
+    name, products = 'elbow_joint.a', []
+    problem = Problem(UR10E, moved(seen, true, 'tool', 1e-3), priors={name: 1e-9}, **SIGMAS)
+    fitted = fitting.fit(problem)[2]
+    gain_of = steps.gain_of
+    monkeypatch.setattr(steps, 'gain_of', lambda *given: products.append(given) or gain_of(*given))
+    assert find_step(fitted).kind == 'tool'
+    ((matrix, count),) = products
+    assert count == len(fitted.names)
+    assert matrix.diagonal()[fitted.names.index(name)] == pytest.approx(1e18, rel=0.1)
 
 
 def test_what_is_on_the_flange_is_named():

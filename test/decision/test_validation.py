@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fits import UR10E, measured_arm
+from in_sockets import PLACES, cell
 from scipy import stats
 
 from calib_ros.decision import validation
@@ -16,6 +17,8 @@ from calib_ros.decision.comparison import Comparison, Residuals, compare, log_ga
 from calib_ros.decision.reasons import Rule
 from calib_ros.decision.validation import left_out
 from calib_ros.estimation.fitted import ParameterRow
+from calib_ros.estimation.fitting import fit
+from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics.parameter import Parameter
 
@@ -232,3 +235,16 @@ def test_places_a_known_distance_apart_are_one():
         separations=[('a', 'c', 1.0), ('c', 'a', 1.0), ('e', 'd', 2.0), ('d', 'a', 1.0)],
     )
     assert validation._places(problem) == [{'b'}, {'a', 'c', 'd', 'e'}]
+
+
+def test_known_distances_count_in_the_places_that_are_fitted(monkeypatch):
+    problem = cell(0, noise=1e-4)[1]
+    fitted, systems = fit(problem)[2], []
+    monkeypatch.setattr(
+        validation, 'minimise', lambda *given: systems.append(given[2]) or minimise(*given)
+    )
+    validation.validate(fitted, fitted.chain)
+    assert [len(each.separations) for each in systems] == [PLACES - 1, 1] * 2 * PLACES
+    for each in systems:
+        seen = {samples.observations.base for samples in each.sets}
+        assert {base for *pair, _ in each.separations for base in pair} == seen

@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""An arm tried on some samples, a part of which may be gross errors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, UR10E, measured_arm
+
+from calib_ros import Problem
+from calib_ros.decision.trials import Trial, misses, refined, trial_of
+from calib_ros.estimation.start import flange
+
+
+def with_gross_errors(count, gross):
+    """Return an arm, and poses of it of which the first are off by a metre or two."""
+    rng, true, seen = measured_arm(1, count, (0.0, 0.0))
+    seen.positions[:gross] += rng.choice([-1.0, 1.0, 2.0], (gross, 3))
+    return replace(true, base=None, tool=None), seen
+
+
+@pytest.mark.parametrize(('count', 'found'), [(17, False), (18, True), (40, True)])
+def test_gross_errors_do_not_spoil_the_closed_form(count, found):
+    """Twelve rows are the fewest: base and tool explain any half a dozen."""
+    chain, seen = with_gross_errors(count, count // 3)
+    trial = trial_of(chain, (seen,))
+    assert (trial.error < 1e-9) == found
+    places = flange(chain, seen)[:, :3, 3], seen.positions
+    spreads = (np.sqrt(((x - x.mean(axis=0)) ** 2).sum() / count) for x in places)
+    assert trial.spread == pytest.approx(min(spreads))
+    assert trial.share == trial.error / trial.spread
+
+
+def test_gross_errors_do_not_spoil_the_refinement():
+    chain, seen = with_gross_errors(40, 8)
+    arm = flange(chain, seen)
+    near = trial_of(chain, (seen,)).chain
+    off = near.with_offsets({f'base.{axis}': 1e-3 for axis in 'xyz'})
+    rough = Trial(off, (seen,), (arm,))
+    assert rough.error == pytest.approx(1e-3 * np.sqrt(3.0))
+    found = refined(Problem(UR10E, seen, sigma_position=NOISE[0]), rough)
+    assert misses(found.chain, seen, arm)[8:].max() < 1e-6
