@@ -217,14 +217,6 @@ def test_a_robot_that_is_not_that_of_the_calibration_is_told(arm, seed, told):
     assert ('is the calibration that of this robot?' in in_words(found)) is told
 
 
-@pytest.mark.parametrize(('scale', 'told'), [(1.0, False), (1e3, True)])
-def test_what_no_arm_can_be_off_is_of_other_units(cell, arm, program, scale, told):
-    seen = measured(cell[0], program)
-    text = in_words(verify(arm, [replace(seen, positions=scale * seen.positions)], 1e-3))
-    assert ('the positions are in mm, not metres' in text) is told
-    assert ('--length mm' in text) is told
-
-
 def test_units_are_named_though_a_common_motion_would_take_most_of_the_error(arm):
     far = with_errors(arm, 30.0 + np.random.default_rng(0).normal(scale=0.1, size=(9, 3)))
     text = in_words(found := verify(arm, [far], 1e-3))

@@ -302,19 +302,6 @@ def test_json_of_a_verdict_alone_is_printed_and_has_no_infinity(of_two, run, tmp
     assert (status, '--sources does not apply to a table' in err) == (1, True)
 
 
-@pytest.mark.parametrize(
-    ('given', 'said'),
-    [
-        (['--new-base'], '--new-base needs --previous'),
-        (['--history', 'h', '--previous', 'r'], '--history does not apply to --previous'),
-        (['--model', 'auto', '--previous', 'r'], '--model does not apply to --previous'),
-    ],
-)
-def test_options_that_would_be_ignored_are_refused(run, given, said):
-    status, _, err = run('identify', 'new.csv', '--chain', 'ur5e', *given)
-    assert (status, said in err) == (1, True)
-
-
 def test_a_device_that_a_calibration_does_not_know_has_no_frame_of_another(of_two, run, tmp_path):
     write_csv(tmp_path / 'new.csv', seen_by((('optitrack', 'ball'), LEICA), 10, 2))
     judged = ['new.csv', '--chain', 'ur5e', '--calibration', of_two]

@@ -14,19 +14,28 @@ from calib_ros.kinematics.chain import Frame
 
 UR = load_chain('ur10e')
 POINTS = np.array([(0.04 * i, 0.04 * j, 0.0) for j in range(4) for i in range(6)])
+LENS = Camera().lens
+
+
+def nominal(on_flange, lens=LENS):
+    return UR.with_frame('tool' if on_flange else 'base', Frame(lens=lens))
+
+
+def images(on_flange, seed=3, errors=1.0):
+    rng = np.random.default_rng(seed)
+    true = before_camera(arm(seed, errors), Camera(), POINTS, on_flange, rng)
+    return photograph(true, Camera(), POINTS, on_flange, 25, rng, 0.1)
 
 
 @pytest.mark.parametrize('on_flange', [True, False])
 @pytest.mark.parametrize('errors', [0.0, 0.5])
 def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, errors):
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3, errors), camera, POINTS, on_flange, rng)
-    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
-    off = camera.lens.moved({'fx': 13.5, 'fy': 13.5, 'cx': 8.0, 'cy': -6.0})
-    near = camera.lens.moved({'fx': 4.0, 'fy': 4.0, 'cx': 3.0, 'cy': -2.0})
+    seen = images(on_flange, errors=errors)
+    off = LENS.moved({'fx': 13.5, 'fy': 13.5, 'cx': 8.0, 'cy': -6.0})
+    near = LENS.moved({'fx': 4.0, 'fy': 4.0, 'cx': 3.0, 'cy': -2.0})
     told = {'--lens fitted': False, 'lens=fitted in sources': True}
-    for lens in (camera.lens, near, off, replace(off, fixed=False)):
-        chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=lens))
+    for lens in (LENS, near, off, replace(off, fixed=False)):
+        chain = nominal(on_flange, lens)
         for words, of_messages in told.items():
             result = identify(Problem(chain, seen, sigma_pixel=0.1, of_messages=of_messages))
             refused, remarked = (
@@ -41,13 +50,10 @@ def test_intrinsics_that_are_not_those_of_the_camera_are_refused(on_flange, erro
 
 def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little():
     """An arm follows so much of a wrong lens that less than half is left for other intrinsics."""
-    rng, camera = np.random.default_rng(5), Camera()
-    true = before_camera(arm(5, 0.2), camera, POINTS, False, rng)
-    seen = photograph(true, camera, POINTS, False, 25, rng, 0.1)
-    off = camera.lens.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 3.0))
-    for lens, refused in ((camera.lens, False), (off, True)):
-        chain = UR.with_frame('base', Frame(lens=lens))
-        result = identify(Problem(chain, seen, sigma_pixel=0.1))
+    seen = images(False, 5, 0.2)
+    off = LENS.moved(dict.fromkeys(('fx', 'fy', 'cx', 'cy'), 3.0))
+    for lens, refused in ((LENS, False), (off, True)):
+        result = identify(Problem(nominal(False, lens), seen, sigma_pixel=0.1))
         assert result.accepted == (not refused)
         assert any('--lens fitted' in each for each in result.refusals) == refused
 
@@ -55,10 +61,7 @@ def test_intrinsics_that_the_arm_imitates_are_refused_though_they_explain_little
 @pytest.mark.parametrize('on_flange', [True, False])
 def test_a_board_that_is_stretched_is_refused(on_flange):
     """Printed 0.3 % wider it left 1.5 mm of 2.2 mm, where 0.24 mm were expected."""
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
-    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
-    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
+    seen = images(on_flange)
     for stated, said in (
         ([1.0, 1.0, 1.0], ''),
         ([1.005, 1.005, 1.0], ''),
@@ -67,7 +70,7 @@ def test_a_board_that_is_stretched_is_refused(on_flange):
     ):
         for sigma in (0.0, 1e-3):  # one scale does not make both sides right
             stretched = replace(seen, points=seen.points * stated)
-            refusals = identify(Problem(chain, stretched, sigma_scale=sigma)).refusals
+            refusals = identify(Problem(nominal(on_flange), stretched, sigma_scale=sigma)).refusals
             told = [each for each in refusals if 'for its height than stated' in each]
             assert bool(told) == bool(said)
             assert all(re.match(rf'the board is 0\.[345]\d? % {said}', each) for each in told)
@@ -76,12 +79,9 @@ def test_a_board_that_is_stretched_is_refused(on_flange):
 @pytest.mark.parametrize('size', [0.99, 1.0, 1.01])
 def test_a_checked_board_by_which_the_whole_arm_grows_is_refused(size):
     """By 1 % no arm does; accepted it left 9 mm of 1.5 mm, as its size was said to be known."""
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3), camera, POINTS, True, rng)
-    seen = photograph(true, camera, POINTS, True, 25, rng, 0.1)
-    chain = UR.with_frame('tool', Frame(lens=camera.lens))
+    seen = images(True)
     wrong = replace(seen, points=seen.points * size)
-    refusals = identify(Problem(chain, wrong, sigma_pixel=0.1, sigma_scale=5e-4)).refusals
+    refusals = identify(Problem(nominal(True), wrong, sigma_pixel=0.1, sigma_scale=5e-4)).refusals
     assert [each.rule for each in refusals] == [Rule.SCALE] * (size != 1.0)
     assert all('more than sigma_scale allows' in each for each in refusals)
 
@@ -90,12 +90,9 @@ def test_a_checked_board_by_which_the_whole_arm_grows_is_refused(size):
 @pytest.mark.parametrize('size', [0.97, 1.004, 1.03])
 def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size):
     """More poses, which were asked for, do not make a board known."""
-    rng, camera = np.random.default_rng(3), Camera()
-    true = before_camera(arm(3), camera, POINTS, on_flange, rng)
-    seen = photograph(true, camera, POINTS, on_flange, 25, rng, 0.1)
-    chain = UR.with_frame('tool' if on_flange else 'base', Frame(lens=camera.lens))
+    seen = images(on_flange)
     seen = replace(seen, points=seen.points * size)
-    (refusal,) = identify(Problem(chain, seen, sigma_pixel=0.1)).refusals
+    (refusal,) = identify(Problem(nominal(on_flange), seen, sigma_pixel=0.1)).refusals
     assert refusal.rule is Rule.SCALE
     found = re.search(r'(grow|shrink) alike, by (\S+) %, as if the board', refusal)
     assert found
@@ -104,11 +101,11 @@ def test_the_size_of_a_board_is_named_where_it_leaves_no_region(on_flange, size)
 
 
 def test_linear_joints_in_millimetres_are_named_of_images_as_well():
-    rng, camera, rail = np.random.default_rng(3), Camera(), load_chain('ur10e_on_linear_axis')
-    true = before_camera(rail, camera, POINTS, True, rng)
-    seen = photograph(true, camera, POINTS, True, 25, rng)
+    rng, rail = np.random.default_rng(3), load_chain('ur10e_on_linear_axis')
+    true = before_camera(rail, Camera(), POINTS, True, rng)
+    seen = photograph(true, Camera(), POINTS, True, 25, rng)
     sizes = [1e3 if joint.type == 'prismatic' else 1.0 for joint in rail.joints]
-    chain = rail.with_frame('tool', Frame(lens=camera.lens))
+    chain = rail.with_frame('tool', Frame(lens=LENS))
     result = identify(Problem(chain, replace(seen, joints=seen.joints * sizes)))
     assert 'the linear joints are in mm, not metres: correct it in --places' in result.refusals[0]
 
@@ -122,8 +119,7 @@ def test_images_of_two_robots_are_not_averaged(seed):
         for k, many in ((0, (80, rng, 0.1)), (seed, (80, rng, 0.1)))
     )
     second = replace(second, base='base_B', tool='tool_B')
-    chain = UR.with_frame('base', Frame(lens=camera.lens))
-    chain = chain.with_frame('base_B', Frame(lens=camera.lens))
+    chain = nominal(False).with_frame('base_B', Frame(lens=LENS))
     result = identify(Problem(chain, first, more=[second], sigma_pixel=0.1))
     told = [each for each in result.refusals if 'one arm does not fit all sessions' in each]
     assert bool(told) == (seed != 0)

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
+import re
 from collections import Counter
 
 import numpy as np
@@ -160,19 +161,19 @@ def test_all_joint_topics_are_heard_together(tmp_path):
 @pytest.mark.parametrize(
     ('settings', 'named'),
     [
-        ({'joint_topics': ('/joints',)}, '/joints'),
-        ({'joint_topics': ('/pose',)}, '/pose'),
-        ({'sources': ('/poze',)}, '/poze'),
-        ({'sources': ('/joint_states',)}, '/joint_states'),
-        ({'sources': ('/pose type=PointStamped',)}, '/pose'),
+        ({'joint_topics': ('/joints',)}, '"/joints" (JointState);'),
+        ({'joint_topics': ('/pose',)}, '"/pose" (JointState);'),
+        ({'sources': ('/poze',)}, '"/poze" (PoseStamped, '),
+        ({'sources': ('/joint_states',)}, '"/joint_states" (PoseStamped, '),
+        ({'sources': ('/pose type=PointStamped',)}, '"/pose" (PointStamped);'),
     ],
 )
 def test_a_topic_that_is_not_there_lists_the_contents(tmp_path, settings, named):
     path = record(tmp_path / 'bag', [*standing([pose_stamped(105 * MS)]), ('/x', text_message())])
-    with pytest.raises(InputError, match=f'no "{named}" \\(') as caught:
+    with pytest.raises(InputError, match=re.escape(f'no {named}')) as caught:
         session_of(path, **settings)
-    contents = '/joint_states (JointState), /pose (PoseStamped), /x (String)'
-    assert contents in str(caught.value)
+    contents = 'it holds /joint_states (JointState), /pose (PoseStamped), /x (String)'
+    assert str(caught.value).endswith(contents)
 
 
 @storages

@@ -113,24 +113,25 @@ def test_what_was_read_before_is_kept_and_never_needed(tmp_path):
     assert left == {each.key for each in first} - {row(3).key} | {row(20).key}
 
 
-def test_rows_of_an_older_version_are_read(tmp_path):
-    store = History(tmp_path)
-    store.file(row())
-    (path,) = tmp_path.rglob('*.parquet')
+def without(folder, *columns):
+    """Return a history of one row that lacks some columns, and the path of the row."""
+    store = History(folder)
+    store.file(row(names=('joint.a',), offsets=np.ones(1), covariance=np.eye(1)))
+    (path,) = folder.rglob('*.parquet')
     table = pyarrow.parquet.read_table(path, partitioning=None)
-    pyarrow.parquet.write_table(table.drop_columns(['rms_mrad', 'remarks']), path)
-    (found,) = store.rows('SN 1/ö')
+    pyarrow.parquet.write_table(table.drop_columns(columns), path)
+    return store, path
+
+
+def test_rows_of_an_older_version_are_read(tmp_path):
+    (found,) = without(tmp_path, 'rms_mrad', 'remarks')[0].rows('SN 1/ö')
     assert found.rms_mrad is None
     assert found.remarks == ()
 
 
 @pytest.mark.parametrize('column', ['offsets', 'covariance', 'filed', 'verdict'])
 def test_rows_without_what_is_compared_are_named(tmp_path, column):
-    store = History(tmp_path)
-    store.file(row(names=('joint.a',), offsets=np.ones(1), covariance=np.eye(1)))
-    (path,) = tmp_path.rglob('*.parquet')
-    table = pyarrow.parquet.read_table(path, partitioning=None)
-    pyarrow.parquet.write_table(table.drop_columns([column]), path)
+    store, path = without(tmp_path, column)
     with pytest.raises(InputError, match=f'{column}.*{path.name}|{path.name}.*{column}'):
         store.rows('SN 1/ö')
 

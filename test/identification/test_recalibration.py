@@ -27,6 +27,11 @@ def problem(true, count, seed):
     return Problem(UR10E, measure(true, UR10E.random_joints(count, rng), rng, *NOISE), **SIGMAS)
 
 
+def but(seen, **changed):
+    """Return a problem with changed observations."""
+    return replace(seen, observations=replace(seen.observations, **changed))
+
+
 @pytest.fixture(scope='module')
 def earlier():
     """Return an arm, and its calibration as it is read from a file."""
@@ -59,8 +64,7 @@ def test_distances_show_a_slipped_zero_of_a_wobbling_arm(earlier):
     now = true.with_offsets({'elbow_joint.theta': 2e-3})
     seen = problem(now, 20, 1)
     sizes = np.linalg.norm(seen.observations.positions, axis=1)
-    distances = replace(seen.observations, distances=sizes, oriented=np.zeros(20, dtype=bool))
-    found = recalibrate(previous, replace(seen, observations=distances), 0.1)
+    found = recalibrate(previous, but(seen, distances=sizes, oriented=np.zeros(20, bool)), 0.1)
     assert found.accepted
     assert {each.owner for reasons in found.changed for each in reasons} == {'elbow_joint'}
 
@@ -168,9 +172,9 @@ def test_another_scale_of_the_device_is_no_change_of_the_arm(earlier, ppm, told)
     if told:
         there = replace(true, base=random_frame(np.random.default_rng(3), 3.0))
     seen = problem(there, 10, 1)
-    grown = replace(seen.observations, positions=seen.observations.positions * (1.0 + 1e-6 * ppm))
+    grown = but(seen, positions=seen.observations.positions * (1.0 + 1e-6 * ppm))
     new = ('base',) * told
-    found = recalibrate(previous, replace(seen, observations=grown), 0.1, new=new)
+    found = recalibrate(previous, grown, 0.1, new=new)
     assert not found.accepted
     assert 1e6 * found.outside.change[0] == pytest.approx(ppm, abs=60.0)
     assert f'scale of the measuring device changed, by {ppm:+.0f}'[:-3] in found.refusal()[0]
@@ -191,8 +195,7 @@ def test_one_gross_error_among_few_poses_is_named(earlier, slip):
     seen = problem(now, 9, 2)
     positions = seen.observations.positions.copy()
     positions[3] += [0.02, -0.01, 0.03]
-    wrong = replace(seen, observations=replace(seen.observations, positions=positions))
-    found = recalibrate(previous, wrong, 0.1)
+    found = recalibrate(previous, but(seen, positions=positions), 0.1)
     assert not found.accepted
     assert found.odd == 'pose 4'
     assert 'pose 4 contradicts all others' in found.refusal()[0]
@@ -205,9 +208,7 @@ def test_one_pose_shows_no_change(earlier, seed):
     true, previous = earlier
     slipped = true.with_offsets({'elbow_joint.theta': 2e-3})
     seen = problem(true, 1, seed)
-    positions = seen.observations.positions.copy()
-    positions[0] += [2e-3, -1e-3, 2e-3]
-    wrong = replace(seen, observations=replace(seen.observations, positions=positions))
+    wrong = but(seen, positions=seen.observations.positions + np.array([2e-3, -1e-3, 2e-3]))
     for single in (wrong, problem(slipped, 1, seed)):
         found = recalibrate(previous, single, 0.1)
         assert found.changed
@@ -258,23 +259,23 @@ def test_another_arm_is_not_mended_by_8_poses(earlier):
     assert found.refusal()[1] == ANEW
 
 
-def test_new_poses_in_other_units_are_named(earlier):
-    true, previous = earlier
-    seen = problem(true, 15, 1)
-    wrong = replace(seen.observations, positions=1e3 * seen.observations.positions)
-    with pytest.raises(InputError, match='in mm, not metres: --length mm'):
-        recalibrate(previous, replace(seen, observations=wrong), 0.1)
+IN_MM = np.where(np.arange(15)[:, np.newaxis] < 7, 1.0, 1e3)
+HALF = 'in poses 8 to 15 of 15 alone, the positions are in mm'
 
 
-@pytest.mark.parametrize('seed', range(1, 4))
-def test_new_poses_of_which_half_are_in_other_units_are_named(earlier, seed):
+@pytest.mark.parametrize(
+    ('seed', 'change', 'said'),
+    [
+        (1, lambda s: {'positions': 1e3 * s.positions}, 'in mm, not metres: --length mm'),
+        (1, lambda s: {'joints': s.joints[:, [0, 2, 1, 3, 4, 5]]}, 'elbow_joint are swapped'),
+        *((k, lambda s: {'positions': IN_MM * s.positions}, HALF) for k in (1, 2, 3)),
+    ],
+)
+def test_mistakes_in_new_poses_are_named(earlier, seed, change, said):
     true, previous = earlier
     seen = problem(true, 15, seed)
-    positions = seen.observations.positions.copy()
-    positions[7:] *= 1e3
-    wrong = replace(seen, observations=replace(seen.observations, positions=positions))
-    with pytest.raises(InputError, match='in poses 8 to 15 of 15 alone, the positions are in mm'):
-        recalibrate(previous, wrong, 0.1)
+    with pytest.raises(InputError, match=said):
+        recalibrate(previous, but(seen, **change(seen.observations)), 0.1)
 
 
 def test_what_moves_while_new_poses_are_measured_is_named(earlier):
@@ -287,15 +288,6 @@ def test_what_moves_while_new_poses_are_measured_is_named(earlier):
     assert not found.accepted
     why, _ = found.refusal()
     assert 'measured: the zero of elbow_joint moved by 0.95 mrad before line 10' in why
-
-
-def test_swapped_columns_of_new_poses_are_named(earlier):
-    true, previous = earlier
-    seen = problem(true, 10, 1)
-    swapped = seen.observations.joints[:, [0, 2, 1, 3, 4, 5]]
-    wrong = replace(seen, observations=replace(seen.observations, joints=swapped))
-    with pytest.raises(InputError, match='shoulder_lift_joint and elbow_joint are swapped'):
-        recalibrate(previous, wrong, 0.1)
 
 
 def test_what_is_needed_is_asked_for(earlier):
