@@ -247,6 +247,7 @@ def head(chain: Chain, what: str, error: float, digest: str) -> str:
 
 def urdf_export(name: str, urdf: str, chain: Chain, links: Mapping[str, str | None]) -> Export:
     """Return a corrected URDF; the comment at its end identifies it."""
+    urdf = re.sub('<!-- calibrated table [0-9a-f]* -->\n', '', urdf)  # corrected before
     foot = f'<!-- calibrated table {table_hash(chain)} -->\n'
     return Export(name, corrected_urdf(urdf, chain, **links) + foot, 0.0)
 

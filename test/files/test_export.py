@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import yaml
+from urdfs import UR10E
 
 from calib_ros.apply.simulation import Cell, faulty
 from calib_ros.files import export
@@ -17,6 +18,7 @@ from calib_ros.files.export import (
     exports,
     kinematics_yaml,
     pose_matrix,
+    urdf_export,
 )
 from calib_ros.files.programs import joints_csv
 from calib_ros.kinematics.chain import Chain, Convention, Frame, Joint
@@ -25,6 +27,7 @@ from calib_ros.kinematics.chain_file import (
     load_chain,
     parse_chain,
     shipped_robots,
+    table_hash,
 )
 from calib_ros.kinematics.parameter import DH_KINDS
 
@@ -232,6 +235,16 @@ def test_a_file_that_differs_is_refused(monkeypatch):
     monkeypatch.setattr(export, 'xyz_rpy', lambda matrix: dict.fromkeys(KEYS, 0.0))
     with pytest.raises(ExportError, match=r'kinematics\.yaml, read back, differs'):
         exports(chain, nominal)
+
+
+def test_a_urdf_corrected_again_names_only_its_own_table():
+    once, twice = (
+        load_chain('ur10e').with_offsets({'elbow_joint.theta': x}) for x in (1e-3, 2e-3)
+    )
+    first = urdf_export('a.urdf', UR10E, once, {}).content
+    again = urdf_export('b.urdf', first, twice, {}).content
+    assert again == urdf_export('b.urdf', UR10E, twice, {}).content
+    assert re.findall('calibrated table (.*) -->', again) == [table_hash(twice)]
 
 
 @pytest.fixture
