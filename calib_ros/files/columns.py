@@ -86,7 +86,7 @@ class Columns:
             remedy += ', or its decimal point as a comma' * (self.decimal == ',')
         if DECIMAL_COMMA.fullmatch(bare):
             told = f'; if these are thousands, {remedy}' * bool(THOUSANDS.fullmatch(bare))
-            remedy = f'write a point, or give --decimal comma{told}'
+            remedy = f'write a point or, of measurements, give --decimal comma{told}'
         of_units = row == 0 and bare.lower() not in MISSING and not re.search('[0-9]', bare)
         if of_units:  # perhaps, as other tables have below their header
             remedy += '; units belong into the header: q1 [deg]'
@@ -279,8 +279,8 @@ def csv_blocks(
     try:
         for row in reader:
             before, line = line, reader.line_num
-            hidden = sum(cell.count(separator) for cell in row) if line - before > 1 else 0
-            if hidden and hidden + len(row) - 1 == (line - before) * (width - 1):
+            within = separator.join(row).split('\n') if line - before > 1 < width else ()
+            if {part.count(separator) for part in within} == {width - 1}:  # a note has others
                 line = before
                 raise csv.Error('whole rows are within quotation marks')
             width = len(row) or width
