@@ -25,6 +25,7 @@ from calib_ros.decision.region import Region
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.kinematics.follower import Follower, Solution
+from calib_ros.kinematics.inverse import a_turn_away
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.progress import Notify, quiet
 from calib_ros.settings import EXACT, LEVER, TURN_IN_PART, Limits
@@ -212,7 +213,8 @@ def _unreached(compensator: Compensator, result: Compensation) -> list[Refusal]:
             i = int(beyond[k].argmax())
             reason = (
                 f'the command {command[k, i]:.6g} of {names[i]} is beyond its limits '
-                f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m)'
+                f'{follower.lower[i]:.6g} to {follower.upper[i]:.6g} (rad or m, not degrees)'
+                + a_turn_away(compensator.nominal.joints[i], float(command[k, i]))
             )
         elif result.limited[k].any():
             held = [name for name, at in zip(names, result.limited[k], strict=True) if at]

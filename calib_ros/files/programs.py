@@ -32,7 +32,7 @@ from calib_ros.files.vocabulary import ANGLES, LENGTHS, POSE_COLUMNS, joint_colu
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.chain_file import TWO_TURNS
-from calib_ros.kinematics.inverse import limits
+from calib_ros.kinematics.inverse import a_turn_away, limits
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.texts import LARGEST_TEXT, csv_text, dump_yaml, parse_yaml, read_text
 from calib_ros.values import parse_numbers
@@ -81,6 +81,7 @@ def check_limits(
         raise InputError(
             f'{where(k, i)}{values[k, i]:.6g} is beyond the limits of {chain.joint_names[i]}, '
             f'{lower[i]:.6g} to {upper[i]:.6g} (rad or m{remedy(i)})'
+            + a_turn_away(chain.joints[i], float(values[k, i]))
         )
 
 

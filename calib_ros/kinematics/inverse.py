@@ -18,8 +18,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.chain_file import TWO_TURNS
 from calib_ros.kinematics.effects import coupled
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
+from calib_ros.kinematics.joint import Joint
 from calib_ros.kinematics.newton import NormalBatch, minimise_batch
 from calib_ros.kinematics.se3 import ROUNDING, ROUNDS, Flags, FloatArray, Index
 from calib_ros.settings import LEVER
@@ -140,3 +142,13 @@ def limits(chain: Chain) -> tuple[FloatArray, FloatArray]:
         np.array([-np.inf if lower is None else lower for lower, _ in ends]),
         np.array([np.inf if upper is None else upper for _, upper in ends]),
     )
+
+
+def a_turn_away(joint: Joint, value: float) -> str:
+    """Return in words that a value [rad] beyond the limits is within them full turns away."""
+    if joint.type == 'prismatic' or abs(value) > TWO_TURNS:  # perhaps degrees
+        return ''
+    turns = np.round((value - np.mean(joint.range)) / (2.0 * np.pi))
+    within = value - 2.0 * np.pi * turns
+    inside = joint.range[0] <= within <= joint.range[1]
+    return f'; a full turn away, {within:.6g} is within them: give that' * bool(turns and inside)

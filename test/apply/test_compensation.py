@@ -141,6 +141,8 @@ def test_a_command_beyond_a_limit_is_refused(side):
     assert f'the command {side * 3.2} of elbow_joint is beyond its limits -3.14159 to 3.14159' in (
         refusal.reason
     )
+    within = side * (3.2 - 2.0 * np.pi)
+    assert refusal.reason.endswith(f'a full turn away, {within:.6g} is within them: give that')
     tolerant = replace(compensator, largest_position_error=1.0, largest_orientation_error=1.0)
     assert 'the command' in only_refusal(compensate(tolerant, q)).reason
     for beyond, said in ((0.5, False), (2.0, True)):  # of what a command may lie beyond a limit
