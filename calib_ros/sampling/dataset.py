@@ -60,8 +60,8 @@ def lenses_by_frame(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens
             camera = frames.of(sample)[sample.eye_in_hand]
             if found.setdefault(camera, sample.view.lens) != sample.view.lens:
                 raise InputError(
-                    f'the CameraInfo of {sample.device or "the camera"} has changed: take the '
-                    'images of one calibration with one setting of the lens, or call ~/clear'
+                    f'the CameraInfo of {sample.device or "the camera"} has changed: one setting '
+                    'of the lens for all images (~/remove_last those since, or ~/clear)'
                 )
     return found
 

@@ -9,13 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib_ros.errors import InputError
 from calib_ros.estimation.configurations import SCATTER, configurations, distinct
 from calib_ros.estimation.levels import FEW, NEARER
 from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.account import LOST, lost
+from calib_ros.sampling.dataset import lenses_by_frame
 from calib_ros.sampling.live import START, Estimate, barely_moved
-from calib_ros.sampling.sample import Sample
+from calib_ros.sampling.sample import Sample, named
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
 from calib_ros.settings import EXCEPTION, Settings
 from calib_ros.shown import counted
@@ -125,12 +127,22 @@ def unmeasured(stops: int, between: int) -> list[Hint]:
     return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
 
-def unseen(images: int, measurements: int, reason: str) -> list[Hint]:
-    """Report that a large share of the images is not used, and why the last of them is not."""
-    if not reason or images <= EXCEPTION * measurements:
+def unseen(images: int, used: int, reason: str) -> list[Hint]:
+    """Report that the images of many stops are not used, and why the last of them is not."""
+    if not reason or images <= EXCEPTION * (images + used):
         return []
-    words = f'{images} of {measurements} images are not used, the last: {reason}'
+    words = f'at {images} of {images + used} stops the images are not used, the last: {reason}'
     return [Hint('', words, explains=False)]
+
+
+def refocused(samples: Sequence[Sample]) -> list[Hint]:
+    """Report a lens that changed between samples: no calibration may have several."""
+    seen = [each for each in samples if each.view is not None]
+    try:
+        lenses_by_frame(seen, named(seen))
+    except InputError as err:
+        return [Hint(str(err), str(err), explains=False)]
+    return []
 
 
 def losses(received: Mapping[str, int], dropped: Mapping[str, int]) -> list[Hint]:

@@ -22,7 +22,7 @@ from calib_ros.kinematics.chain import Chain, refuse_other_joints
 from calib_ros.sampling.account import Account
 from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset_of
 from calib_ros.sampling.delay import Delay
-from calib_ros.sampling.hints import Hint, frozen, losses, progress, unheard, unseen
+from calib_ros.sampling.hints import Hint, frozen, losses, progress, refocused, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
 from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter, Part
 from calib_ros.sampling.messages import frame_name
@@ -244,8 +244,9 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        images, reason = self.pictures.dropped.total(), self.pictures.reason
-        found += unseen(images, self.received[POSES], reason)
+        found += refocused(self.samples)
+        views = sum(each.view is not None for each in self.samples)
+        found += unseen(self.pictures.dropped.total(), views, self.pictures.reason)
         found += self._pipeline.hints(self.received[POSES])
         if any(hint.explains for hint in found):
             return found

@@ -103,6 +103,7 @@ def messages(shift, kind, until=STOPS):
     return sorted(found, key=lambda each: stamp_ns(each[1]))
 
 
+IMAGE_FIELDS = ('height', 'width', 'step', 'encoding', 'data')
 TOPICS = {Image: 'cam/image_raw', CompressedImage: 'cam/image_raw/compressed'}
 
 
@@ -217,8 +218,30 @@ def test_a_lens_that_changed_is_refused_though_it_changed_back(shift, board, unt
         other.header, other.k[0] = header(shift[2][k - 1][-1] + 1, 'camera'), focal
         come.append(('cam/camera_info', other))
     session = directly(sorted(come, key=lambda each: stamp_ns(each[1])), given)
+    session.finish()
     with pytest.raises(CalibrationError, match='the CameraInfo of camera has changed'):
         session.problem()
+    assert 'the CameraInfo of camera has changed' in session.status()
+    assert session.doubtful
+    for _ in session.samples[3:]:
+        session.remove_last()
+    assert 'CameraInfo' not in session.status()
+
+
+def test_why_stops_have_no_image_is_told_however_many_images_come(shift, board):
+    come = messages(shift, Image, 4)
+    joints = [each for each in come if each[0] == 'joint_states']
+    images = [(topic, m) for topic, m in come if isinstance(m, Image)]
+    for topic, message in images[::EACH]:
+        for k in range(1, 20):
+            more = Image(**{name: getattr(message, name) for name in IMAGE_FIELDS})
+            more.header = header(stamp_ns(message) + k * 1_000_000, 'camera')
+            joints.append((topic, more))
+    session = directly(sorted(joints, key=lambda each: stamp_ns(each[1])), sources(board, Image))
+    session.finish()
+    assert session.received['measurements'] > 10 * 4
+    assert 'at 4 of 4 stops the images are not used' in session.summary
+    assert 'no CameraInfo of it has come on cam/camera_info' in session.summary
 
 
 class Slow:
@@ -300,7 +323,7 @@ def test_an_image_that_does_not_fit_its_camera_info_is_refused(shift, board):
     (camera,) = cameras_of(sources(board, Image)).values()
     come = messages(shift, Image, 1)
     info, image = (next(e for _, e in come if isinstance(e, k)) for k in (CameraInfo, Image))
-    assert camera.look(image).reason == 'no CameraInfo of it has come'
+    assert camera.look(image).reason == 'no CameraInfo of it has come on cam/camera_info'
     camera.learn(CameraInfo())
     assert 'not calibrated' in camera.look(image).reason
     camera.learn(info)
