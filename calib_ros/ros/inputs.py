@@ -28,7 +28,8 @@ from rclpy.subscription import Subscription
 from calib_ros.errors import ConfigError
 from calib_ros.sampling.batches import BATCH, Stream, links_of
 from calib_ros.sampling.messages import PICTURES
-from calib_ros.sampling.slices import SILENCE
+from calib_ros.sampling.slices import NO_ACCIDENT, SILENCE
+from calib_ros.settings import EXCEPTION
 
 QUEUE, IMAGE_QUEUE = 5 * BATCH // 2, BATCH // 100
 """Messages and images of a topic that may wait while the node is busy: for seconds, on a busy
@@ -77,6 +78,12 @@ class Hearing:
         if fresh:
             quick = self.last is not None and now - self.last < 0.5 * SILENCE
             self.continuous, self.last = self.continuous or quick, now
+
+    @property
+    def gone(self) -> float:
+        """Return the share lost in transit if it is large, and as long as more is lost."""
+        share = self.lost / max(self.lost + self.count, 1)
+        return share if self.losing and share > EXCEPTION and self.lost >= NO_ACCIDENT else 0.0
 
     @property
     def silent(self) -> bool:
@@ -144,6 +151,8 @@ class Inputs:
             hearing.look(now, span)
         topics = self._topics.items()
         self.failures = [f'no more messages on {topic}' for topic, each in topics if each.silent]
+        gone = [(topic, 100.0 * each.gone) for topic, each in topics if each.gone]
+        self.failures += [f'{share:.0f} % of {topic} is lost on the way' for topic, share in gone]
         deaf = [(topic, each.deaf) for topic, each in topics if each.deaf and not each.count]
         self.failures += [f'{topic} is published {how} is asked for' for topic, how in deaf]
         self.failures += self._of_other_types()

@@ -130,6 +130,7 @@ def test_a_queue_holds_no_more_than_fast_dds_and_an_overflow_is_told(tmp_path, r
 def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, recording):
     with Cell() as cell, Child(domain=cell.domain, chain='ur10e', data_dir=tmp_path) as child:
         reports = cell.listen(DiagnosticArray, '/diagnostics', 10)
+        status = cell.listen(String, 'calibration_node/status')
         publisher = cell.publisher(JointState, 'joint_states', ReliabilityPolicy.BEST_EFFORT)
 
         def told():
@@ -162,6 +163,21 @@ def test_what_is_lost_while_the_process_stands_still_is_counted(tmp_path, record
         missing = sent - first - settled()[0]
         cell.spin_until(lambda: publish() or told()[1] >= missing)
         assert missing > 1000
+        cell.spin_until(lambda: any(' % of /joint_states is lost' in s.data for s in status))
+
+
+def test_a_large_share_is_told_as_lost_as_long_as_more_is():
+    heard = inputs_module.Hearing(count=80)
+    heard.note_lost(20)
+    heard.look(1.0, 1.0)
+    assert heard.gone == 0.2
+    heard.count = 200
+    heard.look(2.0, 1.0)
+    assert heard.gone == 0.0
+    heard.note_lost(21)  # of so many that it is an exception
+    heard.look(3.0, 1.0)
+    assert heard.losing
+    assert heard.gone == 0.0
 
 
 def test_what_dds_tells_of_losses_never_goes_below_zero():
