@@ -262,7 +262,7 @@ def _of_joints(chain: Chain) -> Iterator[Suspect]:
         what, change = f'the joints are {where}', (_joints(same[places]),)
         yield Suspect(what, f'--columns {columns}', change, 2, published=published, part='order')
     ends = ((0, 'device moves'), (len(names) - 1, 'target does not move'))
-    for k, stands in ends if len(names) > 1 else ():
+    for k, stands in ends:
         what, remedy = f'the {stands} with {names[k]}', 'leave this joint out of the chain file'
         still = _joints(same - np.outer(same[k], same[k]))
         yield Suspect(what, f'{remedy}, or --columns q{k + 1}=0', (still,), published=remedy)

@@ -17,6 +17,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import minimise
+from calib_ros.estimation.levels import SURE
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics import se3
 from calib_ros.report.documents import as_document
@@ -213,6 +214,19 @@ def test_poses_of_several_targets_are_told_by_their_lines():
     odd = replace(odd, tool='tool_1')
     result = identify(Problem(UR10E, even, **SIGMAS, more=(odd,)))
     assert f'before line {AT + 1} (if rows are in the order of' in str(result.step)
+
+
+@pytest.mark.parametrize(('share', 'found'), [(0.9, True), (1.1, False)])
+def test_a_step_by_chance_is_one_of_all_groups_and_stops(share, found, monkeypatch):
+    """By an F test, with the freedoms of the fit."""
+    true, seen = session(3)
+    fitted = fitting.fit(Problem(UR10E, moved(seen, true, 'tool', 1e-3), **SIGMAS))[2]
+    told, trials = set(), COUNT * (2 + len(UR10E.joints))
+    seldom = share * (1.0 - SURE) / trials
+    monkeypatch.setattr(steps, 'chance_of', lambda *given: told.add(given[1:]) or seldom)
+    assert (find_step(fitted) is not None) == found
+    freedom = 6 * COUNT - len(fitted.names)
+    assert told == {(1, freedom - 1), (6, freedom - 6)}
 
 
 def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):

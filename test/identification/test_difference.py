@@ -142,13 +142,6 @@ def test_what_a_parameter_shares_with_others_is_a_share():
     assert 0.1 < left[3] < 1.0
 
 
-@pytest.mark.parametrize(('frames', 'owners'), [((), {'elbow'}), (('tool',), {'elbow', 'quill'})])
-def test_frames_that_cannot_have_moved_take_what_they_can(frames, owners):
-    """A tilted quill moves its tip as the elbow does, and as another tool would."""
-    found = Effects(SCARA, [Parameter('elbow.theta')], frames)
-    assert {owner for owner, _ in found.sets} == owners
-
-
 def test_reasons_of_one_effect_are_told_together():
     names = (Parameter('elbow_joint.theta'), Parameter('wrist_1_joint.theta'))
     matrix = np.full((2, 2), 1e10)

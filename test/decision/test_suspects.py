@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which of equivalent mistakes are named, and which may occur together."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib_ros import load_chain
+from calib_ros.apply.simulation import measure
+from calib_ros.decision.suspects import suspects
+from calib_ros.kinematics.chain import Frame
+
+DEGREES = 'and the joint values in degrees'
+BASE_ZERO = 'has its zero 90 degrees away'
+LAST = 'linear_axis_joint and shoulder_pan_joint last'
+RANKS = {
+    'the positions and linear joints are in mm, not metres': (1, 'measured'),
+    f'the positions and linear joints are in mm, not metres {DEGREES}': (2, 'measured'),
+    'the positions are in mm, not metres': (2, 'measured'),
+    'the linear joints are in mm, not metres': (2, 'measured'),
+    'the quaternions are w x y z, not x y z w': (1, 'measured'),
+    f'the quaternions are w x y z, not x y z w, {DEGREES}': (2, 'measured'),
+    'the axes of the measuring device are left-handed': (3, 'handed'),
+    'the joint values are in degrees, not radians': (1, 'measured'),
+    f'elbow_joint {BASE_ZERO}': (1, 'elbow_joint'),
+    'elbow_joint counts the other way round': (1, 'elbow_joint'),
+    f'elbow_joint counts the other way round and {BASE_ZERO}': (2, 'elbow_joint'),
+    'elbow_joint and wrist_1_joint are swapped': (2, 'order'),
+    'the joints are in the order from tool to base': (2, 'order'),
+    f'the joints are in another order, {LAST}': (2, 'order'),
+    'the device moves with linear_axis_joint': (1, ''),
+    'elbow_joint is not given against shoulder_lift_joint: they are coupled': (2, 'elbow_joint'),
+    'elbow_joint is in degrees, the other joints in radians': (2, 'elbow_joint'),
+    'the lengths of the chain file are in mm, not metres': (1, ''),
+    'the DH table is in the modified convention, not the standard one': (3, ''),
+    'the chain file gives a wrong base (fixed: true)': (3, ''),
+    'the joint values stand 2 rows above their measurement': (2, ''),
+}
+
+
+def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
+    """Mistakes of one part exclude each other; without one they are alone."""
+    rail = load_chain('ur10e_on_linear_axis')
+    held = replace(rail, base=Frame(fixed=True), tool=Frame(fixed=True))
+    seen = measure(held, rail.random_joints(20, rng), rng)
+    found = {each.what: (each.rank, each.part) for each in suspects(held, (seen,))}
+    assert {what: found.get(what) for what in RANKS} == RANKS
+    sister = replace(load_chain('ur5e'), base=None, tool=None)
+    ranks = [
+        e.rank for e in suspects(sister, (seen.select(np.arange(0)),)) if 'arm is a' in e.what
+    ]
+    assert ranks
+    assert set(ranks) == {2}
