@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""When mistakes are looked for, and which of several explanations are named."""
+
+from types import SimpleNamespace
+
+import pytest
+from fits import UR10E, measured_arm
+
+from calib_ros import Problem, identify
+from calib_ros.decision import mistakes
+from calib_ros.decision.mistakes import _named, _several, _suspicious
+from calib_ros.decision.suspects import Suspect
+
+FAULTY = SimpleNamespace(largest_error=0.5, largest_length=0.1, largest_angle=0.2, sets=())
+
+
+def test_good_results_are_not_searched(monkeypatch):
+    monkeypatch.setattr(mistakes, 'explained', None)
+    assert identify(Problem(UR10E, measured_arm(1, 40)[2])).accepted
+
+
+def figures(mm=499.0, mrad=199.0):
+    return SimpleNamespace(rms_mm=mm, rms_mrad=mrad)
+
+
+def judged(*each, outliers=0.3):
+    return SimpleNamespace(figures_of_all=each, share_of_outliers=outliers)
+
+
+@pytest.mark.parametrize(
+    ('change', 'suspicious'),
+    [
+        ({}, False),
+        ({'refusals': ('not',)}, False),
+        ({'converged': False}, True),
+        ({'coupled': True}, True),
+        ({'coupled': True, 'refusals': ('not',)}, False),
+        ({'validation': judged(figures(501.0), figures())}, True),
+        ({'validation': judged(figures(), figures(mrad=201.0))}, True),
+        ({'validation': judged(figures(mrad=None), figures(), outliers=0.36)}, True),
+        ({'validation': None}, False),
+        ({'validation': None, 'fitted': judged(figures(), figures(501.0))}, True),
+        ({'fitted': judged(figures(501.0), figures())}, True),
+        ({'fitted': judged(figures(), figures(501.0))}, False),  # judged on other poses
+        ({'parameters': [SimpleNamespace(beyond=lambda *limits: limits == (0.1, 0.2))]}, True),
+        ({'parameters': [SimpleNamespace(beyond=lambda *limits: False)]}, False),
+    ],
+)
+def test_mistakes_are_looked_for_where_errors_are_those_of_no_faulty_arm(change, suspicious):
+    usual = judged(figures(), figures())
+    result = {
+        'converged': True,
+        'refusals': (),
+        'coupled': False,
+        'validation': usual,
+        'fitted': usual,
+        'parameters': (),
+    }
+    assert _suspicious(FAULTY, SimpleNamespace(**result | change)) == suspicious
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """Return a function that sets the suspects, and the share of errors that some leave."""
+
+    def search(options, shares, pairs=()):
+        def trial_of(chain, sets, bare=None):
+            share = shares.get(''.join(sorted(sets[0])), 1.0)
+            return SimpleNamespace(share=share, error=share) if share else None
+
+        suspects = [
+            Suspect(
+                name,
+                f'undo {name}',
+                (lambda each, name=name: each | {name},),
+                rank=rank,
+                part=part,
+                published=f'publish {name}',
+            )
+            for name, rank, part in options
+        ]
+        hidden = [tuple(one for one in suspects if one.what in pair) for pair in pairs]
+        monkeypatch.setattr(mistakes, 'suspects', lambda *_: suspects)
+        monkeypatch.setattr(mistakes, 'hidden', lambda *_: hidden)
+        monkeypatch.setattr(mistakes, 'trial_of', trial_of)
+        monkeypatch.setattr(mistakes, 'refined', lambda problem, trial: trial)
+
+    return search
+
+
+def given(share=1.0, error=1.0):
+    return SimpleNamespace(sets=(frozenset(),), share=share, error=error)
+
+
+@pytest.mark.parametrize(
+    ('shares', 'ranks', 'named'),
+    [
+        ({'a': 0.1}, {}, 'a'),
+        ({'a': 0.1, 'b': 0.14}, {}, 'ab'),  # as good
+        ({'a': 0.1, 'b': 0.14}, {'b': 2}, 'a'),  # but less usual
+        ({'a': 0.1, 'b': 0.14}, {'a': 2}, 'b'),
+        ({'a': 0.1, 'b': 0.16}, {'b': 2}, 'ab'),  # another explanation, nearly as good
+        ({'a': 0.1, 'b': 0.35}, {}, 'a'),
+        ({'a': 0.29}, {}, 'a'),
+        ({'a': 0.31}, {}, ''),  # not clearly better than the given input
+        ({'a': 0.1, 'b': 0.11, 'c': 0.12, 'd': 0.13}, {}, 'abc'),
+        ({'a': 0.14, 'b': 0.0, 'g': 0.1}, {}, 'ga'),  # b has no closed form
+    ],
+)
+def test_of_equal_explanations_the_most_usual_are_named(searched, shares, ranks, named):
+    searched([(name, ranks.get(name, 1), '') for name in 'abcdefg'], shares)
+    found = _named(FAULTY, UR10E, (), given())
+    assert ''.join(each.what for each in found.suspects if found) == named if named else not found
+    if named:
+        assert (found.given, found.corrected) == (1.0, min(filter(None, shares.values())))
+
+
+def test_an_explanation_leaves_a_faulty_arm_and_much_less_of_the_spread(searched):
+    searched([('a', 1, '')], {'a': 0.2})
+    assert _named(FAULTY, UR10E, (), given())
+    assert _named(FAULTY, UR10E, (), given(share=2.0))
+    assert not _named(FAULTY, UR10E, (), given(share=0.6))
+    assert not _named(FAULTY, UR10E, (), given(error=0.6))
+    assert not _named(SimpleNamespace(**vars(FAULTY) | {'largest_error': 0.0}), UR10E, (), given())
+
+
+MISTAKES = [('a', 1, 'measured'), ('b', 1, 'order'), ('c', 1, 'j1'), ('d', 1, 'j2')]
+
+
+@pytest.mark.parametrize(
+    ('shares', 'named'),
+    [
+        ({'a': 0.8, 'ab': 0.5, 'abd': 0.1}, 'abd'),
+        ({'d': 0.8, 'bd': 0.5, 'abd': 0.1}, 'abd'),  # in the order of undoing
+        ({'a': 0.8, 'ab': 0.5, 'abc': 0.35, 'abcd': 0.1}, 'abcd'),
+        ({'a': 0.8, 'ab': 0.77, 'abc': 0.1}, ''),  # the second is no better
+        ({'a': 0.8, 'ab': 0.75, 'abc': 0.1}, 'abc'),
+        ({'c': 1.01, 'cd': 0.1}, 'cd'),  # they hide each other
+        ({'a': 0.1}, ''),  # a single one is named otherwise
+        ({'a': 0.8, 'ab': 0.31}, ''),
+        ({'a': 0.8, 'ab': 0.29}, 'ab'),
+        ({'a': 0.8, 'b': 0.0, 'ab': 0.0, 'ac': 0.2}, 'ac'),  # no closed form
+    ],
+)
+def test_mistakes_at_once_are_searched_one_by_one(searched, shares, named):
+    searched(MISTAKES, shares)
+    found = _several(FAULTY, UR10E, given())
+    assert (found is not None) == bool(named)
+    if named:
+        (both,) = found.suspects
+        assert both.remedy == '; '.join(f'{name} (undo {name})' for name in named)
+        assert both.published == '; '.join(f'{name} (publish {name})' for name in named)
+        assert (found.given, found.corrected) == (1.0, shares[named])
+
+
+def test_mistakes_of_one_part_are_not_made_at_once(searched):
+    searched([('a', 1, 'order'), ('b', 1, 'order'), ('c', 1, '')], {'ab': 0.1, 'ac': 0.1})
+    assert _several(FAULTY, UR10E, given()) is None
+    searched([('a', 1, 'order'), ('b', 1, 'j1')], {'ab': 0.1})
+    assert _several(FAULTY, UR10E, given(error=0.4)) is None  # a faulty arm is no worse
+
+
+def test_signs_that_hide_each_other_are_tried_together(searched):
+    """Six others are better alone, so that one of these would not be kept."""
+    alone = {name: 0.9 + 0.01 * k for k, name in enumerate('abcdef')}
+    options = [(name, 1, f'j{name}') for name in 'abcdefgh']
+    searched(options, alone | {'gh': 0.1})
+    assert _several(FAULTY, UR10E, given()) is None
+    searched(options, alone | {'gh': 0.1}, pairs=['gh'])
+    assert _several(FAULTY, UR10E, given()).suspects[0].remedy == 'g (undo g); h (undo h)'
