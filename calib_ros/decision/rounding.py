@@ -57,7 +57,7 @@ def _step(values: FloatArray) -> float:
     few = values[:3, np.newaxis] / STEPS
     likely = np.compress(np.abs(few - np.round(few)).max(axis=0) < ROUNDED, STEPS).tolist()
     step = next((s for s in sorted(likely, reverse=True) if _are_multiples(values, s)), 0.0)
-    wider = _are_multiples(values, CLEARLY * step) if step else True
+    wider = step and _are_multiples(values, CLEARLY * step)
     return 0.0 if wider or len(np.unique(values)) < 3 else step
 
 

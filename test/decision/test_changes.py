@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from fits import SCARA
 
+from calib_ros.decision import changes
 from calib_ros.decision.changes import Effects, Information, shown
 from calib_ros.kinematics.parameter import Parameter
+from calib_ros.settings import LEVER
 
 
 @pytest.mark.parametrize(('frames', 'owners'), [((), {'elbow'}), (('tool',), {'elbow', 'quill'})])
@@ -21,6 +23,22 @@ def test_another_height_of_the_target_shows_as_one_of_the_device():
     names = [Parameter('elbow.theta'), Parameter('base.z')]
     assert shown(SCARA, names, [Parameter('tool.z')]) == names[1:]
     assert shown(SCARA, names, [Parameter('tool.x')]) == []
+
+
+@pytest.mark.parametrize(
+    ('names', 'free', 'lever'),
+    [
+        (['base.rx'], False, 0.0),
+        (['base.rx', 'tool.rx'], False, LEVER),
+        (['base.rx'], True, LEVER),
+    ],
+)
+def test_turns_count_where_those_of_the_target_are_known(names, free, lever, monkeypatch):
+    told = []
+    follow = changes.followed
+    monkeypatch.setattr(changes, 'followed', lambda *x, **y: told.append(x[4]) or follow(*x, **y))
+    changes.gauged(SCARA, [*map(Parameter, names)], [Parameter('arm.theta')], free)
+    assert told == [lever]
 
 
 @pytest.mark.parametrize(('size', 'times'), [(1.0, 1.0), (5.0, 10.0), (1e3, 100.0)])

@@ -14,7 +14,7 @@ from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision import steps
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.steps import find_step
+from calib_ros.decision.steps import Step, find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import minimise
 from calib_ros.estimation.levels import SURE
@@ -192,6 +192,22 @@ def test_without_stamps_the_order_of_the_rows_is_said():
         'the target moved by 0.8 mm (tool) before line 27 (if rows are in the order of '
         'measurement)'
     )
+
+
+@pytest.mark.parametrize(
+    ('where', 'told'),
+    [
+        ({}, 'before pose 5 of set 2 (stamp 3.500 s)'),
+        ({'image': 2}, 'before image 3 of set 2 (stamp 3.500 s)'),
+        ({'stamp_ns': 7 * 10**9, 'set': 0}, 'before line 7 (if rows are in the order'),
+        ({'stamp_ns': 7 * 10**9, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
+        ({'stamp_ns': 10**15}, 'before pose 5 of set 2 (stamp 1000000.000 s)'),
+    ],
+)
+def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
+    given = {'kind': 'base', 'set': 1, 'sample': 4, 'stamp_ns': 3_500_000_000, 'image': None}
+    step = Step('base', thing='the device', size=1e-3, unit='m', share=0.9, unused='', **given)
+    assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
 
 
 @pytest.mark.parametrize('aside', [0.0, 1.5])

@@ -5,6 +5,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
@@ -52,3 +53,17 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     ]
     assert ranks
     assert set(ranks) == {2}
+
+
+@pytest.mark.parametrize(('size', 'times'), [(0.5, '2'), (1.25, '0.8'), (0.3, '3.33')])
+def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(20, rng), rng)
+    stated = replace(seen, positions=seen.positions / size)
+    found = list(suspects(arm, (stated,), of_images=True))
+    (board,) = (each for each in found if each.what.startswith('the board is'))
+    assert board.what == f'the board is stated {times} times as large as it is'
+    np.testing.assert_allclose(board.undone((stated,))[0].positions, seen.positions)
+    assert {each.part for each in found[:4]} == {'measured'}
+    assert {each.remedy for each in found if each.rows} == {'correct it in --places'}
+    assert 'convention: modified in the chain file' in {each.remedy for each in found}
