@@ -224,13 +224,11 @@ def _lag(problem: Problem, result: Identification) -> Identification:
     if result.noise.position <= 1.0 or known or not stands:
         return result
     first, *more = map(_with_moves, problem.sets)
-    bases = {each.base for each in (first, *more) if each.moving}
-    if not bases:
-        return result
+    bases = sorted({each.base for each in problem.sets})
     late, chain = replace(problem, observations=first, more=more, held_out=()), result.chain
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
-    delays = [Parameter(name, DELAY) for name in sorted(bases)]
+    delays = [Parameter(name, DELAY) for name in bases]
     share = explained_share(late, chain, result.names, delays)
     if share < EXPLAINED:
         return result

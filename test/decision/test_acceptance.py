@@ -7,10 +7,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import SIGMAS, UR10E, measured_arm
+from fits import SCARA, SIGMAS, UR10E, measured_arm
 from scipy import stats
 
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision import acceptance
 from calib_ros.decision.acceptance import _loss_by_chance, oddities, refusals
 from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.levels import CERTAIN
@@ -54,6 +55,17 @@ def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_t
         assert rules == [Rule.LARGEST_ERROR] * refused
     (scale,) = refusals(problem, result, None, False, True, -0.02)
     assert 'shrink alike, by 2 %' in scale
+
+
+@pytest.mark.parametrize(('tilt', 'told'), [(0.9e-3, True), (1.1e-3, False)])
+def test_a_tool_that_points_one_way_is_told(rng, tilt, told):
+    """But for an arm's own angle errors: a leaning first axis tilts it with the arm's turn."""
+    leaning = replace(SCARA.joints[0], alpha=tilt)
+    chain = replace(SCARA, joints=(leaning, *SCARA.joints[1:]))
+    q = chain.random_joints(400, rng)
+    q[:, 0] = 0.5 * np.pi * rng.integers(4, size=400)
+    problem = SimpleNamespace(chain=chain, sets=[SimpleNamespace(joints=q)])
+    assert ('points one way' in acceptance._together(problem)) == told
 
 
 def test_the_loss_by_chance_is_that_of_a_paired_t_test(rng):

@@ -261,6 +261,8 @@ def test_few_samples_show_no_errors_of_time(count, named):
         sizes *= np.linalg.norm(speeds, axis=1) ** 3 if named else 1.0
         result = SimpleNamespace(distances=[sizes], noise=SimpleNamespace(position=1.1))
         found += 'speed' in _motion(SimpleNamespace(sets=[seen]), result)
+        result.noise.position = 1.0  # as stated: nothing is left to explain
+        assert not _motion(SimpleNamespace(sets=[seen]), result)
     assert found == named
 
 

@@ -125,6 +125,13 @@ def test_an_explanation_leaves_a_faulty_arm_and_much_less_of_the_spread(searched
     assert not _named(SimpleNamespace(**vars(FAULTY) | {'largest_error': 0.0}), UR10E, (), given())
 
 
+def test_what_is_wrong_with_some_rows_is_not_the_arm(searched, monkeypatch):
+    searched([], {'': 0.1})
+    monkeypatch.setattr(mistakes, 'suspects', lambda *_: [Suspect('arm', 'change', chain=UR10E)])
+    assert _named(FAULTY, UR10E, (), given()).suspects[0].what == 'arm'
+    assert not _named(FAULTY, UR10E, (), given(), of_rows=True)
+
+
 MISTAKES = [('a', 1, 'measured'), ('b', 1, 'order'), ('c', 1, 'j1'), ('d', 1, 'j2')]
 
 

@@ -17,7 +17,7 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.decision.steps import Step, find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import minimise
-from calib_ros.estimation.levels import SURE
+from calib_ros.estimation.levels import LEAST_ASIDE, SURE
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics import se3
 from calib_ros.report.documents import as_document
@@ -230,6 +230,17 @@ def test_poses_of_several_targets_are_told_by_their_lines():
     odd = replace(odd, tool='tool_1')
     result = identify(Problem(UR10E, even, **SIGMAS, more=(odd,)))
     assert f'before line {AT + 1} (if rows are in the order of' in str(result.step)
+
+
+@pytest.mark.parametrize('count', [6, 30, 400])
+def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
+    some = steps._some_places(count)
+    assert [some[0], some[-1]] == [LEAST_ASIDE, count - LEAST_ASIDE]
+    aside = np.minimum(some, count - some)
+    gaps = np.diff(some)
+    np.testing.assert_array_equal(gaps[:-1], np.maximum(aside[:-2] // 10, 1))
+    assert (gaps[-1:] <= np.maximum(aside[-2:-1] // 10, 1)).all()
+    assert not len(steps._some_places(2 * LEAST_ASIDE - 1))
 
 
 @pytest.mark.parametrize(('share', 'found'), [(0.9, True), (1.1, False)])

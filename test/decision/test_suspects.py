@@ -9,6 +9,7 @@ import pytest
 
 from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
+from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.suspects import suspects
 from calib_ros.kinematics.chain import Frame
 
@@ -67,3 +68,11 @@ def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
     assert {each.part for each in found[:4]} == {'measured'}
     assert {each.remedy for each in found if each.rows} == {'correct it in --places'}
     assert 'convention: modified in the chain file' in {each.remedy for each in found}
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_a_board_that_is_seen_in_one_place_has_no_size(seed):
+    rng, arm = np.random.default_rng(seed), load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(20, rng), rng)
+    assert size_of(arm, seen) == pytest.approx(1.0)
+    assert size_of(arm, replace(seen, positions=np.zeros_like(seen.positions))) == 1.0
