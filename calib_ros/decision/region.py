@@ -123,14 +123,13 @@ def parse_rows(rows: Sequence[str], count: int, triangular: bool = False) -> Flo
     Raises ValueError if the number or length of the rows is wrong, or a value is not finite.
     """
     numbers = [np.array(row.split(), dtype=np.float64) for row in rows]
-    widths = range(1, count + 1) if triangular else [len(row) for row in numbers[:1]] * count
-    matrix = np.zeros((count, max(widths, default=0)))
-    whole = True
-    for row, given, width in zip(matrix, numbers, widths, strict=True):
-        whole = whole and len(given) == width
-        row[:width] = given if whole else np.nan
-    if not np.isfinite(matrix).all():
+    first = [len(row) for row in numbers[:1]]
+    widths = [*range(1, count + 1)] if triangular else first * count
+    if [*map(len, numbers)] != widths or not all(np.isfinite(row).all() for row in numbers):
         raise ValueError(f'{len(rows)} rows of finite numbers for {count} names')
+    matrix = np.zeros((count, max(widths, default=0)))
+    for row, given in zip(matrix, numbers, strict=True):
+        row[: len(given)] = given
     return matrix
 
 

@@ -11,7 +11,13 @@ from fits import UR10E, arm, rms
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision import region
-from calib_ros.decision.region import packed, region_of, region_of_record, unpacked_matrix
+from calib_ros.decision.region import (
+    packed,
+    parse_rows,
+    region_of,
+    region_of_record,
+    unpacked_matrix,
+)
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
 from calib_ros.kinematics.chain import Frame
@@ -64,6 +70,28 @@ def test_a_covariance_without_some_directions_survives_its_record(rng):
     square = root @ root.T
     found = unpacked_matrix(packed(square), 6)
     np.testing.assert_allclose(found, square, atol=1e-7 * square.max())
+
+
+@pytest.mark.parametrize(
+    ('rows', 'triangular', 'wanted'),
+    [
+        (['1', '2 3'], True, [[1, 0], [2, 3]]),
+        (['1 2 3', '4 5 6'], False, [[1, 2, 3], [4, 5, 6]]),
+        (['', ''], False, [[], []]),
+        (['1', '2 3'], False, None),
+        (['1', '2'], True, None),
+        (['1 2', '3'], False, None),
+        (['1', '2 3', '4 5 6'], True, None),
+        (['1', '2 nan'], True, None),
+        (['1'], False, None),
+    ],
+)
+def test_rows_are_of_one_length_or_up_to_the_diagonal(rows, triangular, wanted):
+    if wanted is None:
+        with pytest.raises(ValueError, match='rows of finite numbers for 2 names'):
+            parse_rows(rows, 2, triangular)
+    else:
+        np.testing.assert_array_equal(parse_rows(rows, 2, triangular), wanted)
 
 
 @pytest.mark.parametrize('seed', range(2))
