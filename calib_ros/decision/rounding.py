@@ -91,7 +91,7 @@ def may_be_rounding(fitted: Fitted, before: Chain, steps: Mapping[str, float]) -
     for name, level in levels.items():
         size = steps[Parameter(name).owner] / np.sqrt(12.0)
         column = size * rows[:, [wanted.index(name)]]
-        columns.append(column * (level[owner, np.newaxis] == np.arange(level.max() + 1)))
+        columns.append(column * (level[owner, np.newaxis] == np.unique(level)))
     beside = np.column_stack(columns)
     every = np.column_stack([beside, rows[:, len(frames) : len(frames) + len(arm)], rows[:, -1]])
     prior, count = np.zeros(every.shape[1]), beside.shape[1]

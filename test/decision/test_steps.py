@@ -12,12 +12,10 @@ from fits import NOISE, SIGMAS, UR10E, along_path
 
 from calib_ros import Observations, Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
-from calib_ros.decision import steps
 from calib_ros.decision.reasons import Rule
-from calib_ros.decision.steps import Step, find_step
+from calib_ros.decision.steps import find_step
 from calib_ros.estimation import fitting
 from calib_ros.estimation.leastsquares import minimise
-from calib_ros.estimation.levels import LEAST_ASIDE, SURE
 from calib_ros.estimation.robust import Robust
 from calib_ros.kinematics import se3
 from calib_ros.report.documents import as_document
@@ -194,22 +192,6 @@ def test_without_stamps_the_order_of_the_rows_is_said():
     )
 
 
-@pytest.mark.parametrize(
-    ('where', 'told'),
-    [
-        ({}, 'before pose 5 of set 2 (stamp 3.500 s)'),
-        ({'image': 2}, 'before image 3 of set 2 (stamp 3.500 s)'),
-        ({'stamp_ns': 7 * 10**9, 'set': 0}, 'before line 7 (if rows are in the order'),
-        ({'stamp_ns': 7 * 10**9, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
-        ({'stamp_ns': 10**15}, 'before pose 5 of set 2 (stamp 1000000.000 s)'),
-    ],
-)
-def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
-    given = {'kind': 'base', 'set': 1, 'sample': 4, 'stamp_ns': 3_500_000_000, 'image': None}
-    step = Step('base', thing='the device', size=1e-3, unit='m', share=0.9, unused='', **given)
-    assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
-
-
 @pytest.mark.parametrize('aside', [0.0, 1.5])
 def test_blocks_of_poses_in_different_places_are_said(rng, aside):
     """An arm on a column that bends looks as if its foot moved where it reaches out."""
@@ -230,44 +212,6 @@ def test_poses_of_several_targets_are_told_by_their_lines():
     odd = replace(odd, tool='tool_1')
     result = identify(Problem(UR10E, even, **SIGMAS, more=(odd,)))
     assert f'before line {AT + 1} (if rows are in the order of' in str(result.step)
-
-
-@pytest.mark.parametrize('count', [6, 30, 400])
-def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
-    some = steps._some_places(count)
-    assert [some[0], some[-1]] == [LEAST_ASIDE, count - LEAST_ASIDE]
-    aside = np.minimum(some, count - some)
-    gaps = np.diff(some)
-    np.testing.assert_array_equal(gaps[:-1], np.maximum(aside[:-2] // 10, 1))
-    assert (gaps[-1:] <= np.maximum(aside[-2:-1] // 10, 1)).all()
-    assert not len(steps._some_places(2 * LEAST_ASIDE - 1))
-
-
-@pytest.mark.parametrize(('share', 'found'), [(0.9, True), (1.1, False)])
-def test_a_step_by_chance_is_one_of_all_groups_and_stops(share, found, monkeypatch):
-    """By an F test, with the freedoms of the fit."""
-    true, seen = session(3)
-    fitted = fitting.fit(Problem(UR10E, moved(seen, true, 'tool', 1e-3), **SIGMAS))[2]
-    told, trials = set(), COUNT * (2 + len(UR10E.joints))
-    seldom = share * (1.0 - SURE) / trials
-    monkeypatch.setattr(steps, 'chance_of', lambda *given: told.add(given[1:]) or seldom)
-    assert (find_step(fitted) is not None) == found
-    freedom = 6 * COUNT - len(fitted.names)
-    assert told == {(1, freedom - 1), (6, freedom - 6)}
-
-
-def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
-    """Else it might use the freedom of parameters that are held."""
-    true, seen = session(3, errors=0.0)
-    name, products = 'elbow_joint.a', []
-    problem = Problem(UR10E, moved(seen, true, 'tool', 1e-3), priors={name: 1e-9}, **SIGMAS)
-    fitted = fitting.fit(problem)[2]
-    gain_of = steps.gain_of
-    monkeypatch.setattr(steps, 'gain_of', lambda *given: products.append(given) or gain_of(*given))
-    assert find_step(fitted).kind == 'tool'
-    ((matrix, count),) = products
-    assert count == len(fitted.names)
-    assert matrix.diagonal()[fitted.names.index(name)] == pytest.approx(1e18, rel=0.1)
 
 
 def test_what_is_on_the_flange_is_named():

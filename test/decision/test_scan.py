@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The search for a step: its places, its tests against chance and drift, and what it tells."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fits import NOISE, SIGMAS, UR10E, arm
+
+from calib_ros import Problem
+from calib_ros.apply.simulation import measure
+from calib_ros.decision import steps
+from calib_ros.decision.steps import Step, find_step
+from calib_ros.estimation import fitting
+from calib_ros.estimation.levels import LEAST_ASIDE, SURE
+from calib_ros.settings import EXCEPTION
+
+COUNT, AT = 60, 26
+
+
+def bumped(errors=1.0, **more):
+    """Return the fit of an arm of which the target moved by a millimetre."""
+    rng = np.random.default_rng(3)
+    true = arm(rng, errors)
+    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *NOISE)
+    late = np.arange(COUNT)[:, np.newaxis] >= AT
+    along = true.forward(seen.joints)[:, :3, 0]
+    seen = replace(seen, positions=seen.positions + 1e-3 * late * along)
+    return fitting.fit(Problem(UR10E, seen, **SIGMAS, **more))[2]
+
+
+@pytest.mark.parametrize('count', [6, 30, 400])
+def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
+    some = steps._some_places(count)
+    assert [some[0], some[-1]] == [LEAST_ASIDE, count - LEAST_ASIDE]
+    aside = np.minimum(some, count - some)
+    gaps = np.diff(some)
+    np.testing.assert_array_equal(gaps[:-1], np.maximum(aside[:-2] // 10, 1))
+    assert (gaps[-1:] <= np.maximum(aside[-2:-1] // 10, 1)).all()
+    assert not len(steps._some_places(2 * LEAST_ASIDE - 1))
+
+
+@pytest.mark.parametrize(('share', 'found'), [(0.9, True), (1.1, False)])
+def test_a_step_by_chance_is_one_of_all_groups_and_stops(share, found, monkeypatch):
+    """By an F test, with the freedoms of the fit."""
+    fitted, told, trials = bumped(), set(), COUNT * (2 + len(UR10E.joints))
+    seldom = share * (1.0 - SURE) / trials
+    monkeypatch.setattr(steps, 'chance_of', lambda *given: told.add(given[1:]) or seldom)
+    assert (find_step(fitted) is not None) == found
+    freedom = 6 * COUNT - len(fitted.names)
+    assert told == {(1, freedom - 1), (6, freedom - 6)}
+
+
+def test_a_drift_is_compared_with_priors_as_they_are_known(monkeypatch):
+    """Else it might use the freedom of parameters that are held."""
+    name, products = 'elbow_joint.a', []
+    fitted = bumped(0.0, priors={name: 1e-9})
+    gain_of = steps.gain_of
+    monkeypatch.setattr(steps, 'gain_of', lambda *given: products.append(given) or gain_of(*given))
+    assert find_step(fitted).kind == 'tool'
+    ((matrix, count),) = products
+    assert count == len(fitted.names)
+    assert matrix.diagonal()[fitted.names.index(name)] == pytest.approx(1e18, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ('where', 'told'),
+    [
+        ({}, 'before pose 5 of set 2 (stamp 3.500 s)'),
+        ({'image': 2}, 'before image 3 of set 2 (stamp 3.500 s)'),
+        ({'stamp_ns': 7 * 10**9, 'set': 0}, 'before line 7 (if rows are in the order'),
+        ({'stamp_ns': 7 * 10**9, 'image': 2}, 'before image 3 of set 2, line 7 (if rows are'),
+        ({'stamp_ns': 10**15}, 'before pose 5 of set 2 (stamp 1000000.000 s)'),
+    ],
+)
+def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
+    given = {'kind': 'base', 'set': 1, 'sample': 4, 'stamp_ns': 3_500_000_000, 'image': None}
+    step = Step('base', thing='the device', size=1e-3, unit='m', share=0.9, unused='', **given)
+    assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
+
+
+@pytest.mark.parametrize(('share', 'apart'), [(0.98, True), (1.02, False)])
+def test_places_are_apart_where_a_plane_explains_nearly_all_of_it(share, apart):
+    """Of eight poses of one joint: by the adjusted share of the squares, with six freedoms."""
+    after = np.arange(8) >= 4
+    beside = np.array([1.0, -1.0, -1.0, 1.0] * 2)
+    rest = share * EXCEPTION * 6.0 / 7.0
+    joints = np.sqrt(1.0 - rest) * (2.0 * after - 1.0) + np.sqrt(rest) * beside
+    assert steps._apart(joints[:, np.newaxis], after) == apart
