@@ -11,6 +11,7 @@ from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.suspects import suspects
+from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 
 DEGREES = 'and the joint values in degrees'
@@ -54,6 +55,47 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     ]
     assert ranks
     assert set(ranks) == {2}
+
+
+def quaternions(order):
+    return lambda turns: se3.from_quat(se3.to_quat(turns)[:, order])
+
+
+@pytest.mark.parametrize('inverse', [False, True])
+@pytest.mark.parametrize(
+    ('what', 'written'),
+    [
+        ('the quaternions are w x y z, not x y z w', quaternions([3, 0, 1, 2])),
+        ('the quaternions are x y z w, not w x y z', quaternions([1, 2, 3, 0])),
+        (
+            'the rotations are transposed: they are of the device in the target',
+            lambda turns: np.swapaxes(turns, 1, 2),
+        ),
+    ],
+)
+def test_ways_to_write_a_pose_are_undone_in_the_poses_as_they_were_measured(
+    what, written, inverse, rng
+):
+    """Also with other units; those of a camera on the flange are inverted before and after."""
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(9, rng), rng)
+    for more, length, angle in (
+        ('', 1.0, 1.0),
+        (', and the positions in mm', 1e3, 1.0),
+        (f', {DEGREES}', 1.0, 180.0 / np.pi),
+        (f', the positions in mm {DEGREES}', 1e3, 180.0 / np.pi),
+    ):
+        spoilt = replace(
+            seen,
+            joints=angle * seen.joints,
+            positions=length * seen.positions,
+            rotations=written(seen.rotations),
+        )
+        spoilt, given = (each.inverted() if inverse else each for each in (spoilt, seen))
+        (found,) = (each for each in suspects(arm, (spoilt,)) if each.what == what + more)
+        (undone,) = found.undone((spoilt,))
+        for name in ('joints', 'positions', 'rotations'):
+            np.testing.assert_allclose(getattr(undone, name), getattr(given, name), atol=1e-9)
 
 
 @pytest.mark.parametrize(('size', 'times'), [(0.5, '2'), (1.25, '0.8'), (0.3, '3.33')])
