@@ -10,7 +10,7 @@ import pytest
 from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.printed_board import size_of
-from calib_ros.decision.suspects import suspects
+from calib_ros.decision.suspects import Suspect, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 
@@ -107,7 +107,10 @@ def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
     (board,) = (each for each in found if each.what.startswith('the board is'))
     assert board.what == f'the board is stated {times} times as large as it is'
     np.testing.assert_allclose(board.undone((stated,))[0].positions, seen.positions)
+    _, *of_prints, joints = found[:4]
     assert {each.part for each in found[:4]} == {'measured'}
+    assert all(each.published == each.remedy for each in of_prints)
+    assert (joints.remedy, joints.published) == ('correct it in --places', Suspect.published)
     assert {each.remedy for each in found if each.rows} == {'correct it in --places'}
     assert 'convention: modified in the chain file' in {each.remedy for each in found}
 
