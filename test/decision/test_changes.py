@@ -2,13 +2,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Effects of changes and their evidence. `test_recalibration.py` has the changes themselves."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from fits import SCARA
+from fits import SCARA, UR10E
 
 from calib_ros.decision import changes
-from calib_ros.decision.changes import Effects, Information, shown
-from calib_ros.kinematics.parameter import Parameter
+from calib_ros.decision.changes import (
+    Effects,
+    Information,
+    likelier,
+    mean_square_change,
+    root_of,
+    shown,
+)
+from calib_ros.estimation.start import fit_to_arm
+from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.settings import LEVER
 
 
@@ -52,3 +62,95 @@ def test_a_change_is_as_large_as_its_evidence_tells(size, times):
     gain = 100.0**2 * size**2 * times**2 / spread
     seldom = np.log10(times) ** 2
     assert evidence == pytest.approx(0.5 * (gain - np.log(spread) - seldom))
+
+
+THREE = tuple(UR10E.joints[k].driven for k in (1, 2, 3))
+
+
+def known(rng, change, sigma=1e-5, names=THREE):
+    """Return information about changes, correlated, of about `sigma` [rad]."""
+    root = rng.normal(size=(len(names), len(names))) + 2.0 * np.eye(len(names))
+    matrix = root @ root.T / sigma**2
+    return Information(tuple(names), matrix, matrix @ change)
+
+
+def test_expected_changes_are_added_to_what_is_not_known(rng):
+    information = known(rng, np.array([1e-3, -2e-3, 0.0]))
+    spread = 1e-5 * rng.normal(size=(3, 2))
+    found = information.marginalised(spread @ spread.T)
+    alone = np.linalg.inv(information.matrix)
+    np.testing.assert_allclose(np.linalg.inv(found.matrix), alone + spread @ spread.T, rtol=1e-6)
+    np.testing.assert_allclose(found.vector, found.matrix @ [1e-3, -2e-3, 0.0], rtol=1e-6)
+    mean, covariance = information.mean(root_of(spread @ spread.T))
+    wanted = np.linalg.solve(spread.T @ information.matrix @ spread + np.eye(2), spread.T).T
+    np.testing.assert_allclose(covariance, wanted @ spread.T, rtol=1e-5, atol=1e-18)
+    np.testing.assert_allclose(mean, covariance @ information.vector, rtol=1e-6)
+
+
+def test_an_explanation_gains_what_a_fit_along_its_columns_does(rng):
+    information = known(rng, np.array([1e-3, -2e-3, 0.0]))
+    columns = rng.normal(size=(3, 2))
+    inner = columns.T @ information.matrix @ columns
+    change = np.linalg.solve(inner, columns.T @ information.vector)
+    found = information.explained(columns)
+    assert found[0] == pytest.approx(change @ inner @ change)
+    np.testing.assert_allclose(found[1], change)
+    np.testing.assert_allclose(found[2], np.linalg.inv(inner))
+    assert found[3] == 2
+    twice = information.explained(columns[:, [0, 0]])
+    assert twice[3] == 1
+    assert twice[0] == pytest.approx(information.explained(columns[:, :1])[0])
+    assert information.explained(np.zeros((3, 1)))[3] == 1  # of nothing
+
+
+def test_the_scale_of_the_device_is_that_of_all_lengths():
+    names = [*THREE, Parameter('elbow_joint.a'), Parameter('wrist_1_joint.d')]
+    found = Effects(UR10E, names, scaled=True)
+    assert found.sets[-1] == ('device', (changes.SCALE_OF_DEVICE,))
+    (grown,) = found.of((changes.SCALE_OF_DEVICE,)).T
+    np.testing.assert_allclose(grown[3:], [UR10E.joints[2].a, UR10E.joints[3].d], rtol=1e-3)
+    assert found.unscaled().sets == found.sets[:-1] == Effects(UR10E, names).sets
+    assert not any(owner == 'device' for owner, _ in Effects(UR10E, THREE, scaled=True).sets)
+
+
+@pytest.mark.parametrize(
+    ('change', 'first', 'wanted'),
+    [
+        ((2e-3, 0.0, 0.0), (0,), (0,)),
+        ((2e-3, -2e-3, 0.0), (2,), (0, 1)),
+        ((2e-3, -2e-3, 0.0), (0, 1), (0, 1)),  # as found one by one
+        ((2e-3, -2e-3, 3e-3), (0, 1), (0, 1, 2)),
+    ],
+)
+def test_the_fewest_zeros_that_explain_all_are_likelier(change, first, wanted, rng):
+    information, columns = known(rng, np.array(change)), Effects(UR10E, THREE)
+    one = SimpleNamespace
+    given = [(one(names=(THREE[k],)),) for k in first]
+    found = likelier(information, columns, 100.0, given)
+    assert [reasons[0].names for reasons in found] == [(THREE[k],) for k in wanted]
+    if first == wanted:
+        assert found is given
+        return
+    for (each,), k in zip(found, wanted, strict=True):
+        assert each.owner == THREE[k].owner
+        assert each.change == pytest.approx(change[k], abs=5.0 * each.sigma[0])
+        assert 1e-6 < each.sigma[0] < 1e-4
+    assert likelier(information, columns, 100.0, []) == []
+
+
+def test_the_zeros_of_all_joints_are_one_change(rng):
+    names = [joint.driven for joint in UR10E.joints[1:5]]
+    information = known(rng, np.full(4, 3e-3), names=names)
+    given = [(SimpleNamespace(names=(names[0],)),)]
+    ((found,),) = likelier(information, Effects(UR10E, names), 100.0, given)
+    assert (found.owner, list(found.names)) == ('all joints', names)
+
+
+def test_the_square_of_a_change_is_that_of_positions_in_the_best_frames():
+    names = [Parameter('elbow_joint.a'), Parameter('elbow_joint.theta')]
+    square, change = mean_square_change(UR10E, names), np.array([1e-4, 2e-4])
+    other = UR10E.with_offsets(dict(zip(names, change, strict=True)))
+    frames = [*parameters_of('base'), *parameters_of('tool')]
+    q = UR10E.random_joints(1000, np.random.default_rng(0))
+    far = fit_to_arm(UR10E, frames, other, q)[1]
+    assert np.sqrt(change @ square @ change) == pytest.approx(far, rel=0.1)
