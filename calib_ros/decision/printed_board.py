@@ -12,8 +12,6 @@ uncertain.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy import special
 
@@ -33,7 +31,7 @@ def size_of(chain: Chain, seen: Observations) -> float:
     """Return the factor by which measured lengths become those of the arm, 1 if unknown."""
     along = []
     for rotations, places in (
-        np.split(replace(chain, base=None, tool=None).forward(seen.joints)[:, :3], [3], axis=2),
+        np.split(chain.forward(seen.joints)[:, :3], [3], axis=2),
         (seen.rotations, seen.positions[:, :, np.newaxis]),
     ):
         turns = rotations[1:] @ np.swapaxes(rotations[:-1], 1, 2)

@@ -218,7 +218,7 @@ def _misread(chain: Chain, seen: Observations) -> Iterator[Suspect]:
 
     Base and tool preserve the angle between two poses: it must equal that between the flanges.
     """
-    arm = replace(chain, base=None, tool=None).forward(seen.joints)[seen.oriented, :3, :3]
+    arm = chain.forward(seen.joints)[seen.oriented, :3, :3]
     between = se3.angles_between(arm[:-1], arm[1:])
 
     def away(each: Observations) -> float:
