@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,10 +9,9 @@ from fits import NOISE, SCARA, SIGMAS, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
-from calib_ros.decision import plausibility
 from calib_ros.decision.misfits import explained_share
 from calib_ros.decision.plausibility import _motion
-from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.decision.reasons import Rule
 from calib_ros.estimation.leastsquares import stacked
 from calib_ros.kinematics import effects
 from calib_ros.kinematics.chain import Joint
@@ -313,56 +312,3 @@ def test_two_lengths_may_grow_alike_but_not_all_of_many(chain):
     for sigma, refused in ((1e-5, chain is UR), (0.02, False)):
         refusals = identify(Problem(chain, seen, sigma_scale=sigma)).refusals
         assert any('more than sigma_scale allows' in each for each in refusals) == refused
-
-
-@dataclass(frozen=True)
-class Judged:
-    refusals: tuple = ()
-    remarks: tuple = ()
-    coupled: bool = False
-
-
-@pytest.mark.parametrize(
-    ('found', 'another', 'refused', 'remarked'),
-    [
-        ({}, True, [], []),
-        ({'lens': 'lens', 'sigmas': 'sigmas'}, True, [], ['lens', 'sigmas']),
-        ({'lens': 'lens', 'imitated': True, 'sigmas': 'sigmas'}, True, ['lens', 'sigmas'], []),
-        ({'lens': 'lens', 'given': 'gain', 'sigmas': 's'}, True, ['lens', 'gain', 's'], []),
-        ({'board': 'board', 'sigmas': 'sigmas'}, True, [], ['board', 'sigmas']),
-        ({'board': 'board', 'pixels': 1, 'sigmas': 's'}, True, ['s', 'board'], []),
-        ({'board': 'board', 'lens': 'lens', 'pixels': 1}, True, [], ['lens']),
-        ({'scale': 'scale', 'sigmas': 'sigmas'}, True, ['sigmas', 'scale'], []),
-        ({'sessions': 'two', 'given': 'gain'}, True, ['two', 'gain'], []),
-        ({'sessions': 'two', 'lens': 'lens', 'given': 'gain'}, False, ['gain'], []),
-        ({'given': 'mistake', 'sigmas': 's'}, False, ['mistake', 's'], []),
-        ({'coupled': True, 'motion': 'fast', 'order': 'one way'}, True, [], ['fast', 'one way']),
-    ],
-)
-def test_what_explains_a_refusal_comes_before_it(found, another, refused, remarked, monkeypatch):
-    """But for a mistake that is named already (not `another`), or another lens."""
-    parts = {
-        'stretched': found.get('board', ''),
-        '_lens': (found.get('lens', ''), 'imitated' in found),
-        '_sigmas': found.get('sigmas', ''),
-        '_scale': [Reason(Rule.SCALE, found['scale'])] if 'scale' in found else [],
-        '_sessions': found.get('sessions', ''),
-        '_motion': found.get('motion', ''),
-    }
-    for name, part in parts.items():
-        monkeypatch.setattr(plausibility, name, lambda *_, part=part: part)
-    monkeypatch.setattr(plausibility, '_order', lambda _: found.get('order', ''))
-    monkeypatch.setattr(plausibility, '_lag', lambda _, result: result)
-    seen = SimpleNamespace(socket=False, plane=False, pixels=found.get('pixels'))
-    given = tuple(Reason(Rule.GAIN, found[name]) for name in ('given',) if name in found)
-    result = plausibility.remarked(
-        SimpleNamespace(sets=[seen], separations=()),
-        Judged(given, ('first',), 'coupled' in found),
-        another,
-    )
-    assert list(result.refusals) == refused
-    assert [each for each in result.remarks if each != plausibility.COUPLED] == [
-        'first',
-        *remarked,
-    ]
-    assert (plausibility.COUPLED in result.remarks) == ('coupled' in found)

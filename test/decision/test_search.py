@@ -166,6 +166,10 @@ def test_mistakes_of_one_part_are_not_made_at_once(searched):
     assert _several(FAULTY, UR10E, given()) is None
     searched([('a', 1, 'order'), ('b', 1, 'j1')], {'ab': 0.1})
     assert _several(FAULTY, UR10E, given(error=0.4)) is None  # a faulty arm is no worse
+    assert _several(FAULTY, UR10E, given(error=0.6))
+    searched([('a', 1, 'order'), ('b', 1, 'j1')], {'ab': 0.27})
+    assert _several(FAULTY, UR10E, given())
+    assert _several(FAULTY, UR10E, given(error=0.8)) is None  # 0.24 would be much less
 
 
 def test_signs_that_hide_each_other_are_tried_together(searched):

@@ -34,6 +34,16 @@ def test_gross_errors_do_not_spoil_the_closed_form(count, found):
     assert trial.share == trial.error / trial.spread
 
 
+@pytest.mark.parametrize('socket', [False, True])
+def test_the_spread_is_that_of_the_smaller_of_arm_and_measurements(socket):
+    """A socket measures no spread at all."""
+    chain, seen = with_gross_errors(20, 0)
+    small = replace(seen, positions=1e-3 * seen.positions, socket=socket)
+    places = flange(chain, seen)[:, :3, 3] if socket else small.positions
+    trial = trial_of(chain, (small,))
+    assert trial.spread == pytest.approx(np.sqrt(places.var(axis=0).sum()))
+
+
 def test_gross_errors_do_not_spoil_the_refinement():
     chain, seen = with_gross_errors(40, 8)
     arm = flange(chain, seen)
