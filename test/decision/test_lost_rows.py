@@ -10,8 +10,9 @@ from fits import NOISE, UR10E, arm
 
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
-from calib_ros.decision.lost_rows import row_loss
+from calib_ros.decision.lost_rows import _apart, _where, row_loss
 from calib_ros.decision.mistakes import explained
+from calib_ros.estimation.levels import LEAST_ASIDE
 
 
 def seen_of(count, oriented):
@@ -52,3 +53,34 @@ def test_shuffled_rows_have_not_lost_one(count):
     seen = seen_of(count, True)
     found = explained(Problem(UR10E, replace(seen, joints=seen.joints[rng.permutation(count)])))
     assert found is None
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'row'),
+    [('11100', '00111', 2), ('11110', '00011', 3), ('00000', '11111', 0), ('11111', '00000', 5)],
+)
+def test_the_row_is_the_first_that_leaves_most_to_fit(before, after, row):
+    assert _where(*(np.array([*map(int, each)], dtype=bool) for each in (before, after))) == row
+
+
+@pytest.mark.parametrize(
+    ('own', 'other', 'found'),
+    [
+        (20, 0, True),
+        (17, 0, True),  # all but nearly a fifth
+        (16, 0, False),
+        (20, 9, True),
+        (20, 10, False),  # the other shift fits as many
+    ],
+)
+@pytest.mark.parametrize('first', [True, False])
+def test_each_side_of_a_lost_row_fits_by_its_own_shift(own, other, found, first):
+    far = np.full((2, 20 + LEAST_ASIDE), 1.0)
+    side, rest = (np.s_[:20], np.s_[20:]) if first else (np.s_[-20:], np.s_[:-20])
+    which = int(not first)  # before or after
+    far[which, side][:own] = 0.0
+    far[1 - which, side][:other] = 0.0
+    far[1 - which, rest] = 0.0
+    row = 20 if first else LEAST_ASIDE
+    assert _apart(*far, row, 0.5) == found
+    assert not _apart(*far[:, :-1] if first else far[:, 1:], row - (not first), 0.5)
