@@ -47,6 +47,16 @@ def test_non_geometric_effects_are_taken_into_account(rng):
     )
 
 
+def test_it_ends_after_its_rounds(rng):
+    chain = load_chain('ur10e')
+    q = chain.random_joints(20, rng)
+    wanted = chain.forward(q)
+    once, often = (solve(chain, wanted, q + 0.03, iterations=count) for count in (1, 20))
+    assert not once.converged.any()
+    assert (once.position < 0.1 * np.linalg.norm(wanted[:, :3, 3], axis=1)).all()
+    assert often.converged.mean() > 0.9
+
+
 def test_joints_without_limits_have_none():
     joint = Joint('turntable', a=0.0, alpha=0.0, d=0.0, theta=0.0)
     assert [each.tolist() for each in limits(Chain('one', 'standard', (joint,)))] == [

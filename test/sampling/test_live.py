@@ -54,6 +54,14 @@ def test_it_begins_early_and_only_gets_better(rng):
     assert said[-1].more_for(2.0 * said[-1].sigma) == 0
 
 
+def test_fewer_rows_than_parameters_have_the_noise_that_is_stated(rng):
+    samples = seen(faulty(UR10E, Cell(), rng), 20, rng, oriented=False)
+    said = [each for each in growing(samples)[1] if each is not None]
+    few = [3 * each.samples <= len(each.names) for each in said]
+    assert {each.noise for each, less in zip(said, few, strict=True) if less} == {1.0}
+    assert 1.0 not in {each.noise for each, less in zip(said, few, strict=True) if not less}
+
+
 def test_many_samples_are_taken_by_and_by(rng, monkeypatch):
     """An update is short whatever waits, and in the end nothing has been left out."""
     monkeypatch.setattr(live_module, 'SOME', 40)
