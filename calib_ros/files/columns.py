@@ -45,7 +45,7 @@ from calib_ros.values import LARGEST, ROUNDED, cell_integer, parse_number
 
 Cells = tuple[int, list[str]]  # line number and cells
 BETWEEN = '\0'
-MAYBE_MISSING = (f'{BETWEEN} ', *(f'{BETWEEN}{each}{BETWEEN}' for each in MISSING))
+MAYBE_MISSING = re.compile(f'{BETWEEN}( |({"|".join(map(re.escape, MISSING))}){BETWEEN})')
 Codes = tuple[Index, list[str]]
 """The code (N,) of each row's text, and the texts in order of appearance."""
 
@@ -150,7 +150,7 @@ class Columns:
         if not isinstance(given, str):
             return np.isnan(given)
         cells = f'{BETWEEN}{given.lower()}{BETWEEN}'
-        if not any(each in cells for each in MAYBE_MISSING):
+        if not MAYBE_MISSING.search(cells):
             return np.zeros(len(self.lines), dtype=bool)
         return np.array([text.strip().lower() in MISSING for text in self.texts(name)], dtype=bool)
 
