@@ -174,8 +174,9 @@ def _read(
         known = {} if stream.links is None else stream.links.layouts
         for some in alike(stream.type, [batch[place][1] for place in group], known):
             left[some.which] = False
-            for k in range(len(some.layout.items)):
-                yield stream, places[some.which], some.of(k)
+            read = places[some.which]
+            for part in some.readings():
+                yield stream, read, part
         single += places[left].tolist()
     rows: dict[tuple[Stream, tuple[str, ...], int], list[tuple[int, int, FloatArray]]] = {}
     for place in sorted(single):

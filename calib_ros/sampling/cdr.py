@@ -11,10 +11,9 @@ Messages without a layout must be decoded one by one.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,21 +37,17 @@ _FORMS: dict[str, tuple[int, int, str, int]] = {
 """By type: strings before the numbers, bytes between, kind and count of the numbers."""
 
 
-class Item(NamedTuple):
-    """Strings of one part of a message, and the offsets of its stamp and numbers."""
-
-    strings: tuple[str, ...]
-    stamp: int
-    numbers: int
-    kind: str
-    width: int
-
-
 @dataclass(frozen=True, eq=False)
 class MessageLayout:
-    """Offsets in messages of one kind."""
+    """The K parts of messages of one kind: their strings, and where their numbers are.
 
-    items: tuple[Item, ...]
+    Places count words of the size of a number, or of four bytes of a stamp, from the head.
+    """
+
+    strings: tuple[tuple[str, ...], ...]
+    stamps: Index  # (K, 2) places of seconds and nanoseconds
+    kind: str
+    numbers: Index  # (K, w) places
     begin: int  # offset of the first common byte
     text: NDArray[np.uint8]  # the common bytes
     mask: NDArray[np.uint8]  # 255 for common bytes
@@ -61,7 +56,8 @@ class MessageLayout:
     def among(self, rows: NDArray[np.uint8]) -> Flags:
         """Tell which messages (N, ...) have this layout."""
         part = slice(self.begin, len(self.mask))
-        if (rows[:, part] == self.text[part]).all():  # the usual case, at half the cost
+        alone = len(self.strings) == 1  # usually even the bytes between are alike: half the cost
+        if alone and (rows[:, part] == self.text[part]).all():
             return np.ones(len(rows), dtype=bool)
         equal = (rows[:, self.last] == self.text[self.last]).all(axis=1)  # usually decides
         equal[equal] = ~((rows[equal, part] ^ self.text[part]) & self.mask[part]).any(axis=1)
@@ -76,13 +72,16 @@ class Alike:
     which: Index
     rows: NDArray[np.uint8]
 
-    def of(self, k: int) -> Readings:
-        """Return the readings of item k."""
-        strings, stamp, begin, kind, width = self.layout.items[k]
-        times = _numbers(self.rows, stamp, '<i4', 2)  # seconds, and nanoseconds without sign
-        stamps = times[:, 0].astype(np.int64) * 1_000_000_000 + times.view('<u4')[:, 1]
-        numbers = _numbers(self.rows, begin, kind, width).astype(float)  # a copy
-        return Readings(stamps, strings, numbers)
+    def readings(self) -> Iterator[Readings]:
+        """Yield the readings of each part."""
+        layout, length = self.layout, self.rows.shape[1] - _HEAD
+        whole = slice(_HEAD, _HEAD + length - length % int(layout.kind[2:]))
+        words = np.ascontiguousarray(self.rows[:, whole]).view('<i4')
+        times = words.take(layout.stamps, axis=1)  # nanoseconds are without sign
+        stamps = times[..., 0].astype(np.int64) * 1_000_000_000 + times.view('<u4')[..., 1]
+        numbers = words.view(layout.kind).take(layout.numbers, axis=1).astype(float, copy=False)
+        for k, strings in enumerate(layout.strings):
+            yield Readings(stamps[:, k], strings, numbers[:, k])
 
 
 def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]) -> list[Alike]:
@@ -123,8 +122,8 @@ def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout
 def _layout(kind: str, blob: bytes) -> MessageLayout:
     """Return the layout of a message, or raise struct.error."""
     texts, between, numbers, count = _FORMS[kind]
-    read = _Reader(blob)
-    items = []
+    read, size = _Reader(blob), int(numbers[2:])
+    parts, begins = list[tuple[str, ...]](), list[tuple[int, int]]()
     for _ in range(read.integer() if kind == TRANSFORMS else 1):
         stamp = _aligned(read.at, 4)
         read.at = stamp + 8
@@ -134,17 +133,27 @@ def _layout(kind: str, blob: bytes) -> MessageLayout:
             count = read.integer()
             if len(strings) != count + 1:
                 raise struct.error
-        size = np.dtype(numbers).itemsize
         begin = _aligned(read.at + between, size)
         read.at = begin + count * size
         if read.at > len(blob):
             raise struct.error
-        items.append(Item(tuple(strings), stamp, begin, numbers, count))
+        parts.append(tuple(strings))
+        begins.append((stamp, begin))
     mask = np.zeros(read.named[-1].stop, dtype=np.uint8)
     for part in read.named:
         mask[part] = 255
     text = np.frombuffer(blob, dtype=np.uint8)[: len(mask)]
-    return MessageLayout(tuple(items), read.named[0].start, text, mask, read.named[-1])
+    places = np.array(begins, dtype=np.intp).reshape(-1, 2) - _HEAD
+    return MessageLayout(
+        tuple(parts),
+        places[:, :1] // 4 + np.arange(2),
+        numbers,
+        places[:, 1:] // size + np.arange(count),
+        read.named[0].start,
+        text,
+        mask,
+        read.named[-1],
+    )
 
 
 class _Reader:
@@ -202,8 +211,3 @@ def trajectory_size(blob: bytes, most_names: int) -> tuple[int, int]:
 def _aligned(at: int, size: int) -> int:
     """Return the next offset aligned to a size after the encapsulation."""
     return at + (_HEAD - at) % size
-
-
-def _numbers(rows: NDArray[np.uint8], begin: int, kind: str, width: int) -> NDArray[Any]:
-    size = int(kind[2:]) * width
-    return np.ascontiguousarray(rows[:, begin : begin + size]).view(kind)

@@ -26,7 +26,11 @@ STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 def decode(kind, blobs):
     """Return what messages of one layout say; None where they are of several or of none."""
     found = alike(kind, blobs, {})
-    return found[0].of(0) if len(found) == 1 and len(found[0].which) == len(blobs) else None
+    return (
+        next(found[0].readings())
+        if len(found) == 1 and len(found[0].which) == len(blobs)
+        else None
+    )
 
 
 def assert_decoded(kind, blobs):
@@ -88,7 +92,7 @@ def joint_blob(names, positions, frame_id='', stamp_ns=10**9, velocities=()):
 def test_of_more_layouts_than_there_are_names_the_others_are_left():
     blobs = [joint_blob([f'{k:03d}'], [float(k)]) for k in range(60)]
     found = alike(JOINT_STATE, blobs, {})
-    assert [each.of(0).strings[1] for each in found] == [f'{k:03d}' for k in range(50)]
+    assert [next(each.readings()).strings[1] for each in found] == [f'{k:03d}' for k in range(50)]
 
 
 @pytest.mark.parametrize('cut', [3, 9, 14, 30, -9, -1])
