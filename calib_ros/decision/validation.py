@@ -12,7 +12,7 @@ import numpy as np
 from calib_ros.decision.comparison import Comparison, Residuals, compare, joined, residuals
 from calib_ros.estimation.configurations import distinct
 from calib_ros.estimation.fitted import Fitted
-from calib_ros.estimation.identifiability import structurally_independent
+from calib_ros.estimation.identifiability import drawn, independent_in
 from calib_ros.estimation.leastsquares import System, minimise, without_each
 from calib_ros.estimation.levels import TELLING
 from calib_ros.estimation.observations import Observations, numbered
@@ -167,14 +167,17 @@ def _leave_one_place_out(
         return replace(fitted.system, sets=tuple(chosen), separations=apart)
 
     frames = [name for name in names if before.owns_frame(name)]
+    anywhere, rows = drawn(problem.model, names, problem.kinds)
     chains: list[list[Chain]] = [[], []]
     for place in places:
         own = [n for base in sorted(place) for n in parameters_of(base)[:3] if n in problem.free]
         others, left = part(place, inside=False), part(place, inside=True)
-        kinds = [kind for kind in problem.kinds if kind.base not in place]
         rest = [name for name in names if name not in own]
+        seen = zip(rows, problem.kinds, strict=True)
+        which = [names.index(name) for name in rest]
+        there = [each[:, which] for each, kind in seen if kind.base not in place]
         # without this place a gauge may be free; frames come first, so they are the same alone
-        known = structurally_independent(problem.model, rest, kinds, others.separation_rows)
+        known = independent_in([*there, others.separation_rows(anywhere, rest)[0]], rest)
         kept = {*known, *problem.prior_sigmas}
         fits = (before, frames), (fitted.chain, names)
         for found, (chain, wanted) in zip(chains, fits, strict=True):

@@ -100,6 +100,16 @@ def structurally_independent(
     Parameters of which those before them leave little come last: with a known tool near the last
     axis a turn would else imitate a length, and end far away.
     """
+    anywhere, rows = drawn(chain, names, kinds)
+    if extra is not None:
+        rows.append(extra(anywhere, names)[0])
+    return independent_in(rows, names)
+
+
+def drawn(
+    chain: Chain, names: Sequence[str], kinds: Sequence[Kind]
+) -> tuple[Chain, list[FloatArray]]:
+    """Return a chain with arbitrary frames, and the rows (R, P) of each kind at many poses."""
     rng = np.random.default_rng(0)
     joints = chain.random_joints(100, rng)
     frames = [name for name in names if chain.owns_frame(name)]
@@ -125,11 +135,14 @@ def structurally_independent(
         elif not kind.oriented:
             jacobian = jacobian[:, :3]
         rows.append(jacobian.reshape(-1, len(names)))
-    if extra is not None:
-        rows.append(extra(anywhere, names)[0])
+    return anywhere, rows
+
+
+def independent_in(rows: Sequence[FloatArray], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the parameters that rows (R, P) at arbitrary poses determine."""
     lens = [k for k, name in enumerate(names) if Parameter(name).of_lens]
-    rows.append(np.eye(len(names))[lens])
-    first = np.asarray(np.linalg.qr(np.concatenate(rows), mode='r'))
+    every = np.concatenate([*rows, np.eye(len(names))[lens]])
+    first = np.asarray(np.linalg.qr(every, mode='r'))
     least = [HALF_THE_DIGITS if Parameter(n).kind in FRAME_KINDS else EXCEPTION for n in names]
     strong = independent(first, names, np.array(least))
     order = sorted(range(len(names)), key=lambda k: names[k] not in strong)
