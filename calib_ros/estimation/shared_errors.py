@@ -259,23 +259,24 @@ def _crossed(
 ) -> tuple[FloatArray, FloatArray]:
     """Return Q^T A Q (K, P, P) of columns Q (n, c, P), and the traces (K, K) tr(A C Q Q^T).
 
-    Of matrices A (K, n, n) and, for the traces, those between the rows that were measured.
+    Of matrices A (K, n, n), the first of which is the identity, and, for the traces, those between
+    the rows that were measured.
     """
     columns, rows = basis.reshape(len(basis), -1), basis.reshape(-1, basis.shape[2])
     if columns.shape[1] <= len(columns):
         spread = both @ columns
         return rows.T @ spread.reshape(-1, *rows.shape), gram(spread)
-    crossed = [gram(_rooted(basis, each).transpose(2, 0, 1)) for each in own]
+    crossed = [each.T @ each for each in (rows, *(_rooted(basis, each) for each in own[1:]))]
     spread = both @ (columns @ columns.T)
     return np.array(crossed), spread.reshape(len(both), -1) @ both.reshape(len(both), -1).T
 
 
 def _rooted(basis: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Return C^T Q of columns Q (n, c, P), with C C^T the positive matrix (n, n)."""
+    """Return C^T Q (n c, P) of columns Q (n, c, P), with C C^T the positive matrix (n, n)."""
     size = len(matrix)
     root = np.linalg.cholesky(matrix + ROUNDING * np.diag(np.diag(matrix)))
     turned = linalg.blas.dtrmm(1.0, root.T, basis.reshape(size, -1).T, side=1, trans_a=1)
-    return np.asarray(turned.T.reshape(basis.shape))
+    return np.asarray(turned.T.reshape(-1, basis.shape[2]))
 
 
 def gathered(chain: Chain, names: Sequence[str], system: System, most: int) -> tuple[Stops, int]:
