@@ -33,10 +33,10 @@ NO_PRIOR = {'*_joint.*': 1e6}
 """As good as none, but given: so none is told by the data."""
 
 
-def arm(rng, errors=1.0):
+def arm(rng, errors=1.0, chain=UR10E):
     """Return an arm, its errors so many times the usual; `rng` may be a seed."""
     cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
-    return faulty(UR10E, cell, np.random.default_rng(rng))
+    return faulty(chain, cell, np.random.default_rng(rng))
 
 
 def measured_arm(rng, count, noise=NOISE, **more):

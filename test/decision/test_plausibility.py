@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, rms
+from fits import NOISE, SCARA, SIGMAS, arm, rms
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
@@ -29,11 +29,6 @@ def scaled(observations, ppm):
     return replace(observations, positions=observations.positions * (1.0 + 1e-6 * ppm))
 
 
-def arm(seed=0, errors=1.0, chain=UR):
-    cell = Cell(length_error=5e-4 * errors, angle_error=1e-3 * errors)
-    return faulty(chain, cell, np.random.default_rng(seed))
-
-
 @pytest.mark.parametrize('name', ['ur10e', 'puma560', 'kuka_iiwa14'])
 @pytest.mark.parametrize('oriented', [True, False])
 def test_a_device_out_of_scale_is_named(name, oriented):
@@ -44,11 +39,11 @@ def test_a_device_out_of_scale_is_named(name, oriented):
 
 
 def test_a_joint_that_only_goes_one_way_is_named():
-    seen = seen_of(arm(), count=40)
+    seen = seen_of(arm(0), count=40)
     steady = seen.select(np.argsort(seen.joints[:, 2]))
     joints = steady.joints.copy()
     joints[:, 4] = np.sort(joints[:, 4])
-    several = measure(arm(), joints, np.random.default_rng(0), 5e-5, 2e-4)
+    several = measure(arm(0), joints, np.random.default_rng(0), 5e-5, 2e-4)
     for one, named in (
         (seen, ''),
         (steady, 'elbow_joint'),
@@ -90,7 +85,7 @@ def test_two_robots_in_two_sessions_are_not_averaged(seed, alike):
 
 def test_a_session_that_cannot_be_fitted_alone_is_of_the_same_arm():
     """Only the first has the signs of the last moves, which backlash needs."""
-    first, second = (seen_of(arm(), seed, 40) for seed in (1, 2))
+    first, second = (seen_of(arm(0), seed, 40) for seed in (1, 2))
     signs = np.sign(np.random.default_rng(0).normal(size=first.joints.shape))
     more = [replace(second, base='base_B', tool='tool_B')]
     problem = Problem(UR, replace(first, approach=signs), more=more, effects=['backlash'])
@@ -148,7 +143,7 @@ def test_poses_computed_by_a_controller_are_named():
 
 
 def test_a_mistake_is_told_before_the_sigmas_that_it_meets():
-    seen = seen_of(arm(), count=40)
+    seen = seen_of(arm(0), count=40)
     turned = replace(seen, joints=seen.joints * [1, 1, 1, 1, 1, -1])
     result = identify(Problem(UR, turned, sigma_position=0.1, sigma_orientation=0.4))
     first, *_, last = result.refusals
@@ -183,7 +178,7 @@ def test_covariances_in_square_millimetres_are_named():
 
 def test_motor_angles_are_noticed():
     coupled = {'wrist_3_joint.coupling_wrist_2_joint': 2e-3}
-    seen = seen_of(arm().with_effects(list(coupled)).with_offsets(coupled))
+    seen = seen_of(arm(0).with_effects(list(coupled)).with_offsets(coupled))
     (remark,) = identify(Problem(UR, seen)).remarks
     assert 'couplings of the last joints explain' in remark
     assert (
@@ -195,7 +190,7 @@ def test_motor_angles_are_noticed():
 def test_couplings_that_the_model_lacks_are_uncertainty_elsewhere(unsearched):
     wrist = ('wrist_3_joint.coupling_wrist_2_joint', 'wrist_2_joint.coupling_wrist_1_joint')
     coupled = dict(zip(wrist, (2e-3, 1e-3), strict=True))
-    true = arm().with_effects(list(coupled)).with_offsets(coupled)
+    true = arm(0).with_effects(list(coupled)).with_offsets(coupled)
     rng = np.random.default_rng(0)
     near, far = 0.5 * UR.random_joints(60, rng), UR.random_joints(300, rng)
     result = identify(Problem(UR, measure(true, near, rng, 5e-5, 2e-4)))
@@ -275,7 +270,7 @@ def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_ha
     rng = np.random.default_rng(1)
     joints = UR.random_joints(40, rng)
     behind = joints - share * np.diff(joints, axis=0, prepend=joints[:1])
-    seen = replace(measure(arm(), behind, rng, 5e-5, 2e-4, oriented), joints=joints)
+    seen = replace(measure(arm(0), behind, rng, 5e-5, 2e-4, oriented), joints=joints)
     result = identify(Problem(UR, seen))
     assert result.accepted == (not refused)
     assert (Rule.LAG in [each.rule for each in result.refusals]) == refused
@@ -284,7 +279,7 @@ def test_poses_that_lie_towards_the_stop_before_are_told_and_refused_where_it_ha
 
 @pytest.mark.parametrize('size', [3e-4, 1e-3])
 def test_backlash_is_not_taken_for_a_lag(size):
-    true = arm().with_effects([f'{joint.name}.backlash' for joint in UR.joints])
+    true = arm(0).with_effects([f'{joint.name}.backlash' for joint in UR.joints])
     true = true.with_offsets({name: -size for name, _ in true.effects})
     rng = np.random.default_rng(1)
     joints = true.random_joints(60, rng)

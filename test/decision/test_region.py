@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from commanded import missed
 from fits import UR10E, arm, rms
 
 from calib_ros import Calibration, Compensator, Problem, compensate, identify, load_calibration
@@ -20,7 +21,6 @@ from calib_ros.decision.region import (
 )
 from calib_ros.errors import ConfigError, UnknownNameError
 from calib_ros.kinematics import effects, se3
-from calib_ros.kinematics.chain import Frame
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.jacobian import ErrorModel, orientation_error
 from calib_ros.report.documents import as_document
@@ -370,24 +370,18 @@ def test_a_calibration_without_a_region_is_still_read(folder):
     assert load_calibration(path, UR10E).region is None
 
 
-def missed(command, wanted):
-    """Return the RMS distance [m] of the true arm's flange from where the nominal one would be."""
-    true = replace(arm(0), base=Frame(), tool=Frame())
-    error = (true.forward(command) - UR10E.forward(wanted))[:, :3, 3]
-    return float(np.sqrt((error**2).sum(axis=1).mean()))
-
-
 def test_programs_are_corrected_inside_the_region_only(local, folder):
     inside = around(2, 0.1, 15)
     other = UR10E.random_joints(50, np.random.default_rng(0))
     outside = other[~local.region.covers(other)][:5]
     assert local.region.covers(inside).all()
-    refused = []
+    true, refused = Compensator(UR10E, arm(0)), []
     for calibration in (local, load_calibration(folder, UR10E)):
         compensator = Compensator(UR10E, calibration.chain, region=calibration.region)
         result = compensate(compensator, inside)
         assert not result.refusals
-        assert missed(result.joints, inside) < 0.2 * missed(inside, inside)
+        after, before = (missed(true, inside, q)[0] for q in (result.joints, inside))
+        assert np.sqrt((after**2).mean()) < 0.2 * np.sqrt((before**2).mean())
         result = compensate(compensator, np.concatenate([inside, outside]))
         refused.append([each.sample for each in result.refusals if 'not valid' in each.reason])
         first = min(each.reason for each in result.refusals if 'not valid' in each.reason)

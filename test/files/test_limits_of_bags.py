@@ -8,28 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded import ARM
 
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.recording import Recording, write_bag
 from calib_ros.files.stored import recorded
-from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.sampling.session import CalibrationSession
-
-ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
-
-
-def session():
-    return CalibrationSession(ARM)
 
 
 @pytest.fixture(params=['sqlite3', 'mcap'])
 def bag(tmp_path, request, rng):
-    poses = Observations.from_arrays(rng.normal(size=(20, 2)), rng.normal(size=(20, 3)))
-    write_bag(
-        tmp_path / 'bag', Recording.of_dwells(('a', 'b'), poses, np.zeros(20, bool)), request.param
-    )
+    poses = Observations.from_arrays(rng.normal(size=(20, 3)), rng.normal(size=(20, 3)))
+    made = Recording.of_dwells(ARM.joint_names, poses, np.zeros(20, bool))
+    write_bag(tmp_path / 'bag', made, request.param)
     return tmp_path / 'bag'
 
 
@@ -46,7 +39,7 @@ def bag(tmp_path, request, rng):
 def test_with_any_metadata_the_messages_are_read(bag, content):
     (bag / 'metadata.yaml').write_bytes(content)
     assert recorded(bag) is None
-    taken = session()
+    taken = CalibrationSession(ARM)
     replayed = replay(bag, taken)
     assert len(taken.samples) == 20
     assert replayed.read == 120
@@ -84,7 +77,7 @@ ENDLESS = 'WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) SEL
 def test_a_database_that_computes_what_it_holds_is_refused(tmp_path, statements):
     path = changed(tmp_path / 'bag.db3', *statements)
     with pytest.raises(InputError, match='is not what a recorder makes'):
-        replay(path, session())
+        replay(path, CalibrationSession(ARM))
 
 
 @pytest.mark.parametrize('bag', ['sqlite3'], indirect=True)
@@ -96,7 +89,7 @@ def test_messages_without_data_are_lost_and_no_more(bag):
         "UPDATE sqlite_master SET sql=replace(sql, 'BLOB NOT NULL', 'BLOB') WHERE name='messages'",
     )
     changed(file, 'UPDATE messages SET data=NULL WHERE id=7')
-    replayed = replay(bag, session())
+    replayed = replay(bag, CalibrationSession(ARM))
     assert (replayed.recorded, replayed.read) == (120, 119)
     assert 'cannot be decoded' in replayed.warnings[0]
 
@@ -108,12 +101,12 @@ def test_topics_whose_names_are_no_text_are_not_read(bag, column, known):
     (file,) = bag.glob('*.db3')
     changed(file, f"UPDATE topics SET {column}=x'05' WHERE type LIKE '%Point%'")
     if known:  # the metadata name them
-        replayed = replay(bag, session())
+        replayed = replay(bag, CalibrationSession(ARM))
         assert (replayed.recorded, replayed.read) == (120, 100)
         return
     (bag / 'metadata.yaml').unlink()
     with pytest.raises(InputError, match='has no pose topic'):
-        replay(bag, session())
+        replay(bag, CalibrationSession(ARM))
 
 
 @pytest.mark.parametrize(
@@ -128,7 +121,7 @@ def test_topics_whose_names_are_no_text_are_not_read(bag, column, known):
     ],
 )
 def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, refused):
-    account = session().account()
+    account = CalibrationSession(ARM).account()
     found = Replayed(recorded_, read).refusals(account, largest)
     assert bool(found) == bool(refused)
     assert all(refused in reason and '--largest-loss' in reason for reason in found)
@@ -144,5 +137,5 @@ def test_a_bag_of_which_much_is_lost_is_not_accepted(recorded_, read, largest, r
     ],
 )
 def test_messages_dropped_for_their_stamps_count_as_lost(cause, refused):
-    account = replace(session().account(), poses=100, dropped={cause: 50})
+    account = replace(CalibrationSession(ARM).account(), poses=100, dropped={cause: 50})
     assert bool(Replayed(100, 100).refusals(account, 0.1)) == refused
