@@ -11,7 +11,6 @@ from fits import NOISE, UR10E, arm
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.lost_rows import _apart, _where, row_loss
-from calib_ros.decision.mistakes import explained
 from calib_ros.estimation.levels import LEAST_ASIDE
 
 
@@ -45,14 +44,6 @@ def test_rows_lost_before_the_first_and_again_later_are_not_told_as_one():
     rows = np.delete(np.arange(40), [0, 20])
     shifted = replace(seen.select(rows), joints=seen.joints[:-2])
     assert row_loss(Problem(UR10E, shifted), UR10E, shifted, 5e-3) is None
-
-
-@pytest.mark.parametrize('count', [20, 40])
-def test_shuffled_rows_have_not_lost_one(count):
-    rng = np.random.default_rng(count)
-    seen = seen_of(count, True)
-    found = explained(Problem(UR10E, replace(seen, joints=seen.joints[rng.permutation(count)])))
-    assert found is None
 
 
 @pytest.mark.parametrize(

@@ -317,9 +317,11 @@ def test_large_errors_of_an_arm_are_no_mistake():
 
 def test_where_nothing_is_wrong_nothing_is_said(rng):
     poses, places = (seen_of(oriented=oriented) for oriented in (True, False))
-    mixed = replace(poses, joints=rng.permutation(poses.joints))
+    mixed, few = (
+        replace(each, joints=rng.permutation(each.joints)) for each in (poses, seen_of(count=20))
+    )
     noisy = replace(places, positions=places.positions + rng.normal(scale=0.2, size=(40, 3)))
-    for seen in (poses, places, mixed, noisy):
+    for seen in (poses, places, mixed, few, noisy):
         assert explained(Problem(UR, seen)) is None
 
 

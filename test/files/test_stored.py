@@ -6,12 +6,11 @@ import struct
 from types import SimpleNamespace
 
 import pytest
-from recorded import STREAMS, record_in_chunks, session_of, storages
+from recorded import STREAMS, record_in_chunks, session_of
 from rosbags.rosbag2 import Reader
 
 from calib_ros.files.mcap import MAGIC, Opcode, records
 from calib_ros.files.stored import CHUNK, STORAGE, read
-from calib_ros.sampling.batches import Stream
 from calib_ros.settings import STORAGES
 
 COMPRESSIONS = [
@@ -107,12 +106,3 @@ def test_the_files_of_a_split_bag_are_read_one_after_the_other(tmp_path):
         expected = [(STREAMS[c.topic], bytes(data)) for c, _, data in reader.messages(connections)]
         assert list(read(reader, STREAMS)) == expected
     assert len(expected) == 560
-
-
-@storages
-@pytest.mark.parametrize('kind', ['std_msgs/msg/String', 'geometry_msgs/msg/PointStamped'])
-def test_a_channel_of_another_type_is_not_read(tmp_path, storage, kind):
-    path = record_in_chunks(tmp_path / 'bag', storage)
-    with Reader(path) as reader:
-        found = list(read(reader, {'/pose': Stream('/pose', kind)}))
-    assert found == []

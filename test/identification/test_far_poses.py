@@ -31,13 +31,6 @@ def earlier():
     return [Calibration.of(identify(each)) for each in first]
 
 
-def test_half_a_table_in_mm_is_named():
-    """It was refused for its errors alone."""
-    found = identify(seen(40, in_mm=20, **SIGMAS))
-    assert 'in poses 1 to 20 of 40 alone, the positions are in mm' in str(found.refusals[0])
-    assert 'write them as the others (--length mm reads them)' in str(found.refusals[0])
-
-
 @pytest.mark.parametrize('without_noise', [False, True])
 def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
     there = replace(TRUE, base=random_frame(np.random.default_rng(1), 2.0))

@@ -43,14 +43,6 @@ def test_restored_samples_come_first_and_are_as_good_as_new():
         assert one == other
 
 
-def test_restored_samples_know_their_frame():
-    made = session(samples(frame_id='world'))
-    assert made.problem().world_frame == 'world'
-    drive(made, 2, [tracker()])  # in 'tracker'
-    with pytest.raises(InputError, match=r'different frames \(tracker, world\)'):
-        made.problem()
-
-
 def renamed(tracked, frames):
     """Return a source whose measurements by their number are in other frames."""
     source, kind, seen = tracked
