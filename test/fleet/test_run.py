@@ -215,15 +215,6 @@ def test_nights_by_other_settings_are_told_of(plant, cluster, tmp_path):
     assert statuses((later,), history, found, 100.0)[0].remarks == ()
 
 
-def test_a_pattern_that_matches_nothing_costs_no_other(plant, cluster, tmp_path):
-    first, second = plant
-    missing = Pattern(str(tmp_path / 'archive/*.csv'))
-    first = replace(first, measured=(missing, *first.measured))
-    found = run((first, second), History(tmp_path / 'history'), cluster)
-    assert found.filed == 4
-    assert found.errors == {'A': {missing.files: f'nothing matches {missing.files}'}}
-
-
 def test_hidden_files_are_no_nights(plant, tmp_path):
     """As rsync has them until a copy is whole, and calib_ros until a bag is."""
     nights = tmp_path / 'nights/A'
@@ -247,10 +238,15 @@ def test_what_is_damaged_costs_its_robot_only(plant, cluster, tmp_path):
     bad.write_bytes(bad.read_bytes()[:-200] + b'\xff\xfe\n')
     for path in (tmp_path / 'nights/B').iterdir():
         path.unlink()
-    found = run(plant, history, cluster)
+    first, second = plant
+    missing = str(tmp_path / 'archive/*.csv')
+    first = replace(first, measured=(Pattern(missing), *first.measured))
+    found = run((first, second), history, cluster)
     assert found.filed == 1
+    assert found.errors['A'].keys() == {missing, str(bad)}
+    assert found.errors['A'][missing] == f'nothing matches {missing}'
     assert str(bad) in found.errors['A'][str(bad)]
-    assert found.errors['B'] == {(none := plant[1].measured[0].files): f'nothing matches {none}'}
+    assert found.errors['B'] == {(none := second.measured[0].files): f'nothing matches {none}'}
 
 
 def test_a_page_that_cannot_be_written_costs_no_result(plant, cluster, tmp_path):

@@ -17,13 +17,16 @@ from calib_ros.decision.suspects import Suspect
 from calib_ros.report import advice
 
 
+@pytest.mark.parametrize('auto', [False, True])
 @pytest.mark.parametrize('rule', Rule)
-def test_every_refusal_is_told_in_plain_words(rule):
-    (told,) = advice.advice([Reason(rule, 'something new')])
+def test_every_refusal_is_told_in_plain_words(rule, auto):
+    """And sends nobody to the model just used."""
+    (told,) = advice.advice([Reason(rule, 'something new')], advice.Situation(auto=auto))
     assert told.heading
     assert told.steps
     assert told.meaning
     assert told.refusal == 'something new'
+    assert not auto or 'auto' not in ''.join(told.steps)
 
 
 def test_a_verdict_names_each_of_several_mistakes():
@@ -82,13 +85,6 @@ def test_a_device_finer_than_stated_is_to_be_stated_first(poses):
     assert 'less than 0.1 mm' in finer.steps[0]
     assert 'only 0.022 mm' in finer.steps[0]
     assert finer.steps[1:] == usual.steps
-
-
-@pytest.mark.parametrize('rule', Rule)
-def test_nobody_is_sent_to_the_model_just_used(rule):
-    (told,) = advice.advice([Reason(rule, 'something new')], advice.Situation(auto=True))
-    assert told.steps
-    assert 'auto' not in ''.join(told.steps)
 
 
 @pytest.mark.parametrize(

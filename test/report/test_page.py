@@ -44,8 +44,8 @@ def test_the_figures_are_those_of_the_result(solved):
     _, result = solved
     page = page_of(report_of(*solved))
     for figures in result.validation.figures:
-        for value in (figures.rms_mm, figures.mean_mm, figures.max_mm, figures.rms_mrad):
-            assert f'{value:.3f}' in page.text
+        for name in ('rms_mm', 'mean_mm', 'max_mm', 'mean_plus_3_sigma_mm', 'rms_mrad'):
+            assert f'{getattr(figures, name):.3f}' in page.text
     for name, partners in result.gauges.items():
         assert f'{name} {", ".join(partners)}' in page.text
     assert table_hash(result.chain) in page.text
