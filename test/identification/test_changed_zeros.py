@@ -120,34 +120,29 @@ def test_another_load_is_no_change_of_the_arm(earlier, seed):
     assert found.document()['refusal'].endswith(f'or, with this one, {ANEW}')
 
 
-def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show():
-    true = faulty(UR10E, Cell(), np.random.default_rng(4))
-    pair = enumerate((true, slipped(true, ALL)))
-    first, second = (Calibration.of(identify(seen(arm, 50, k))) for k, arm in pair)
+TWO = Chain('two', 'standard', (Joint('j1', a=0.4, alpha=1.5, d=0.2), Joint('j2', a=0.3)))
+ONE_TURN = np.radians([0.0, 0.0, 7.2, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ('chain', 'change', 'owner', 'said'),
+    [
+        (UR10E, lambda true: slipped(true, ALL), 'all joints', ' (theta); nothing else'),
+        (UR10E, lambda true: slipped(true, ONE_TURN), 'elbow_joint', '.theta by +125.'),
+        # Beside free frames only its elbow has a zero; an arm of two joints has none.
+        (SCARA, lambda true: slipped(true, [1e-3, 2e-3, 1e-3, -2e-3]), 'elbow', '.theta by +'),
+        (TWO, lambda true: true.with_offsets({'j1.a': 2e-3}), 'j1', '.a by +'),
+    ],
+)
+def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show(
+    chain, change, owner, said
+):
+    true = faulty(chain, Cell(), np.random.default_rng(4))
+    pair = enumerate((true, change(true)))
+    first, second = (Calibration.of(identify(seen(arm, 50, k, chain=chain))) for k, arm in pair)
     found = difference(first, second)
-    assert 'changed: all joints (theta); nothing else' in found.in_words()
-    true = faulty(SCARA, Cell(), np.random.default_rng(4))  # beside free frames only its elbow
-    first, second = (
-        Calibration.of(identify(seen(arm, 50, k, chain=SCARA)))
-        for k, arm in enumerate((true, slipped(true, [1e-3, 2e-3, 1e-3, -2e-3])))
-    )
-    assert owners(difference(first, second).changed) == [{'elbow'}]
-
-
-def test_two_calibrations_differ_by_the_turn_of_one_motor():
-    true = faulty(UR10E, Cell(), np.random.default_rng(4))
-    pair = enumerate((true, slipped(true, np.radians([0.0, 0.0, 7.2, 0.0, 0.0, 0.0]))))
-    first, second = (Calibration.of(identify(seen(arm, 50, k))) for k, arm in pair)
-    assert owners(difference(first, second).changed) == [{'elbow_joint'}]
-
-
-def test_two_calibrations_of_an_arm_without_a_zero_of_its_own():
-    """Beside free frames an arm of two joints has none."""
-    arm = Chain('two', 'standard', (Joint('j1', a=0.4, alpha=1.5, d=0.2), Joint('j2', a=0.3)))
-    true = faulty(arm, Cell(), np.random.default_rng(3))
-    pair = enumerate((true, true.with_offsets({'j1.a': 2e-3})))
-    first, second = (Calibration.of(identify(seen(now, 50, k, chain=arm))) for k, now in pair)
-    assert owners(difference(first, second).changed) == [{'j1'}]
+    assert owners(found.changed) == [{owner}]
+    assert f'changed: {owner}{said}' in found.in_words()
 
 
 @pytest.mark.parametrize('new', [(), ('base',)])
