@@ -113,7 +113,8 @@ def _check_shown(
     shown = set(excited(triangular_factor(chain, names, system), names)).intersection(
         *(independent(triangular_factor(chain, names, rest), names) for rest in rests)
     )
-    if hidden := set(structurally_independent(chain, names, problem.kinds)).difference(shown):
+    nominal = replace(chain, joints=problem.chain.joints)  # corrected ones are hardly parallel
+    if hidden := set(structurally_independent(nominal, names, problem.kinds)).difference(shown):
         frames = ' and '.join(dict.fromkeys(name.owner for name in names if name in hidden))
         raise InputError(
             f'{counted(system.count, "pose")} cannot place the new {frames}: measure more, all '

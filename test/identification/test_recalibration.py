@@ -358,7 +358,7 @@ def test_poses_that_do_not_tell_of_new_frames_are_too_few():
 def test_heights_on_a_scara_are_told_from_each_other(seed):
     """Corrected axes are not quite parallel, and the height of its target is that of its base."""
     rng = np.random.default_rng(seed)
-    true = faulty(SCARA, Cell(), rng)
+    true = faulty(SCARA, Cell(angle_error=3e-4), rng)
 
     def seen(now, count):
         measured = measure(now, SCARA.random_joints(count, rng), rng, *NOISE)
@@ -368,10 +368,11 @@ def test_heights_on_a_scara_are_told_from_each_other(seed):
     slipped = seen(true.with_offsets({'quill.d': 5e-4}), 8)
     ((*reasons,),) = recalibrate(previous, slipped, 0.1).changed
     assert 'quill.d' in {name for each in reasons for name in each.names}
-    other = seen(replace(true, tool=random_frame(rng, 0.2)), 8)
-    found = recalibrate(previous, other, 0.1, new=('tool',))
-    assert found.accepted
-    assert not found.changed
+    elsewhere = {'tool': random_frame(rng, 0.2), 'base': random_frame(rng, 2.0)}
+    for new in (('tool',), ('tool', 'base')):
+        now = replace(true, **{name: elsewhere[name] for name in new})
+        found = recalibrate(previous, seen(now, 8), 0.1, new=new)
+        assert (found.accepted, found.changed) == (True, ())
 
 
 def test_another_of_several_targets_may_be_new(earlier):
