@@ -91,6 +91,8 @@ class Verification(Shown):
     """Of the interval."""
     group: Index
     """(N,) configuration of each measurement; `configurations` counts them."""
+    stamps_ns: Index
+    """(N,) of each measurement; lines of a table without stamps."""
     rms: float
     lower: float
     upper: float
@@ -183,6 +185,7 @@ def verify(
         limit=limit,
         confidence=confidence,
         group=group,
+        stamps_ns=np.concatenate([each.stamps_ns for each in sets]),
         rms=rms,
         lower=float(lower[0]),
         upper=float(upper[0]),

@@ -1,22 +1,25 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A missing row in one of two tables put side by side: later rows are mismatched.
+"""Tables put together wrongly: rows lost or repeated, columns dead or in any order.
 
-Base and tool are found from the first or last third of the session. Then each measurement i is
-compared with the joint values i + s for small shifts s: one shift fits before a row k, another
-from there on, and one of them is zero.
+Where a row is missing in one of two tables put side by side, later rows are mismatched. Base and
+tool are found from the first or last third of the session. Then each measurement i is compared
+with the joint values i + s for small shifts s: one shift fits before a row k, another from there
+on, and one of them is zero.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import product
+from functools import partial
+from itertools import permutations, product
 
 import numpy as np
 
-from calib_ros.decision.suspects import rows_away
+from calib_ros.decision.suspects import Sets, Suspect, rows_away
 from calib_ros.decision.trials import in_frames, misses
-from calib_ros.estimation.levels import LEAST_ASIDE
+from calib_ros.estimation.levels import LEAST_ASIDE, NEARER, SEVERAL, TELLING, TRIED
 from calib_ros.estimation.observations import SOME_POSES, Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.start import flange
@@ -24,6 +27,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
+from calib_ros.shown import row_name, rows_in_words
 
 SLIPS = (0, 1, -1, 2, -2)  # rows that may be missing (benchmarks/mistakes.py loses one)
 FEWEST_ROWS = 3 * IN_A_FRAME
@@ -65,10 +69,88 @@ def row_loss(
             fitting = int(np.count_nonzero(pieced <= largest))
             if fitting >= good and _apart(tables[before], tables[after], row, largest):
                 good = fitting + 1
-                where = f'from pose {row + 1} on' if after else f'before pose {row + 1}'
+                name = row_name(row, seen.stamps_ns[row])
+                where = f'from {name} on' if after else f'before {name}'
                 error = float(np.median(pieced[np.isfinite(pieced)]))
                 best = f'{where} {rows_away(after or before)}', error
     return best
+
+
+def in_any_order(chain: Chain, seen: Observations) -> Iterator[Suspect]:
+    """Yield the orders of joints that fit best the distances of positions, tools being short."""
+    count = len(chain.joints)
+    if not 3 < count < 8 or seen.socket:
+        return
+    few = seen.select(np.linspace(0, len(seen) - 1, 3 * count).astype(int))
+    orders = np.array([*permutations(range(count))])
+    arm = replace(chain, base=None, tool=None).forward(few.joints[:, orders].reshape(-1, count))
+    reached = arm[:, :3, 3].reshape(len(few), len(orders), 3)
+    measured = (few.inverted() if few.inverse else few).positions[:, np.newaxis]
+    steps = (np.linalg.norm(np.diff(each, axis=0), axis=2) for each in (reached, measured))
+    away = np.median(np.abs(np.subtract(*steps)), axis=0)
+    for order in orders[np.argsort(away)[: SEVERAL * TRIED]].tolist():
+        columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(order, 1))
+        yield Suspect(
+            'the joints are in another order',
+            f'--columns {columns}',
+            (partial(_ordered, order=order),),
+            3,
+            published='set the order of joint_names, start without resume',
+        )
+
+
+def _ordered(each: Observations, order: list[int]) -> Observations:
+    return replace(each, joints=each.joints[:, order])
+
+
+def dead(chain: Chain, sets: Sets) -> Suspect | None:
+    """Return position coordinates that are constant although the arm moves.
+
+    A device square to a planar arm measures no more.
+    """
+    for each in sets:
+        if each.socket or len(each) < TELLING:
+            continue
+        seen = (each.inverted() if each.inverse else each).positions
+        held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
+        places = replace(chain, base=None, tool=None).forward(each.joints)[:, :3, 3]
+        spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
+        if len(held) and spreads[2] > NEARER**2 * spreads[0]:
+            columns = ', '.join('xyz'[k] for k in held)
+            return Suspect(
+                f'all positions have the same {columns}, though the arm moves in all directions',
+                f'give the column {columns} as it was measured, or measure again with it',
+                published='check the positions where they are published',
+            )
+    return None
+
+
+def stuck(chain: Chain, seen: Observations, largest: float) -> Suspect | None:
+    """Return rows that repeat the measurement, or the joint values, of the row before them.
+
+    They miss the chain, and the other ones moved meanwhile, by more than `largest` [m].
+    """
+    if seen.socket:
+        return None
+    arm = flange(chain, seen)
+    far = misses(chain, seen, arm) > largest
+    poses = np.column_stack([seen.positions, seen.rotations.reshape(-1, 9)])
+    for what, values, others in (
+        ('the measurement is', poses, arm[:, :3, 3]),
+        ('the joint values are', seen.joints, seen.positions),
+    ):
+        moved = np.linalg.norm(np.diff(others, axis=0), axis=1) > largest
+        again = (np.diff(values, axis=0) == 0.0).all(axis=1)
+        rows = 1 + np.flatnonzero(again & moved & far[1:])
+        if len(rows) >= LEAST_ASIDE:
+            names = rows_in_words(rows.tolist(), seen.stamps_ns.tolist())
+            return Suspect(
+                f'{what} repeated in {names} while the rest moved',
+                'leave these rows out, and look why its source stood still',
+                rank=0,
+                published='look why its publisher repeats old values',
+            )
+    return None
 
 
 def _where(before: Flags, after: Flags) -> int:

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.decision.lost_rows import row_loss
+from calib_ros.decision.lost_rows import dead, in_any_order, row_loss, stuck
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
-from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, dead, hidden, suspects
+from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, hidden, suspects
 from calib_ros.decision.trials import Bare, Trial, in_frames, misses, refined, trial_of
 from calib_ros.estimation.levels import (
     ALIKE,
@@ -48,7 +48,7 @@ from calib_ros.kinematics.lens import require_lens
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import norms
 from calib_ros.settings import LEVER
-from calib_ros.shown import some
+from calib_ros.shown import rows_in_words
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,8 @@ class Explained:
     @property
     def alone(self) -> bool:
         """Tell whether this refuses a result by itself."""
-        return not any(each.chain or each.what == ORIENTATIONS.what for each in self.suspects)
+        other = ORIENTATIONS.what
+        return all(each.rank and not each.chain and each.what != other for each in self.suspects)
 
     @property
     def reason(self) -> Reason:
@@ -142,6 +143,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         (missing and Explained((missing,), given.error, np.nan))  # no change restores it
         or _of_a_lost_row(problem, chain, sets, given)
         or _named(problem, chain, sets, given)
+        or _of_stuck(problem, given.chain, _moved(problem, sets[0], 0))
         or _by_places(problem, chain, sets, given)
         or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
@@ -161,7 +163,7 @@ def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
     sets = [each for each in problem.all_sets if each.distances is None and each.pixels is None]
     for each in sets:
-        if found := _of_rows(problem, chain, each):
+        if found := _of_rows(problem, chain, each) or _of_stuck(problem, chain, each):
             return _told(problem, replace(found, where=_among(sets, each) + found.where))
     return None
 
@@ -182,11 +184,11 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
     found = _named(problem, chain, given.sets, given, of_rows=True)
     if found is None or len(rows) == len(seen):
         return found
-    runs = np.split(rows + 1, np.flatnonzero(np.diff(rows) > 1) + 1)
-    poses = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
+    poses = rows_in_words(rows.tolist(), seen.stamps_ns.tolist())
+    among = f' of {len(seen)}' * poses.startswith('pose')
     alike = '{}' if problem.of_messages else 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
-    where = f'in poses {", ".join(some(poses))} of {len(seen)} alone, '
+    where = f'in {poses}{among} alone, '
     return replace(found, suspects=tuple(named), where=where)
 
 
@@ -224,7 +226,8 @@ def _named(
     """Return the mistakes that explain the sets best; only of what is written in each row."""
     rough, tried = [], []
     bare: Bare = {}
-    for each in suspects(chain, given.sets, _of_images(problem)):
+    likely = suspects(chain, given.sets, _of_images(problem))
+    for each in (*likely, *in_any_order(chain, given.sets[0])):
         if of_rows and not each.changes:
             continue
         few = given.sets
@@ -269,6 +272,11 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
     # the typical error tells nothing if most rows are right
     corrected = error if error < NEARER * given.error else np.nan
     return Explained((Suspect(what, remedy),), given.error, corrected)
+
+
+def _of_stuck(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
+    odd = stuck(chain, seen, _largest(problem))
+    return None if odd is None else Explained((odd,), np.nan, np.nan)
 
 
 def _in_some_rows(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> Explained | None:

@@ -23,6 +23,11 @@ from calib_ros.kinematics.se3 import FloatArray
 
 Turn: TypeAlias = Callable[[FloatArray], FloatArray]
 ORDERS = tuple(map(''.join, permutations('XYZ')))
+BACKWARDS = (
+    'the Euler angles stand in the opposite order',
+    'of r1, r2, r3 reverse the letters of --euler, and small for capital (xyz for ZYX); of rx, '
+    'ry, rz exchange the first and the last turn',
+)
 VECTOR = ''  # "Order" of a rotation vector
 
 
@@ -34,6 +39,7 @@ def misread() -> Iterator[tuple[str, str, Turn]]:
         angles = f'Euler angles {_order(read)}'
         for meant in ORDERS:
             if meant == read:
+                yield *BACKWARDS, _reinterpret(read, read, read[::-1])
                 continue
             what, turn = f'the Euler angles are {_order(meant)}', _reinterpret(read, meant, meant)
             yield f'{what}, not {_order(read)}', f'--euler {meant}{so}', turn

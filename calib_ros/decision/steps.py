@@ -37,6 +37,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
+from calib_ros.shown import row_name
 
 FRAMES = ('base', 'tool')
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
@@ -83,12 +84,12 @@ class Step:
     @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
-        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
+        name = row_name(self.sample, self.stamp_ns)
+        where = name if self.image is None else f'image {self.image + 1}'
         where += f' of set {self.set + 1}' if self.set else ''
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
-        line, fraction = divmod(self.stamp_ns, 10**9)
-        if line < 10**6 and not fraction:  # row numbers instead of a clock
-            where = f'line {line}' if self.image is None else f'{where}, line {line}'
+        if name.startswith('line'):  # instead of a clock
+            where = name if self.image is None else f'{where}, {name}'
             when = 'if rows are in the order of measurement'
         size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
         if self.held:

@@ -7,14 +7,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from typing import TypeAlias
 
 import numpy as np
 
 from calib_ros.decision.printed_board import size_of
 from calib_ros.decision.rotation_conventions import Turn, misread
-from calib_ros.estimation.levels import NEARER, TELLING
+from calib_ros.estimation.levels import NEARER
 from calib_ros.estimation.observations import Observations
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Chain, Convention
@@ -43,9 +43,9 @@ class Suspect:
     """A possible mistake, in words, and the option to give with a table.
 
     `changes` in order undo it in the samples, `chain` is the corrected nominal one, joint values
-    are `rows` below their measurement. Of equivalent mistakes, those of lowest `rank` are named.
-    `published` is the remedy for messages, live or from a bag. Mistakes of different parts
-    (those of FIRST, or a joint) may occur together.
+    are `rows` below their measurement. Of equivalent mistakes, those of lowest `rank` are named;
+    with 0 the other rows may do. `published` is the remedy for messages, live or from a bag.
+    Mistakes of different parts (those of FIRST, or a joint) may occur together.
     """
 
     what: str
@@ -87,6 +87,7 @@ def suspects(chain: Chain, sets: Sets, of_images: bool = False) -> Iterator[Susp
         (seen,) = sets
         ways = _conventions(chain, seen) if seen.oriented.any() else ()
         yield from (replace(each, part='measured') for each in (*_units(chain), *ways))
+        yield from _of_coordinates(seen)
         if seen.oriented.any():
             yield from _misread(chain, seen)
         remedy = 'turn one of them round, --columns y=-y (of poses qx=-qx,qz=-qz as well)'
@@ -163,6 +164,23 @@ def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[
             yield Suspect(f'the {key} are in {way}', option, (change(factor),), 2, part='measured')
 
 
+def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
+    """Yield other axes of the positions alone, and units of one coordinate."""
+    back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
+    for signs, order in product(product((1, -1), repeat=3), permutations(range(3))):
+        if seen.oriented.any() and ({*signs} == {1}) != (order == (0, 1, 2)):
+            matrix = np.diag(signs) @ np.eye(3)[[*order]]
+            given = [f'{"-" * (n < 0)}{"xyz"[k]}' for n, k in zip(signs, order, strict=True)]
+            option = '--columns ' + ','.join(f'{a}={b}' for a, b in zip('xyz', given, strict=True))
+            what = f'the coordinates x, y, z of the positions are {", ".join(given)}'
+            changes = (*back, partial(_turned, matrix=matrix), *back)
+            yield Suspect(what, option, changes, part='measured')
+    for k, name in enumerate('xyz'):
+        own = partial(_scaled, axis=k)
+        for each in _of_lengths(f'{name} coordinates alone', name, own):
+            yield replace(each, changes=(*back, *each.changes, *back))
+
+
 def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     """Yield ways to write a pose, also with lengths in mm or joint values in degrees.
 
@@ -186,7 +204,7 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
             (_with(lambda turns: np.swapaxes(turns, 1, 2)), *back),
         ),
     ]
-    if seen.inverse:
+    if back:
         ways.append(Suspect(*NOT_ON_FLANGE, published=_in_sources(False)))
     elif seen.oriented.all():
         what = 'the poses are of the world in the target, as from a camera on the flange'
@@ -293,28 +311,6 @@ def _of_one_unit(chain: Chain) -> Iterator[Suspect]:
             yield Suspect(what, remedy, (change,), 2, part=name)
 
 
-def dead(chain: Chain, sets: Sets) -> Suspect | None:
-    """Return position coordinates that are constant although the arm moves.
-
-    A device square to a planar arm measures no more.
-    """
-    for each in sets:
-        if each.socket or len(each) < TELLING:
-            continue
-        seen = (each.inverted() if each.inverse else each).positions
-        held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
-        places = replace(chain, base=None, tool=None).forward(each.joints)[:, :3, 3]
-        spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
-        if len(held) and spreads[2] > NEARER**2 * spreads[0]:
-            columns = ', '.join('xyz'[k] for k in held)
-            return Suspect(
-                f'all positions have the same {columns}, though the arm moves in all directions',
-                f'give the column {columns} as it was measured, or measure again with it',
-                published='check the positions where they are published',
-            )
-    return None
-
-
 def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> Suspect:
     """Return that a joint has the other sign, another zero [rad], or both."""
     parts, column = [], f'q{k + 1}'
@@ -341,8 +337,7 @@ def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
     size = SCALES['mm']
     small = [replace(j, a=size * j.a, b=size * j.b, d=size * j.d) for j in chain.joints]
-    what = 'the lengths of the chain file are in mm, not metres'
-    remedy = 'give a and d in metres there'
+    what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
     arm = replace(chain, joints=tuple(small))
     yield Suspect(what, remedy, chain=arm, published=remedy)
     other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
@@ -384,8 +379,13 @@ def _lengths(chain: Chain, size: float) -> tuple[DataChange, DataChange]:
     return _scaled(size), _of_kind(chain, 'prismatic', size)
 
 
-def _scaled(size: float) -> DataChange:
-    return lambda each: replace(each, positions=size * each.positions)
+def _scaled(size: float, axis: int | None = None) -> DataChange:
+    sizes = np.where(np.isin(np.arange(3), range(3) if axis is None else axis), size, 1.0)
+    return lambda each: replace(each, positions=sizes * each.positions)
+
+
+def _turned(each: Observations, matrix: FloatArray) -> Observations:
+    return replace(each, positions=each.positions @ matrix.T)
 
 
 def _with(turn: Turn) -> DataChange:

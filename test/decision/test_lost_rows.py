@@ -1,17 +1,20 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that one of two tables lacks: joint values and measurements stand side by side no more."""
+"""Rows lost or repeated, columns in another order: joints and measurements do not match."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from fits import NOISE, UR10E, arm
+from scipy.spatial.transform import Rotation
 
 from calib_ros import Problem, identify
-from calib_ros.apply.simulation import measure
+from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.lost_rows import _apart, _where, row_loss
+from calib_ros.decision.mistakes import explained
 from calib_ros.estimation.levels import LEAST_ASIDE
+from calib_ros.kinematics.chain_file import load_chain
 
 
 def seen_of(count, oriented):
@@ -22,9 +25,9 @@ def seen_of(count, oriented):
 @pytest.mark.parametrize(
     ('positions', 'joints', 'said'),
     [
-        ([9], [-1], 'from pose 10 on the joint values stand 1 row below'),
-        ([-2, -1], [21, 22], 'from pose 22 on the joint values stand 2 rows above'),
-        ([31], [0], 'before pose 32 the joint values stand 1 row above'),
+        ([9], [-1], 'from line 11 on the joint values stand 1 row below'),
+        ([-2, -1], [21, 22], 'from line 22 on the joint values stand 2 rows above'),
+        ([31], [0], 'before line 33 the joint values stand 1 row above'),
     ],
 )
 @pytest.mark.parametrize('oriented', [True, False])
@@ -75,3 +78,66 @@ def test_each_side_of_a_lost_row_fits_by_its_own_shift(own, other, found, first)
     row = 20 if first else LEAST_ASIDE
     assert _apart(*far, row, 0.5) == found
     assert not _apart(*far[:, :-1] if first else far[:, 1:], row - (not first), 0.5)
+
+
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('name', ['ur10e', 'kuka_iiwa14'])
+def test_any_order_of_the_joints_is_named(name, oriented):
+    chain, rng = load_chain(name), np.random.default_rng(3)
+    true = faulty(chain, Cell(), rng)
+    seen = measure(true, chain.random_joints(40, rng), rng, *NOISE, oriented)
+    order = rng.permutation(len(chain.joints))
+    found = explained(Problem(chain, replace(seen, joints=seen.joints[:, order])))
+    back = np.argsort(order)
+    columns = ','.join(f'q{k + 1}=q{place + 1}' for k, place in enumerate(back))
+    assert found.suspects[0].remedy == f'--columns {columns}'
+    assert len(found.suspects) == 1
+
+
+@pytest.mark.parametrize('part', ['measurement is', 'joint values are'])
+def test_a_source_that_repeats_its_last_value_is_named(part):
+    """If the other rows do not suffice; a fixed point touched again and again is measured so."""
+    seen, rows = seen_of(40, True), slice(8, 30)
+    held = {'joints': seen.joints.copy()}
+    if part != 'joint values are':
+        held = {'positions': seen.positions.copy(), 'rotations': seen.rotations.copy()}
+    for values in held.values():
+        values[rows] = values[7]
+    result = identify(Problem(UR10E, replace(seen, **held)))
+    assert not result.accepted
+    assert f'the {part} repeated in lines 9 to 30 while the rest moved' in ' '.join(
+        map(str, result.refusals)
+    )
+
+
+@pytest.mark.parametrize('size', [1e3, 1e-3])
+def test_one_coordinate_in_another_unit_is_named(size):
+    seen = seen_of(30, size > 1.0)
+    positions = seen.positions * [1.0, size, 1.0]
+    found = explained(Problem(UR10E, replace(seen, positions=positions)))
+    assert found.suspects[0].remedy == f'--columns y=y*{1.0 / size:g}'
+
+
+@pytest.mark.parametrize(
+    ('axes', 'option'),
+    [([1, 0, 2], 'x=y,y=x,z=z'), ([1, 2, 0], 'x=z,y=x,z=y')],
+)
+def test_coordinates_of_the_positions_alone_in_another_order_are_named(axes, option):
+    seen = seen_of(30, True)
+    found = explained(Problem(UR10E, replace(seen, positions=seen.positions[:, axes])))
+    assert f'--columns {option}' in [each.remedy for each in found.suspects]
+
+
+def test_a_coordinate_of_the_positions_alone_that_counts_the_other_way_is_named():
+    seen = seen_of(30, True)
+    found = explained(Problem(UR10E, replace(seen, positions=seen.positions * [1.0, 1.0, -1.0])))
+    assert [each.remedy for each in found.suspects] == ['--columns x=x,y=y,z=-z']
+
+
+def test_euler_angles_about_fixed_axes_in_the_order_of_their_columns_are_named():
+    """Of a Fanuc, W P R, read as those of a KUKA, A B C."""
+    seen = seen_of(30, True)
+    angles = Rotation.from_matrix(seen.rotations).as_euler('xyz')
+    wrong = Rotation.from_euler('ZYX', angles).as_matrix()
+    (found,) = explained(Problem(UR10E, replace(seen, rotations=wrong))).suspects
+    assert 'reverse the letters of --euler' in found.remedy

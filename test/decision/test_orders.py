@@ -81,7 +81,7 @@ def test_rows_that_are_not_like_the_others_are_named():
     for part, where in ((rows < 22, '1 to 22'), (rows >= 27, '28 to 50')):
         spoilt = replace(one, joints=np.where(part, np.rad2deg(q), q))
         found = explained(Problem(arm, spoilt))
-        assert found.where == f'in poses {where} of 50 alone, '
+        assert found.where == f'in lines {where} alone, '
         assert (
             found.suspects[0].remedy == 'write them as the others (--joint-angle deg reads them)'
         )
@@ -104,10 +104,10 @@ def test_a_few_rows_in_another_unit_are_named(rows, where, oriented):
         (seen.positions, np.where(some, np.degrees(q), q), 'joint values are in degrees'),
     ):
         found = str(explained(Problem(arm, replace(seen, positions=positions, joints=joints))))
-        assert found.startswith(f'in poses {where} of 40 alone, the {words}, not ')
+        assert found.startswith(f'in lines {where} alone, the {words}, not ')
     many = Problem(arm, replace(seen, joints=np.where(some, np.degrees(q), q)), of_messages=True)
     told = str(explained_alone(many, true))
-    assert told.startswith(f'in poses {where} of 40 alone, the joint values are in degrees, not ')
+    assert told.startswith(f'in lines {where} alone, the joint values are in degrees, not ')
     assert ': correct the publisher and measure again' in told
 
 
@@ -135,7 +135,7 @@ def test_rows_of_one_of_several_sets_are_told_with_its_device():
     second = replace(there, base='second', positions=mixed)
     problem = Problem(arm.with_frame('second', true.frame('second')), first, more=(second,))
     found = str(explained_alone(problem, true))
-    assert found.startswith('in the measurements with second alone, in poses 1 to 3 of 40 alone')
+    assert found.startswith('in the measurements with second alone, in lines 1 to 3 alone')
 
 
 def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):
@@ -152,5 +152,5 @@ def test_mistakes_of_many_rows_are_searched_in_some_of_them(monkeypatch):
     late = np.arange(len(q))[:, np.newaxis] >= SOME_POSES
     seen = replace(seen, positions=np.where(late, 1e3, 1.0) * seen.positions)
     found = str(explained_alone(Problem(arm, seen), true))
-    assert found.startswith(f'in poses {SOME_POSES + 1} to {len(q)} of {len(q)} alone, the ')
+    assert found.startswith(f'in lines {SOME_POSES + 1} to {len(q)} alone, the ')
     assert max(tried) <= SOME_POSES

@@ -35,7 +35,7 @@ def earlier():
 def test_a_part_in_mm_is_named_between_new_frames_too(earlier, without_noise):
     there = replace(TRUE, base=random_frame(np.random.default_rng(1), 2.0))
     few = seen(15, in_mm=7, true=there)
-    with pytest.raises(InputError, match='in poses 1 to 7 of 15 alone, the positions are in mm'):
+    with pytest.raises(InputError, match='in lines 1 to 7 alone, the positions are in mm'):
         recalibrate(earlier[without_noise], few, 0.1, new=('base',))
 
 

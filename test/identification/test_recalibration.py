@@ -260,7 +260,7 @@ def test_another_arm_is_not_mended_by_8_poses(earlier):
 
 
 IN_MM = np.where(np.arange(15)[:, np.newaxis] < 7, 1.0, 1e3)
-HALF = 'in poses 8 to 15 of 15 alone, the positions are in mm'
+HALF = 'in lines 8 to 15 alone, the positions are in mm'
 
 
 @pytest.mark.parametrize(
