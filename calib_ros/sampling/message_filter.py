@@ -12,6 +12,7 @@ import numpy as np
 
 from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.hints import Hint
 from calib_ros.sampling.messages import JOINT_STATE, PICTURES, Readings, usable
 from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, JointIndices, Piece, StreamKey
 from calib_ros.sampling.sources import Source
@@ -80,6 +81,12 @@ class JointNames:
         """Return the names of joints that move but are not in the chain."""
         moved = {name for name, (low, high) in self._heard.items() if high - low > STILL}
         return sorted(moved.difference(self._names))
+
+    def silent_ones(self, silent: Sequence[int]) -> list[Hint]:
+        """Return a hint that no more joint states of these joints arrive, if any."""
+        words = f'no more joint states of {", ".join(self._names[k] for k in silent)}'
+        ask = 'does their driver run, and publish them at rest too?'
+        return [Hint(f'nothing can be sampled: {words}', f'{words}: {ask}')] if silent else []
 
     def foreign_ones(self, missing: Sequence[int]) -> str:
         """Return a hint that other joints arrive than the missing ones; empty if none do."""

@@ -184,9 +184,8 @@ class CalibrationSession:
         if not self.recording:
             return NOT_RECORDING
         track = self._collector.track
-        silent = [self.joint_names[k] for k in track.silent(round(1e9 * SILENCE))]
-        if silent:
-            return f'nothing can be sampled: no more joint states of {", ".join(silent)}'
+        for hint in self._names.silent_ones(track.silent(round(1e9 * SILENCE))):
+            return hint.status
         if others := self._names.foreign_ones(track.missing):
             return others
         if why := self._filter.refused.get(JOINTS):
@@ -244,7 +243,8 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        found += refocused(self.samples)
+        silent = self._collector.track.silent(round(1e9 * SILENCE))
+        found += [*self._names.silent_ones(silent), *refocused(self.samples)]
         views = sum(each.view is not None for each in self.samples)
         found += unseen(self.pictures.dropped.total(), views, self.pictures.reason)
         found += self._pipeline.hints(self.received[POSES])
@@ -255,7 +255,8 @@ class CalibrationSession:
     @property
     def doubtful(self) -> bool:
         """Tell whether the status says that messages are refused, or something looks wrong."""
-        return bool(self._filter.refused) or any(hint.status for hint in self.hints)
+        others = self._names.foreign_ones(self._collector.track.missing)
+        return bool(self._filter.refused or others) or any(hint.status for hint in self.hints)
 
     @property
     def delay(self) -> Delay | None:
@@ -300,7 +301,7 @@ class CalibrationSession:
             parts.append(f'pose {number} does not fit the others, was the target moved?')
         fitted = [sample.joints for sample in self.usable if not sample.validation]
         parts += progress(self.chain, fitted, estimate, self.settings)
-        return '; '.join(filter(None, parts))
+        return '; '.join(dict.fromkeys(filter(None, parts)))
 
     # Identification
 

@@ -118,6 +118,10 @@ def test_the_status_names_joints_of_which_nothing_is_heard_any_more():
     assert made.status().startswith(
         'nothing can be sampled: no more joint states of wrist_2_joint, wrist_3_joint'
     )
+    assert made.status().count('wrist_2_joint') == 1
+    assert made.doubtful
+    made.finish()  # a bag has no status
+    assert 'no more joint states of wrist_2_joint, wrist_3_joint: does' in made.summary
 
 
 @pytest.mark.parametrize(
@@ -149,6 +153,14 @@ def named(*messages):
         made, *(of_joints(joint_state(t, *each)) for t, each in zip(stamps, messages, strict=True))
     )
     return made
+
+
+def test_joints_by_other_names_are_doubtful():
+    made = named((UR5E.joint_names, [0.1] * 6))
+    assert not made.doubtful
+    made = named(([f'r1_{name}' for name in UR5E.joint_names], [0.1] * 6))
+    assert 'set joint_names?' in made.status()
+    assert made.doubtful
 
 
 def test_a_joint_that_is_named_twice_has_no_value():
