@@ -120,6 +120,8 @@ def cameras_of(texts: Sequence[str]) -> Mapping[str, BoardCamera]:
             raise ConfigError(
                 f'source "{source.topic}" is rectified: give what CameraInfo describes, image_raw'
             )
+        if sum(each.device == source.device for each in sources) > 1:
+            raise ConfigError(f'source "{source.topic}" needs a device=NAME that no other has')
     return {source.topic: BoardCamera(source) for source in sources}
 
 

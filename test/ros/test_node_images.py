@@ -362,6 +362,13 @@ def test_a_source_of_images_that_cannot_be(board, text, said):
         cameras_of([text.replace('BOARD', str(board))])
 
 
+def test_two_cameras_are_two_devices(board):
+    given = [f'{side}/image_raw board={board}' for side in ('left', 'right')]
+    with pytest.raises(ConfigError, match='"left/image_raw" needs a device=NAME'):
+        cameras_of(given)
+    assert len(cameras_of([f'{each} device=camera_{k}' for k, each in enumerate(given)])) == 2
+
+
 def test_what_images_need_is_told(monkeypatch, board):
     with pytest.raises(ConfigError, match='mode must not be continuous'):
         CalibrationSession(
