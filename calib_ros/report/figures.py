@@ -25,6 +25,7 @@ Figure: TypeAlias = dict[str, Any]
 BEFORE, AFTER, LIMIT = '#d95f02', '#1b9e77', '#6e7781'
 DASHED, SOLID = {'color': BEFORE, 'dash': 'dash'}, {'color': AFTER, 'dash': 'solid'}
 DOTTED = {'color': LIMIT, 'dash': 'dot'}
+AROUND_ZERO = [[0.0, '#053061'], [0.5, '#ffffff'], [1.0, '#67001f']]
 QUANTILES = 2 * SOME_POSES  # points of a curve for any number of poses
 TICKS = {'tickvals': [m * 10.0**k for k in range(-6, 4) for m in (1, 2, 5)], 'tickformat': '~g'}
 """Of a logarithmic axis: 0.1, 0.2, 0.5, 1, ..."""
@@ -43,7 +44,7 @@ def axis(title: str, **more: Any) -> Figure:
     return {'title': {'text': title}, **more}
 
 
-def scale_of(title: str, colours: str = 'Viridis', **more: Any) -> Figure:
+def scale_of(title: str, colours: Any = 'Viridis', **more: Any) -> Figure:
     """Return a colour scale beside the figure."""
     bar = axis(title, thickness=12)
     return {'colorscale': colours, 'reversescale': True, 'colorbar': bar, **more}
@@ -142,7 +143,7 @@ def correlations(names: Sequence[str], covariance: FloatArray) -> Figure:
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     labels = list(map(label, names))
     values = numbers(covariance / np.outer(scale, scale), 3)
-    colours = scale_of('correlation', 'RdBu', zmin=-1, zmax=1)
+    colours = scale_of('correlation', AROUND_ZERO, zmin=-1, zmax=1)
     mesh = _heat_map(labels, labels, values, '%{y} and %{x}: %{z:.2f}', colours)
     small = {'tickfont': {'size': 10}, 'automargin': True}
     layout = {'xaxis': small, 'yaxis': REVERSED | small, 'margin': _margin(130, 20, 90)}
@@ -194,7 +195,7 @@ def drives(chain: Chain, joints: FloatArray) -> Figure | None:
     error = np.array([added[owners == name].sum(axis=0) for name in names])
     error[(q < low[:, np.newaxis]) | (q > high[:, np.newaxis])] = np.nan
     largest = float(np.nanmax(np.abs(error)))
-    colours = scale_of('mrad', 'RdBu', zmin=-largest, zmax=largest)
+    colours = scale_of('mrad', AROUND_ZERO, zmin=-largest, zmax=largest)
     x, y, z = numbers(np.degrees(q)), list(map(label, names)), numbers(error, 3)
     mesh = _heat_map(x, y, z, '%{y} at %{x}°: %{z:.3f} mrad', colours)
     across = axis('joint value [°]')

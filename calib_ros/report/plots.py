@@ -136,8 +136,8 @@ def _png(figure: Figure) -> bytes:
     return image.getvalue()
 
 
-def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
-    """Return a plotly figure as PNG in base64, `height` in pixels; None for one in space.
+def drawing(figure: Mapping[str, Any] | None, height: int, width: int = 810) -> str | None:
+    """Return a plotly figure as PNG in base64, sizes in pixels; None for one in space.
 
     It supports the figures of reports with a PDF: curves, dots with intervals, and heat maps.
     """
@@ -146,7 +146,7 @@ def drawing(figure: Mapping[str, Any] | None, height: int) -> str | None:
         return None
     layout = figure['layout']
     count = layout.get('grid', {}).get('columns', 1)
-    paper = _figure(9.0, height / 90.0)
+    paper = _figure(width / 90.0, height / 90.0)
     titles = [each['text'] for each in layout.get('annotations', ())] or ['']
     panels = paper.subplots(1, count, squeeze=False)[0]
     for end, title, axes in zip(('', '2'), titles, panels, strict=False):
@@ -177,7 +177,7 @@ def _draw_curve(axes: Axes, curve: Mapping[str, Any]) -> None:
 
 def _draw_colours(axes: Axes, mesh: Mapping[str, Any]) -> None:
     values = np.array(mesh['z'], dtype=float)
-    colours = {'RdBu': 'RdBu', 'Viridis': 'viridis_r'}[mesh['colorscale']]  # plotly's, reversed
+    colours = 'viridis_r' if mesh['colorscale'] == 'Viridis' else 'RdBu'  # plotly's, reversed
     x, y = (
         np.arange(len(each)) if isinstance(each[0], str) else np.array(each)
         for each in (mesh['x'], mesh['y'])
