@@ -165,7 +165,7 @@ def spoilt(problem):
     )
     yield (
         'eye in hand given needlessly',
-        'not on the flange',
+        'not of a fixed target',
         with_(lambda e: e.inverted(), measured and oriented),
     )
     for group, words, change in (

@@ -205,12 +205,12 @@ def _conventions(chain: Chain, seen: Observations) -> Iterator[Suspect]:
         ),
     ]
     if back:
-        ways.append(Suspect(*NOT_ON_FLANGE, published=_in_sources(False)))
+        what = 'the poses are not of a fixed target seen from the flange'
+        ways.append(Suspect(what, NOT_ON_FLANGE[1], published=_in_sources(False)))
     elif seen.oriented.all():
         what = 'the poses are of the world in the target, as from a camera on the flange'
         remedy = '--eye-in-hand (or --inverse, where the device stands)'
-        change = (Observations.inverted,)
-        ways.append(Suspect(what, remedy, change, published=_in_sources(True)))
+        ways.append(Suspect(what, remedy, (Observations.inverted,), published=_in_sources(True)))
     in_mm, degrees = _lengths(chain, SCALES['mm']), _of_kind(chain, 'revolute', np.radians(1.0))
     for way in ways:
         yield replace(way, changes=(*back, *way.changes))
