@@ -107,8 +107,7 @@ class Recalibration(Shown):
         if self.accepted:
             return '', ''
         if self.reused:
-            why, _, step = reused_in_words(self.reused).rpartition(': ')
-            return why, f'{step}, and give only those'
+            return reused_in_words(self.reused), 'measure new ones, and give only those'
         if self.odd:
             why = f'{self.odd} contradicts all others: without it they would be accepted'
             return why, 'measure it again, or leave it out'

@@ -333,5 +333,5 @@ def reused_in_words(share: float) -> str:
     which = 'these' if share > 0.995 else f'{100.0 * share:.0f} % of these'
     return (
         f'the calibration was fitted to {which} measurements, so they prove nothing about other '
-        'poses: measure new ones'
+        'poses'
     )

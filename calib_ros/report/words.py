@@ -201,7 +201,7 @@ def verdict(
     text += f'; the limit is {1e3 * limit:.3f} mm'
     if warning := reused_in_words(reused):
         text = f'RMS {now.rms_mm:.3f} mm on {since}'
-        return 'no verdict', f'no verdict: {warning}; {text}'
+        return 'no verdict', f'no verdict: {warning}: measure new ones; {text}'
     if most > limit:
         text = f'too few poses to tell whether the calibration holds: {text}; measure more'
         return 'UNDECIDED', text
@@ -227,11 +227,16 @@ def sigma_over_range(result: Identification) -> dict[str, float]:
     return {'median': float(np.median(sigma)), 'max': float(sigma.max())}
 
 
+def times_in_words(noise: Noise) -> str:
+    """Return the ratio of the residuals to the device's noise."""
+    turned = noise.orientation
+    text = '' if turned is None else f', {turned:.2f} times in orientation'
+    return f'{noise.position:.2f} times the stated device noise{text}'
+
+
 def scatter_in_words(noise: Noise) -> str:
     """Return the excess of the residuals over the device's noise."""
-    text = f'The remaining error is {noise.position:.2f} times the stated device noise'
-    if noise.orientation is not None:
-        text += f', {noise.orientation:.2f} times in orientation'
+    text = f'The remaining error is {times_in_words(noise)}'
     if noise.consistent:
         return f'{text}: consistent with pure noise (chi-squared test).'
     if noise.position < 1.0:
@@ -246,8 +251,9 @@ def drift_in_words(noise: Noise) -> str:
 
 
 def drifts(noise: Noise) -> bool:
-    """Tell whether poses share errors in succession only."""
-    return noise.shared == ('successive',)
+    """Tell whether poses share errors in succession only, or far more than neighbours do."""
+    more = 'successive' in noise.shared and noise.successive > 2.0 * noise.near
+    return more or noise.shared == ('successive',)
 
 
 STEADY = 'Let the device warm up as long as its manual says, and measure in random order.'

@@ -161,3 +161,14 @@ def test_no_figure_is_rounded_to_nothing():
 def test_the_limits_of_an_interval_have_the_same_decimals(monkeypatch, limits, said):
     monkeypatch.setattr(words, 'limits_mm', lambda *_: limits)
     assert between(None, 0) == said
+
+
+@pytest.mark.parametrize(
+    ('successive', 'near', 'drifting'),
+    [(0.78, 0.16, True), (0.63, 0.72, False), (0.46, 0.5, False)],
+)
+def test_a_drift_is_named_though_it_shows_between_neighbours_too(successive, near, drifting):
+    """A simulated drift; the measured positioner and Panda, whose arms have errors left."""
+    noise = Noise(6.0, None, False, successive, near, ('successive', 'near'))
+    assert ('warm up' in words.drift_in_words(noise)) == drifting
+    assert words.drifts(replace(noise, shared=('near',))) is False
