@@ -24,8 +24,10 @@ from calib_ros.texts import in_markdown, one_line
 State: TypeAlias = Literal['good', 'bad', 'open', 'info']
 MARKS: dict[State, str] = {'good': '✔', 'bad': '✘', 'open': '?', 'info': 'i'}
 VALUE = r"""(?:auto|none|[cm]m|deg|rad|[xyzw]{3,4})\b|"[^"]*"|'[^']*'|[^\s()]*[\dA-Z*=_][^\s()]*"""
-TYPED = re.compile(rf'((?<![\w-])--[a-z][\w-]*(?: (?:{VALUE})(?<![.,;:]))?|calib_ros [a-z\d]+)')
-"""An option, with a value that is no plain word, or a command."""
+TYPED = re.compile(
+    rf'((?:(?<![\w-])--[a-z][\w-]*|calib_ros [a-z\d]+)(?: (?:{VALUE})(?<![.,;:]))?)'
+)
+"""An option or a command, with a value that is no plain word."""
 NEEDS_JINJA = (
     'report.html is not written: it needs jinja2 and plotly (pip install "calib_ros[report]", '
     'or apt install python3-jinja2 python3-plotly)'
@@ -104,7 +106,7 @@ class Report:
     verdict: Headline
     advice: tuple[Advice, ...] = ()
     accuracy: Section | None = None
-    picture: Section | None = None
+    picture: Section | None = None  # beside the accuracy: a figure or a table
     steps: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     identity: tuple[tuple[str, str], ...] = ()
@@ -158,9 +160,12 @@ def on_paper(report: Report) -> bytes | None:
         return None
     from calib_ros.report.plots import drawing
 
-    drawn = ((each.name, drawing(each.figure, each.height)) for each in report.shown)
+    drawings = {each.name: drawing(each.figure, each.height) for each in report.sections}
+    if report.picture:  # as high as wide
+        height = report.picture.height
+        drawings[report.picture.name] = drawing(report.picture.figure, height, height)
     logging.getLogger('weasyprint').setLevel(logging.ERROR)  # ignores screen styles
-    drawings = {name: each for name, each in drawn if each}
+    drawings = {name: each for name, each in drawings.items() if each}
     page = filled('report.html.jinja', report=report, drawings=drawings)
     found: bytes | None = weasyprint.HTML(string=page).write_pdf() if page else None
     return found
@@ -194,9 +199,10 @@ def with_code(text: str) -> str:
 
 
 def _shown(value: object) -> object:
-    """Return a foreign text without characters that hide or reverse others."""
+    """Return a foreign text, indented as it is, without characters that hide or reverse others."""
     if isinstance(value, str) and not hasattr(value, '__html__'):
-        return '\n'.join(map(one_line, value.split('\n')))
+        lines = value.split('\n')
+        return '\n'.join(' ' * (len(x) - len(x.lstrip(' '))) + one_line(x) for x in lines)
     return value
 
 
@@ -215,7 +221,7 @@ def markdown(report: Report, samples: Mapping[str, Any]) -> str:
         lines += [*_section('What to do next'), *_listed(report.steps)]
     if report.remarks:
         lines += [*_section('Please note'), *_listed(report.remarks)]
-    for each in (report.accuracy, *report.sections):
+    for each in (report.accuracy, report.picture, *report.sections):
         if each is None:
             continue
         text = each.text if each.rows or each.figure is None else ()

@@ -27,7 +27,7 @@ from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.settings import Settings
-from calib_ros.shown import sentence, some
+from calib_ros.shown import counted, sentence, some
 
 NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
@@ -53,6 +53,8 @@ def identification_report(
     reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
     gain = sections.gain(judged) if result.accepted else ''
+    scale = f'scale checked to {1e6 * problem.sigma_scale:g} ppm'
+    scale = scale if problem.sigma_scale else 'scale not checked'
     corrected, notes = 'none: not accepted', words.other_remarks(result)
     if result.accepted:
         corrected = table_hash(result.chain)
@@ -81,7 +83,9 @@ def identification_report(
             origin,
             poses,
             (
-                ('Stated device noise', f'{_stated(problem, poses)}; one sigma'),
+                ('Fitted', _fitted(result)),
+                ('Stated device noise', f'{_stated(problem, poses)}; one sigma; {scale}'),
+                ('Remaining error', words.times_in_words(result.noise)),
                 ('Judged by', result.validated_by),
             ),
             corrected,
@@ -249,6 +253,11 @@ def _stated(problem: Problem, poses: Poses) -> str:
         for name, (measured, text) in found.items()
         if measured
     )
+
+
+def _fitted(result: Identification) -> str:
+    effects = words.notes(result)[:1] if result.chain.effects else []
+    return ', '.join((counted(result.rank, 'parameter'), *effects))
 
 
 def _unmodelled(result: Identification) -> list[str]:

@@ -33,6 +33,7 @@ COMPUTED = (
     '"Before" is not measured but computed: the nominal arm in its best frames, at the same '
     'joint values.'
 )
+NO_SCALE = 'No interval holds an error of the scale of the device: check it with a known length.'
 TOLERANCE = 'For PASS or FAIL, give --tolerance, the RMS error [mm] that your task allows.'
 STANDINGS: dict[str, tuple[Headline, tuple[str, ...]]] = {
     'PASS': (
@@ -216,6 +217,9 @@ def verification_report(
         )
     text += map(sentence, caveats(found))
     state, steps = standing(found)
+    pictured, others = sections.distribution(poses), [_by_configuration(found)] * bool(found.each)
+    if found.by_program and found.each:  # the figures of the standard come first
+        pictured, others = others[0], [pictured]
     gain = sections.gain(found.comparison, intervals=False)
     different = 'Different poses', f'{found.configurations:,}'
     return Report(
@@ -227,16 +231,17 @@ def verification_report(
             found.comparison,
             poses.things,
             COMPUTED,
+            NO_SCALE,
             intervals=False,
             error=sections.OF_THE_PROGRAM if found.by_program else sections.ERROR,
         ),
-        picture=sections.distribution(poses),
+        picture=pictured,
         steps=steps,
         remarks=(*warnings, *not_steps(hints(found) + causes(found), steps)),
         identity=sections.identity_of(chain, origin, poses, [different], table_hash(chain)),
         explorer=explorer(chain, poses),
         sections=(
-            *((_by_configuration(found),) if found.each else ()),
+            *others,
             sections.coverage(chain, poses.joints, 'How far each joint was moved'),
         ),
         origin=origin,
@@ -245,7 +250,7 @@ def verification_report(
 
 def _by_configuration(found: Verification) -> Section:
     """Return the figures of the standard, or of errors at the joint values that were reported."""
-    title, names = 'Pose by pose (ISO 9283)', ('AP before [mm]', 'AP after [mm]', 'RP [mm]')
+    title, names = 'Pose by pose (ISO 9283) [mm]', ('AP before', 'AP after', 'RP')
     text = (
         'AP: position accuracy of the mean over all cycles. RP: repeatability, mean + 3 sigma. '
         'The standard asks for 30 cycles.'

@@ -218,6 +218,11 @@ def test_the_components_are_chosen(wide):
     )
     texts = page.locator('#joints .xtitle').all_text_contents()
     assert 'shoulder_pan_joint' in ' '.join(texts)
+    page.check('#alone')
+    for figure in ('session', 'joints'):
+        names = page.evaluate(f"document.getElementById('{figure}').data.map((t) => t.name)")
+        assert set(names) == {'after', 'outliers'}
+    page.uncheck('#alone')
 
 
 def test_the_keyboard_reaches_everything(wide):
@@ -252,6 +257,25 @@ def test_the_first_printed_page_is_the_certificate(wide):
     page.emulate_media(media='screen')
     page.set_viewport_size({'width': 1280, 'height': 800})
     assert height < 1016
+
+
+def test_printed_figures_are_whole(chromium, result):
+    """They were as wide as on the screen, and cut: dots were missing."""
+    seen = Seen(chromium, result / 'report.html', 1280)
+    seen.drawn()
+    page = seen.page
+    widths = """[...document.querySelectorAll('.plot')].filter((e) => e.checkVisibility())
+        .map((e) => e.querySelector('.main-svg').getBoundingClientRect().right)"""
+    page.emulate_media(media='print')
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    printed = page.evaluate(widths)
+    assert len(printed) > 5
+    assert max(printed) <= 688
+    assert not page.is_visible('#space')  # empty on paper, and nothing to pick
+    page.emulate_media(media='screen')
+    page.evaluate("dispatchEvent(new Event('afterprint'))")
+    assert max(page.evaluate(widths)) > 1000
+    seen.end()
 
 
 def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):

@@ -116,7 +116,11 @@ def test_the_page_says_whether_it_is_good_enough(solved):
 def test_a_noise_that_nobody_stated_is_marked(solved):
     problem = replace(solved[0], sigma_position=5e-5, sigma_orientation=Problem.sigma_orientation)
     identity = dict(report_of(problem, solved[1]).identity)
-    assert identity['Stated device noise'] == '0.05 mm, 0.333 mrad (default); one sigma'
+    stated = '0.05 mm, 0.333 mrad (default); one sigma; scale '
+    assert identity['Stated device noise'] == f'{stated}not checked'
+    problem = replace(problem, sigma_scale=1e-5)
+    identity = dict(report_of(problem, solved[1]).identity)
+    assert identity['Stated device noise'] == f'{stated}checked to 10 ppm'
 
 
 def test_what_others_named_is_text(solved):
@@ -237,6 +241,7 @@ def test_the_verdict_of_an_accepted_result_says_where_it_holds_and_what_is_doubt
         ('--force replaces files', '--force'),
         ('--new-base refits', '--new-base'),
         ('run calib_ros verify.', 'calib_ros verify'),
+        ('calib_ros chain ROBOT --out FILE', 'calib_ros chain ROBOT'),
     ],
 )
 def test_options_are_code_with_their_values(text, code):

@@ -6,14 +6,21 @@ import hashlib
 import json
 import re
 import sys
+from dataclasses import replace
 
+import numpy as np
 import pytest
+import yaml
 from measured import UR, measured, rows_of, write_csv
-from pages import Page
+from pages import Page, page_of, report_of
 
+from calib_ros.apply.verification import verify
 from calib_ros.files.export import exports
 from calib_ros.identification.calibration import Calibration
 from calib_ros.kinematics.chain_file import dump_chain, parse_chain, table_hash
+from calib_ros.report.page import Origin, markdown, on_paper
+from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.verdicts import verification_report
 
 IDENTIFY = ('identify', 'cell.csv', '--chain', 'ur5e')
 
@@ -51,6 +58,53 @@ def test_identify_writes_what_it_was_told(table, run, tmp_path):
         f'table_sha256: {re.search("[0-9a-f]{64}", page.text)[0]}'
         in (out / 'calibration.yaml').read_text()
     )
+
+
+def test_settings_of_a_page_can_be_copied(table, run, tmp_path):
+    assert run(*IDENTIFY, '--out', 'out')[0] == 0
+    assert table.is_file()
+    page = (tmp_path / 'out' / 'report.html').read_text()
+    shown = re.search(r'<pre[^>]*>(/\*\*:.*?)</pre>', page, re.DOTALL)[1]
+    written = (tmp_path / 'out' / 'settings.yaml').read_text()
+    assert yaml.safe_load(shown.replace('&#39;', "'")) == yaml.safe_load(written)
+
+
+def of_the_certificate(report, monkeypatch):
+    """Return the pages of a certificate without what follows it, and its texts."""
+    weasyprint = pytest.importorskip('weasyprint')
+    printed, pages = weasyprint.HTML.write_pdf, []
+    monkeypatch.setattr(
+        weasyprint.HTML, 'write_pdf', lambda self: pages.extend(self.render().pages) or b''
+    )
+    alone = replace(report, sections=(), origin=Origin(operator='A. Smith'))
+    on_paper(alone)
+    monkeypatch.setattr(weasyprint.HTML, 'write_pdf', printed)
+    return pages[:-1]  # the last has the line about the software
+
+
+def test_a_certificate_is_one_sheet(solved, monkeypatch):
+    note = 'Poses measured in succession have similar errors. ' * 4
+    report = report_of(*solved, warnings=(note, note), tolerance=1e-3)
+    assert len(of_the_certificate(report, monkeypatch)) == 1
+    refused = replace(report.verdict, state='bad')
+    assert len(of_the_certificate(replace(report, verdict=refused), monkeypatch)) == 1
+
+
+@pytest.mark.parametrize('poses', [5, 20])
+def test_the_figures_of_the_standard_are_on_the_certificate(solved, monkeypatch, poses):
+    _, result = solved
+    chosen = np.tile(np.arange(poses), 3)
+    sets = (measured(count=20, seed=8).select(chosen),)
+    found = verify(Calibration.of(result), sets, 1e-3, commanded=sets[0].joints[:poses])
+    rows = poses_to_verify(result.chain, sets, found.comparison)
+    report = verification_report(result.chain, found, rows, Origin())
+    assert found.by_program
+    assert report.picture.head[2:] == ('AP before', 'AP after', 'RP')
+    assert len(report.picture.rows) == poses
+    text = page_of(report).text
+    assert text.index('AP before') < text.index('Identity') < text.index('Share of')
+    assert '| P5 |' in markdown(report, {})
+    assert len(of_the_certificate(report, monkeypatch)) == 1
 
 
 @pytest.mark.usefixtures('table')

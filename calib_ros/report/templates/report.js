@@ -43,10 +43,13 @@
     if (id) { draw(id); idle(next); }
   };
   window.addEventListener('load', () => idle(next));
+  const fit = (width) => document.querySelectorAll('.js-plotly-plot').forEach((each) => Plotly.relayout(each, { width }));
   window.addEventListener('beforeprint', () => {
     [...waiting.keys()].forEach(draw);
     document.querySelectorAll('details').forEach((each) => { each.open = true; });
+    fit(680);  // px, of a sheet: what is wider is cut
   });
+  window.addEventListener('afterprint', () => fit(null));
   for (const [id, figure] of Object.entries(data.figures)) {
     later(id, () => {
       const layout = Object.assign(base(), figure.layout);
@@ -257,6 +260,7 @@
     : state.component === 'angle' ? floats['turned_' + when][i]
       : floats[when][3 * i + AXIS[state.component]]);
   const label = () => names.find(([v]) => v === state.component)[1];
+  const first = () => Number(byId('alone').checked);
   function series(xs, key, axis) {
     if (e.bins) return bands(e.bins[key][state.component], axis);
     const type = count > 2000 && hasGL() ? 'scattergl' : 'scatter';
@@ -266,7 +270,7 @@
     const found = [
       one('before', good, { name: 'before', marker: { color: BEFORE, size: 4, symbol: 'diamond', opacity: 0.6 } }),
       one('after', good, { name: 'after', marker: { color: AFTER, size: 4, opacity: 0.8 } }),
-    ];
+    ].slice(first());
     if (!outliers.length) return found;
     const shown = found.flatMap((each) => each.y).filter(Number.isFinite);
     const low = shown.reduce((a, b) => Math.min(a, b), 0), high = shown.reduce((a, b) => Math.max(a, b), 0);
@@ -279,7 +283,7 @@
   }
   function bands(bin, axis) {
     const found = [];
-    for (const [when, colour, fill] of [['before', BEFORE, 'rgba(217,95,2,.18)'], ['after', AFTER, 'rgba(27,158,119,.25)']]) {
+    for (const [when, colour, fill] of [['before', BEFORE, 'rgba(217,95,2,.18)'], ['after', AFTER, 'rgba(27,158,119,.25)']].slice(first())) {
       const [low, middle, high] = bin[when];
       const line = { mode: 'lines', type: 'scatter', hoverinfo: 'skip', ...axis };
       found.push({ ...line, x: bin.x, y: low, line: { width: 0 }, showlegend: false });
@@ -327,8 +331,8 @@
   for (const id of ['sort', 'only']) byId(id).addEventListener('change', () => { arrange(); list(); });
   byId('previous').addEventListener('click', () => { state.page -= 1; list(); });
   byId('next').addEventListener('click', () => { state.page += 1; list(); });
-  byId('component').addEventListener('change', (event) => {
-    state.component = event.target.value;
+  for (const id of ['component', 'alone']) byId(id).addEventListener('change', () => {
+    state.component = byId('component').value;
     if (drawn('session')) drawSession();
     if (drawn('joints')) drawJoints();
   });
