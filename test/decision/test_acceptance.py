@@ -14,6 +14,7 @@ from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
 from calib_ros.decision import acceptance
 from calib_ros.decision.acceptance import _loss_by_chance, oddities, refusals
 from calib_ros.decision.reasons import Rule
+from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.levels import CERTAIN
 from calib_ros.estimation.problem import Problem
 from calib_ros.identification.identification import identify
@@ -66,6 +67,26 @@ def test_a_tool_that_points_one_way_is_told(rng, tilt, told):
     q[:, 0] = 0.5 * np.pi * rng.integers(4, size=400)
     problem = SimpleNamespace(chain=chain, sets=[SimpleNamespace(joints=q)])
     assert ('points one way' in acceptance._together(problem)) == told
+
+
+@pytest.mark.parametrize(
+    ('still', 'alike', 'apart', 'told'),
+    [
+        ([2], [], 0.0, 'elbow_joint stood still (or was not recorded): '),
+        ([], [1, 3], 0.0, 'shoulder_lift_joint, wrist_1_joint only moved together ('),
+        ([], [1, 3], 2.0, ''),
+        ([0, 5], [1, 2, 4], 0.0, 'shoulder_lift_joint, elbow_joint, wrist_2_joint only moved'),
+    ],
+)
+def test_joints_that_the_poses_do_not_move_apart_are_told(still, alike, apart, told, rng):
+    q = UR10E.random_joints(40, rng)
+    q[:, still] = 0.3 + 0.4 * STILL * rng.choice([-1.0, 1.0], (40, len(still)))
+    if alike:
+        q[:, alike] = q[:, alike[:1]] + apart * STILL * rng.normal(size=(40, len(alike)))
+    problem = SimpleNamespace(chain=UR10E, sets=[SimpleNamespace(joints=q)])
+    said = acceptance._together(problem)
+    assert told in said
+    assert bool(said) == bool(told)
 
 
 def test_the_loss_by_chance_is_that_of_a_paired_t_test(rng):
