@@ -225,7 +225,7 @@ def _lag(problem: Problem, result: Identification) -> Identification:
         return result
     first, *more = map(_with_moves, problem.sets)
     bases = sorted({each.base for each in problem.sets})
-    late, chain = replace(problem, observations=first, more=more, held_out=()), result.chain
+    late, chain = replace(problem, observations=first, more=more), result.chain
     for name in bases:
         chain = chain.with_frame(name, replace(chain.frame(name), delay=0.0))
     delays = [Parameter(name, DELAY) for name in bases]

@@ -11,6 +11,7 @@ from fits import SCARA, UR10E
 from calib_ros.decision import changes
 from calib_ros.decision.changes import (
     Effects,
+    Explanation,
     Information,
     likelier,
     mean_square_change,
@@ -62,6 +63,21 @@ def test_a_change_is_as_large_as_its_evidence_tells(size, times):
     gain = 100.0**2 * size**2 * times**2 / spread
     seldom = np.log10(times) ** 2
     assert evidence == pytest.approx(0.5 * (gain - np.log(spread) - seldom))
+
+
+@pytest.mark.parametrize(
+    ('owner', 'names', 'told'),
+    [
+        ('device', [changes.SCALE_OF_DEVICE], 'the scale of the device by +100 ± 20 ppm (95 %)'),
+        ('elbow', [Parameter('elbow.theta')], 'elbow.theta by +0.100 ± 0.020 mrad (95 %)'),
+        ('elbow', [Parameter('elbow.a')], 'elbow.a by +0.100 ± 0.020 mm (95 %)'),
+        ('elbow', [Parameter('elbow.a'), Parameter('elbow.d')], 'elbow (a, d)'),
+        ('load', [Parameter('elbow.gravity_quill')], 'the load of the arm'),
+    ],
+)
+def test_a_change_is_told_with_its_limits(owner, names, told):
+    sizes = np.full(len(names), 1e-4), np.full(len(names), 0.2e-4 / 1.959964)
+    assert Explanation(owner, tuple(names), 9.0, 0.0, 1.0, *sizes).in_words() == told
 
 
 THREE = tuple(UR10E.joints[k].driven for k in (1, 2, 3))
