@@ -64,7 +64,8 @@ class Simpler:
 class Fitted:
     """A robust fit with what follows from its residuals.
 
-    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors.
+    `problem` has the last priors; `size` [sigma given] is the noise before data gave priors, of a
+    model richer than a simpler one with them.
     `held` are K parameters held at nominal that only other kinds of measurement determine, and how
     the fitted ones follow them (P, K).
     """

@@ -126,7 +126,7 @@ def _fit_all(
             break
         size = less  # too narrow priors had made it larger
         posterior = posterior_of(fitted, size, judging=False)
-    return replace(fitted, size=first)
+    return replace(fitted, size=first if simpler is None else min(first, less))
 
 
 def _some(problem: Problem, simpler: Simpler | None) -> tuple[Problem, Simpler | None]:
@@ -167,8 +167,14 @@ def _noise_for_priors(noise: Noise, simpler: Simpler | None) -> float:
     robots errors in held-out regions were least with more weight on the prior, those on held-out
     rows of the same session with less. With the noise that neighbours do not share, over FOLLOWED,
     they are those of least squares (`benchmarks/real_robots.py`).
+
+    Of a richer model, priors hold most parameters: the size by their uncertainty may be that of
+    the priors. Residuals tell it if they are as given, or far smaller.
     """
-    if simpler is not None or noise.consistent:
+    if simpler is not None:
+        told = max(noise.widened * max(noise.position, noise.orientation or 0.0), 1.0)
+        return told if noise.consistent or noise.size > FOLLOWED * told else noise.size
+    if noise.consistent:
         return noise.size
     return max(noise.size / (FOLLOWED * noise.widened), min(noise.size, 1.0))
 

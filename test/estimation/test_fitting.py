@@ -39,6 +39,22 @@ def test_what_the_model_lacks_weighs_priors_in_part(size, widened, told):
     assert fitting._noise_for_priors(noise(size, widened=widened), SimpleNamespace()) == size
 
 
+@pytest.mark.parametrize(
+    ('position', 'orientation', 'consistent', 'size', 'told'),
+    [
+        *((3.0, None, False, 8.9, 8.9), (3.0, None, False, 9.1, 4.5)),
+        *((1.0, 3.0, False, 8.9, 8.9), (1.0, 3.0, False, 9.1, 4.5)),
+        *((0.3, 0.2, False, 1.9, 1.9), (0.3, 0.2, False, 2.1, 1.0)),  # not below those given
+        *((1.1, 0.9, True, 1.7, 1.65), (0.6, 0.5, True, 1.7, 1.0)),
+    ],
+)
+def test_residuals_tell_the_noise_of_a_richer_model_with_priors_far_above_it(
+    position, orientation, consistent, size, told
+):
+    found = Noise(position, orientation, consistent, 0.0, 0.0, (), 1.5, size)
+    assert fitting._noise_for_priors(found, SimpleNamespace()) == pytest.approx(told)
+
+
 def test_only_what_is_told_worse_than_common_sense_is_guarded():
     problem = Problem(UR10E, seen(), priors={'wrist_1_joint.a': 1.0})
     names = ('base.x', 'elbow_joint.a', 'elbow_joint.theta', 'wrist_1_joint.a', 'wrist_1_joint.d')

@@ -51,20 +51,25 @@ def chosen(result):
     return {group_of(name) for name, _ in result.chain.effects}
 
 
-@pytest.mark.parametrize('seed', range(2))
-def test_effects_larger_than_usual_are_not_taken_for_noise(seed):
-    """The first fit holds them at their usual size; what it leaves is no noise."""
+@pytest.mark.parametrize(
+    ('group', 'size', 'seed'), [*(('eccentricity', 7e-4, k) for k in (0, 1)), ('gravity', 1e-2, 0)]
+)
+def test_effects_larger_than_usual_are_not_taken_for_noise(group, size, seed):
+    """The first fit holds them at their usual size; what it leaves is no noise, then or later."""
     rng = np.random.default_rng(seed)
-    names = effects.members(UR10E, 'eccentricity')
-    values = dict(zip(names, rng.normal(scale=7e-4, size=len(names)).tolist(), strict=True))
+    names = effects.members(UR10E, group)
+    values = dict(zip(names, rng.normal(scale=size, size=len(names)).tolist(), strict=True))
     true = faulty(UR10E, Cell(), rng).with_effect_values(values)
     q, unseen = UR10E.random_joints(60, rng), UR10E.random_joints(300, rng)
     positions = true.forward(q)[:, :3, 3] + rng.normal(scale=1e-5, size=(60, 3))
     problem = Problem(UR10E, Observations.from_arrays(q, positions), sigma_position=1e-5)
-    result = identify(replace(problem, effects=('eccentricity',)), identify(problem))
+    result = identify(replace(problem, effects=(group,)), identify(problem))
     assert result.accepted
     assert 0.8 < result.noise.position < 1.2
-    assert rms(result.chain, true, unseen) < 2e-5
+    error = rms(result.chain, true, unseen)
+    assert error < 2e-5
+    expected = result.posterior.expected(unseen)[:, :3, :3]
+    assert 0.5 < np.sqrt(np.trace(expected, axis1=1, axis2=2).mean()) / error < 2.0
 
 
 @pytest.mark.parametrize(
