@@ -57,6 +57,54 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     assert set(ranks) == {2}
 
 
+ALL = 'the positions and linear joints are in'
+DEGREE = 180.0 / np.pi
+
+
+@pytest.mark.parametrize(
+    ('what', 'positions', 'travel', 'angles'),
+    [
+        (f'{ALL} mm, not metres', 1e3, 1e3, 1.0),
+        (f'{ALL} metres, not cm', 1e-2, 1e-2, 1.0),
+        (f'{ALL} mm, not metres {DEGREES}', 1e3, 1e3, DEGREE),
+        (f'{ALL} metres, not in {DEGREES}', 0.0254, 0.0254, DEGREE),
+        ('the positions are in mm, not metres', 1e3, 1.0, 1.0),
+        ('the positions are in metres, not in', 0.0254, 1.0, 1.0),
+        ('the linear joints are in cm, not metres', 1.0, 1e2, 1.0),
+        ('the linear joints are in metres, not mm', 1.0, 1e-3, 1.0),
+        ('the joint values are in degrees, not radians', 1.0, 1.0, DEGREE),
+        ('the joint values are in radians, not degrees', 1.0, 1.0, 1.0 / DEGREE),
+    ],
+)
+def test_units_are_undone(what, positions, travel, angles, rng):
+    rail = load_chain('ur10e_on_linear_axis')
+    seen = measure(rail, rail.random_joints(5, rng), rng)
+    spoilt = replace(
+        seen,
+        positions=positions * seen.positions,
+        joints=seen.joints * np.array([travel, *[angles] * 6]),
+    )
+    (found,) = (each for each in suspects(rail, (spoilt,)) if each.what == what)
+    (undone,) = found.undone((spoilt,))
+    np.testing.assert_allclose(undone.positions, seen.positions)
+    np.testing.assert_allclose(undone.joints, seen.joints)
+
+
+def test_lengths_and_convention_of_a_chain_are_undone(rng):
+    arm = load_chain('ur10e')
+    arm = replace(arm, joints=(replace(arm.joints[0], b=0.1), *arm.joints[1:]))
+    large = [replace(j, a=1e3 * j.a, b=1e3 * j.b, d=1e3 * j.d) for j in arm.joints]
+    seen = measure(arm, arm.random_joints(5, rng), rng)
+    found = {e.what: e.chain for e in suspects(replace(arm, joints=tuple(large)), (seen,))}
+    undone = found['the lengths of the chain file are in mm, not metres']
+    np.testing.assert_allclose(undone.table, arm.table)
+    modified = found['the DH table is in the modified convention, not the standard one']
+    assert modified.convention == 'modified'
+    back = {e.what: e.chain for e in suspects(modified, (seen,))}
+    standard = back['the DH table is in the standard convention, not the modified one']
+    assert (standard.convention, standard.parallel) == ('standard', arm.parallel)
+
+
 def quaternions(order):
     return lambda turns: se3.from_quat(se3.to_quat(turns)[:, order])
 
