@@ -13,20 +13,21 @@ from calib_ros.apply.simulation import measure
 from calib_ros.decision import steps
 from calib_ros.decision.steps import Step, find_step
 from calib_ros.estimation import fitting
+from calib_ros.estimation.leastsquares import STEP_TOLERANCE
 from calib_ros.estimation.levels import LEAST_ASIDE, SURE
 from calib_ros.settings import EXCEPTION
 
 COUNT, AT = 60, 26
 
 
-def bumped(errors=1.0, **more):
-    """Return the fit of an arm of which the target moved by a millimetre."""
+def bumped(errors=1.0, size=1e-3, noise=NOISE, **more):
+    """Return the fit of an arm of which the target moved by a size [m]."""
     rng = np.random.default_rng(3)
     true = arm(rng, errors)
-    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *NOISE)
+    seen = measure(true, UR10E.random_joints(COUNT, rng), rng, *noise)
     late = np.arange(COUNT)[:, np.newaxis] >= AT
     along = true.forward(seen.joints)[:, :3, 0]
-    seen = replace(seen, positions=seen.positions + 1e-3 * late * along)
+    seen = replace(seen, positions=seen.positions + size * late * along)
     return fitting.fit(Problem(UR10E, seen, **SIGMAS, **more))[2]
 
 
@@ -39,6 +40,12 @@ def test_the_coarse_search_is_a_tenth_of_the_shorter_side_apart(count):
     np.testing.assert_array_equal(gaps[:-1], np.maximum(aside[:-2] // 10, 1))
     assert (gaps[-1:] <= np.maximum(aside[-2:-1] // 10, 1)).all()
     assert not len(steps._some_places(2 * LEAST_ASIDE - 1))
+
+
+@pytest.mark.parametrize(('share', 'found'), [(0.3, False), (30.0, True)])
+def test_residuals_below_the_tolerance_of_the_fit_show_no_step(share, found):
+    step = find_step(bumped(size=share * STEP_TOLERANCE * NOISE[0], noise=(0.0, 0.0)))
+    assert (step is not None) == found
 
 
 @pytest.mark.parametrize(('share', 'found'), [(0.9, True), (1.1, False)])

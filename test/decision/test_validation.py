@@ -77,20 +77,39 @@ def test_an_arm_that_fits_is_not_called_wrong_for_a_bad_correction(rng, before, 
 
 
 def rules_of(before, after, judged):
+    return set(refused(before, after, judged))
+
+
+def refused(before, after, judged, **change):
     """Return the rules that fail by position errors (N, 3) [m] on pairs that were left out."""
     numbers, none = np.arange(len(judged)), np.full((len(judged), 3), np.nan)
     parts = [Residuals(x, none, numbers, none[:, :2]) for x in (before, after)]
     problem = SimpleNamespace(largest_error=0.01, largest_length=1.0, largest_angle=1.0, sets=())
+    given = {'converged': True, 'parameters': ()} | change
     result = SimpleNamespace(
         step=None,
-        converged=True,
         not_excited=(),
-        parameters=(),
         chance=None,
         region=1,
         validation=Comparison(*parts, judged),
+        **given,
     )
-    return {each.rule for each in refusals(problem, result, None, False, True)}
+    return [each.rule for each in refusals(problem, result, None, False, True)]
+
+
+@pytest.mark.parametrize(
+    ('before', 'after', 'rules'),
+    [
+        (3e-3, 1e-3, [Rule.CONVERGENCE, Rule.COMMON_SENSE]),
+        (3e-3, 3e-3, [Rule.CONVERGENCE, Rule.COMMON_SENSE, Rule.GAIN]),
+        (0.02, 0.02, [Rule.CONVERGENCE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.COMMON_SENSE]),
+        (0.04, 0.02, [Rule.CONVERGENCE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR]),
+    ],
+)
+def test_parameters_of_a_fit_that_explains_nothing_are_told_last(rng, before, after, rules):
+    away = rng.normal(size=(40, 3)) / np.sqrt(3.0)
+    given = {'converged': False, 'parameters': [row('a', 1.5, 0.01)]}
+    assert refused(before * away, after * away, np.ones(40, dtype=bool), **given) == rules
 
 
 @pytest.mark.parametrize('size', [2e-3, 5e-3, 5e-2])
