@@ -56,6 +56,11 @@ def test_orientations_may_get_worse_by_half_a_per_cent_and_positions_be_off_by_t
         assert rules == [Rule.LARGEST_ERROR] * refused
     (scale,) = refusals(problem, result, None, False, True, -0.02)
     assert 'shrink alike, by 2 %' in scale
+    (drift,) = refusals(problem, replace(result, chance=0.07), None, False, True)
+    assert drift.endswith('just as well in 7 % of cases (limit 5 %)')
+    gross = replace(held_out, judged=np.arange(len(held_out.judged)) >= 24)
+    (outliers,) = refusals(problem, replace(result, validation=gross), None, False, True)
+    assert outliers.startswith('40 % of the judged poses are outliers')
 
 
 @pytest.mark.parametrize(('tilt', 'told'), [(0.9e-3, True), (1.1e-3, False)])
