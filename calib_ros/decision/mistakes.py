@@ -186,7 +186,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
         return found
     poses = rows_in_words(rows.tolist(), seen.stamps_ns.tolist())
     among = f' of {len(seen)}' * poses.startswith('pose')
-    alike = '{}' if problem.of_messages else 'write them as the others ({} reads them)'
+    alike = 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)
     where = f'in {poses}{among} alone, '
     return replace(found, suspects=tuple(named), where=where)

@@ -15,9 +15,11 @@ from calib_ros.decision.changes import (
     Information,
     likelier,
     mean_square_change,
+    reasons_of,
     root_of,
     shown,
 )
+from calib_ros.estimation.levels import chance_of
 from calib_ros.estimation.start import fit_to_arm
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.settings import LEVER
@@ -148,10 +150,20 @@ def test_the_fewest_zeros_that_explain_all_are_likelier(change, first, wanted, r
         assert found is given
         return
     for (each,), k in zip(found, wanted, strict=True):
-        assert each.owner == THREE[k].owner
+        assert (each.owner, each.share) == (THREE[k].owner, 1.0)
         assert each.change == pytest.approx(change[k], abs=5.0 * each.sigma[0])
         assert 1e-6 < each.sigma[0] < 1e-4
     assert likelier(information, columns, 100.0, []) == []
+
+
+@pytest.mark.parametrize('size', [1e-6, 2e-5, 3e-5])
+def test_the_chance_of_an_explanation_is_that_of_all_that_are_tried(size, rng):
+    information, columns = known(rng, np.array([0.0, size, 0.0])), Effects(UR10E, THREE)
+    (best, *_) = reasons_of(information, columns, 50.0, most=1.0)
+    gain, change, covariance, rank = information.explained(columns.of(best.names))
+    assert best.chance == min(1.0, len(columns.sets) * chance_of(gain, rank, 50.0))
+    assert (best.gain, best.change.tolist()) == (gain, change.tolist())
+    assert best.sigma.tolist() == np.sqrt(np.diag(covariance)).tolist()
 
 
 def test_the_zeros_of_all_joints_are_one_change(rng):
