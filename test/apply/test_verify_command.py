@@ -50,7 +50,7 @@ def test_the_whole_way_from_test_poses_to_the_verdict(cell, folder, run):
             assert status == wanted
             assert out.startswith(f'{word}: ')
             assert 'poses like these   RMS 0.' in out
-            assert 'about the calibration' not in out
+            assert 'judges the calibration' not in out
             assert '15 times at 5 poses' in out
             assert len([line for line in out.splitlines() if line[:6].strip().isdigit()]) == 5
     status, out, _ = run(*VERIFY, 'result', '--commanded', 'corrected.csv', '--tolerance', 1)

@@ -308,9 +308,10 @@ def test_a_warning_goes_above_the_bar(monkeypatch):
     monkeypatch.setattr(screen, 'FIRST_S', 1e-4)
     monkeypatch.setattr(sys, 'stderr', Terminal())
     made = screen.Screen()
+    end = time.monotonic() + 60
     with made.work('counting'):
         while 'counting' not in sys.stderr.getvalue():
-            pass
+            assert time.monotonic() < end, 'no bar'
         made.warn('no jinja2', 'note')
     assert re.search(r'\x1b\[2K(\x1b\[33m)?note: no jinja2', sys.stderr.getvalue())
 

@@ -94,7 +94,7 @@ def test_a_queue_that_was_full_is_told(tmp_path, recording):
         )
         assert cell.node.session.received['joints'] < 20
         assert int(values_of(heard[-1])['queue of /joint_states full']) > 0
-        cell.spin_until(lambda: 'get lost' not in heard[-1].status[0].message)
+        cell.spin_until(lambda: 'are lost' not in heard[-1].status[0].message)
 
 
 def test_messages_of_seconds_wait_while_the_node_is_busy(tmp_path, recording):
