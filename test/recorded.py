@@ -98,16 +98,19 @@ def text_message(text='hello'):
     return TYPES['std_msgs/msg/String'](text)
 
 
-def write(path, types, content, storage='mcap', mode='none'):
-    """Write (topic, log time, bytes) in the order given, of topics with their types."""
+def write(path, types, content, storage='mcap', mode='none', texts=()):
+    """Write (topic, log time, bytes) in the order given, of topics with their types.
+
+    Other `texts` (topic, definition) may define some of these.
+    """
     writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
     if mode != 'none':
         writer.set_compression(CompressionMode[mode.upper()], CompressionFormat.ZSTD)
     with writer:
-        connections = {
-            topic: writer.add_connection(topic, kind, typestore=TYPESTORE)
-            for topic, kind in types.items()
-        }
+        connections = {}
+        for topic, kind in types.items():
+            given = {'msgdef': dict(texts).get(topic), 'rihs01': TYPESTORE.hash_rihs01(kind)}
+            connections[topic] = writer.add_connection(topic, kind, typestore=TYPESTORE, **given)
         for topic, time, data in content:
             writer.write(connections[topic], time, data)
     return path
@@ -117,14 +120,14 @@ def serialised(message):
     return bytes(TYPESTORE.serialize_cdr(message, message.__msgtype__))
 
 
-def record(path, events, storage='mcap', silent=(), behind=b''):
+def record(path, events, storage='mcap', silent=(), behind=b'', texts=()):
     """Write (topic, message) in the order given; `silent` topics (topic, type) get none.
 
     Some bytes may stand behind each message.
     """
     types = dict([*silent, *((topic, message.__msgtype__) for topic, message in events)])
     content = [(topic, k, serialised(m) + behind) for k, (topic, m) in enumerate(events, 1)]
-    return write(path, types, content, storage)
+    return write(path, types, content, storage, texts=texts)
 
 
 def standing(messages, topic='/pose'):

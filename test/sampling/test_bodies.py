@@ -8,15 +8,14 @@ import struct
 
 import numpy as np
 import pytest
-from recorded import MS, TYPES, header, pose, record, session_of, standing, storages
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from recorded import MS, TYPES, TYPESTORE, header, pose, record, session_of, standing, storages
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import get_types_from_msg
 from test_transforms import TIMES, frame, link, tf
 
 from calib_ros.errors import ConfigError, InputError
 from calib_ros.files.stored import LARGEST_MESSAGE
 from calib_ros.kinematics import se3
-from calib_ros.sampling.messages import JOINT_STATE
 from calib_ros.sampling.sources import parse_source
 
 MOCAP = 'mocap4r2_msgs/msg/RigidBodies'
@@ -31,9 +30,8 @@ TEXTS = {
     'float32 quality\n',
     NAMED: 'std_msgs/Header header\nNamedPose[] poses\n',
 }
-STORE = get_typestore(Stores.ROS2_JAZZY)
 for name, text in TEXTS.items():
-    STORE.register(get_types_from_msg(text, name))
+    TYPESTORE.register(get_types_from_msg(text, name))
 
 
 def message(kind, stamp_ns, bodies):
@@ -43,31 +41,13 @@ def message(kind, stamp_ns, bodies):
         at = pose(matrix[:3, 3].tolist(), se3.to_quat(matrix[:3, :3]).tolist())
         if kind == MOCAP:
             point = TYPES['geometry_msgs/msg/Point'](1.0, 2.0, 3.0)
-            marker = STORE.types['mocap4r2_msgs/msg/Marker'](2, 7, 'm', point)
-            found.append(STORE.types['mocap4r2_msgs/msg/RigidBody'](name, [marker] * 4, at))
+            marker = TYPES['mocap4r2_msgs/msg/Marker'](2, 7, 'm', point)
+            found.append(TYPES['mocap4r2_msgs/msg/RigidBody'](name, [marker] * 4, at))
         else:
-            kinds = STORE.types['motion_capture_tracking_interfaces/msg/NamedPose']
+            kinds = TYPES['motion_capture_tracking_interfaces/msg/NamedPose']
             found.append(kinds(name, at, 0.5))
     head = header(stamp_ns, 'hall')
-    return STORE.types[kind](head, 3, found) if kind == MOCAP else STORE.types[kind](head, found)
-
-
-def write(path, events, storage='mcap', defined=None):
-    """Write (topic, message) in the order given, with the definitions that a recorder adds.
-
-    Bodies may be defined by another text.
-    """
-    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        connections = {}
-        for k, (topic, each) in enumerate(events):
-            kind = each.__msgtype__
-            if topic not in connections:
-                text, digest = STORE.generate_msgdef(kind, ros_version=2)
-                if defined is not None and kind != JOINT_STATE:
-                    text = defined
-                connections[topic] = writer.add_connection(topic, kind, msgdef=text, rihs01=digest)
-            writer.write(connections[topic], k + 1, STORE.serialize_cdr(each, kind))
-    return path
+    return TYPES[kind](head, 3, found) if kind == MOCAP else TYPES[kind](head, found)
 
 
 def measured(rng, kind, stamps=TIMES):
@@ -90,7 +70,7 @@ def line(kind, child='tool'):
 def test_a_body_is_worth_its_transform_to_the_last_digit(tmp_path, rng, kind, storage):
     tools, come = measured(rng, kind)
     content = standing(come, '/bodies')
-    session, found = session_of(write(tmp_path / 'bag', content, storage), sources=(line(kind),))
+    session, found = session_of(record(tmp_path / 'bag', content, storage), sources=(line(kind),))
     moving = [tf(link('hall', 'tool', ms * MS, t)) for ms, t in zip(TIMES, tools, strict=True)]
     as_tf = record(tmp_path / 'tf', standing(moving, '/tf'))
     expected, _ = session_of(as_tf, sources=('/tf parent=hall child=tool',))
@@ -107,7 +87,7 @@ def test_a_body_is_worth_its_transform_to_the_last_digit(tmp_path, rng, kind, st
 
 def test_several_bodies_are_several_targets(tmp_path, rng):
     _, come = measured(rng, MOCAP)
-    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    path = record(tmp_path / 'bag', standing(come, '/bodies'))
     session, _ = session_of(path, sources=(line(MOCAP), f'{line(MOCAP, "base")} validation=true'))
     found = [(each.target, each.validation) for each in session.samples]
     assert sorted(found) == [('base', True)] * len(TIMES) + [('tool', False)] * len(TIMES)
@@ -117,7 +97,7 @@ def test_several_bodies_are_several_targets(tmp_path, rng):
 @pytest.mark.parametrize('kind', [MOCAP, NAMED])
 def test_a_bag_without_named_sources_lists_the_bodies(tmp_path, rng, kind, storage):
     _, come = measured(rng, kind, range(10, 1000, 5))
-    path = write(tmp_path / 'bag', standing(come, '/bodies'), storage)
+    path = record(tmp_path / 'bag', standing(come, '/bodies'), storage)
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
     assert 'hall to tool at 200 Hz' in str(caught.value)
@@ -132,7 +112,7 @@ def test_the_line_that_is_proposed_is_of_use_whatever_a_body_is_called(tmp_path,
     come = [
         message(NAMED, ms * MS, {"Rigid Body 1 of 'Tom'": frame(rng)}) for ms in range(10, 1000, 5)
     ]
-    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    path = record(tmp_path / 'bag', standing(come, '/bodies'))
     with pytest.raises(InputError, match='has no pose topic') as caught:
         session_of(path)
     (proposed,) = re.findall('such as (.*)$', str(caught.value))
@@ -145,14 +125,14 @@ def test_the_line_that_is_proposed_is_of_use_whatever_a_body_is_called(tmp_path,
 
 def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
     _, come = measured(rng, MOCAP)
-    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined='')
+    path = record(tmp_path / 'bag', standing(come, '/bodies'), texts=[('/bodies', '')])
     with pytest.raises(InputError, match=f'does not define {MOCAP}'):
         session_of(path, sources=(line(MOCAP),))
 
 
 def test_bodies_are_read_beside_a_wrong_index_too(tmp_path, rng):
     _, come = measured(rng, MOCAP)
-    path = write(tmp_path / 'bag', standing(come, '/bodies'))
+    path = record(tmp_path / 'bag', standing(come, '/bodies'))
     with Reader(path) as reader:
         (chunk,) = reader.storage.storages[0].chunks
     (file,) = path.glob('*.mcap')
@@ -176,7 +156,7 @@ def test_bodies_are_read_beside_a_wrong_index_too(tmp_path, rng):
 )
 def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
     _, come = measured(rng, MOCAP, [105])
-    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=text)
+    path = record(tmp_path / 'bag', standing(come, '/bodies'), texts=[('/bodies', text)])
     with pytest.raises(InputError, match=f'defines {MOCAP} by what cannot be read'):
         session_of(path, sources=(line(MOCAP),))
 
@@ -192,6 +172,6 @@ def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
 )
 def test_another_message_of_that_name_is_told(tmp_path, rng, text):
     _, come = measured(rng, MOCAP, [105])
-    path = write(tmp_path / 'bag', standing(come, '/bodies'), defined=text)
+    path = record(tmp_path / 'bag', standing(come, '/bodies'), texts=[('/bodies', text)])
     _, warnings = session_of(path, sources=(line(MOCAP),))
     assert 'a message on /bodies cannot be decoded' in ' '.join(warnings)
