@@ -37,10 +37,12 @@ from calib_ros.report.page import Origin, markdown
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import (
     BRING,
+    CLOSER,
     NOT_YET,
     advice_of,
     doubts,
     identification_report,
+    may_be_closer,
     result_standing,
 )
 from calib_ros.sampling.dataset import with_lenses
@@ -274,7 +276,9 @@ def show(found: Identified, screen: Screen) -> None:
 def _explain(result: Identification, reasons: Sequence[Advice], screen: Screen) -> None:
     if result.accepted:
         drift = words.drift_in_words(result.noise)
-        for note in (*doubts(result), drift, *words.notes(result), f'{NOT_YET}: {BRING}'):
+        closer = CLOSER if may_be_closer(result) else ''
+        notes = *doubts(result), drift, *words.notes(result), closer, f'{NOT_YET}: {BRING}'
+        for note in notes:
             if note:
                 screen.bullet(note)
         return

@@ -22,7 +22,7 @@ from calib_ros.identification.linear_model import COMPARED
 from calib_ros.kinematics.chain_file import table_hash
 from calib_ros.kinematics.effects import group_of
 from calib_ros.report import figures, sections, words
-from calib_ros.report.advice import GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Situation, advice
+from calib_ros.report.advice import FAR, GOOD_ARM, GOOD_HERE, SPREAD_OUT, Advice, Situation, advice
 from calib_ros.report.explorer import explorer
 from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
@@ -33,6 +33,10 @@ NOT_YET = 'The robot itself is unchanged so far'
 BRING = (
     'give the correction to its controller (calib_ros export, or ~/export of the node), or '
     'correct its programs (calib_ros compensate)'
+)
+CLOSER = (
+    'to get closer, identify with --model auto: it also corrects gears, gravity and backlash '
+    'where that helps'
 )
 UNPROVEN = (
     'All these poses were used to compute the correction: a small error "after" proves nothing.'
@@ -166,6 +170,12 @@ def advice_of(result: Identification) -> tuple[Advice, ...]:
     return advice(result.refusals, Situation(poses, noise, sigma, auto, drifts))
 
 
+def may_be_closer(result: Identification, beyond: bool = False) -> bool:
+    """Tell whether effects not tried may explain an error `beyond` what is wanted or the noise."""
+    beyond = beyond or result.noise.position >= FAR
+    return beyond and not (result.chain.effects or result.verdicts)
+
+
 def _steps(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> tuple[str, ...]:
@@ -180,8 +190,7 @@ def _steps(
         'First check what is named above. If it is true, remove the cause and identify again.': (
             bool(result.remarks)
         ),
-        'To get closer to the tolerance, identify with --model auto: it also corrects gears, '
-        'gravity and backlash where that helps.': beyond and not result.chain.effects,
+        sentence(CLOSER): may_be_closer(result, beyond),
         'Compare the remaining error with the accuracy of the measuring device: no calibration '
         'gets below that.': beyond,
         f'Measure more poses to decide on the tolerance, {SPREAD_OUT}.': undecided,

@@ -5,7 +5,7 @@ from datetime import datetime, timezone
 
 import numpy as np
 import pytest
-from pages import problem_of
+from pages import problem_of, report_of
 from verified import in_words
 
 from calib_ros.apply.simulation import measure
@@ -19,11 +19,13 @@ from calib_ros.identification.identification import identify
 from calib_ros.identification.recalibrated import Recalibration
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.report import words
+from calib_ros.report.advice import FAR
 from calib_ros.report.page import Origin
 from calib_ros.report.poses import poses_to_verify
+from calib_ros.report.reports import CLOSER, may_be_closer
 from calib_ros.report.verdicts import standing, verification_report
 from calib_ros.report.words import between, still_holds, verdict
-from calib_ros.shown import rounded
+from calib_ros.shown import rounded, sentence
 
 
 @pytest.mark.parametrize(
@@ -135,6 +137,15 @@ def test_the_error_told_is_the_one_within_its_limits():
 )
 def test_what_is_left_is_told_by_the_noise_stated(size, consistent, said):
     assert said in words.scatter_in_words(Noise(size, None, consistent, 0.3, 0.2, ()))
+
+
+@pytest.mark.parametrize('ratio', [0.5, 2.0])
+def test_effects_are_proposed_where_far_more_than_noise_is_left_and_none_was_tried(solved, ratio):
+    problem, result = solved
+    left = replace(result, noise=replace(result.noise, position=ratio * FAR))
+    steps = report_of(problem, left).steps
+    assert (sentence(CLOSER) in steps) == (ratio > 1.0)
+    assert not may_be_closer(replace(left, verdicts=(None,)), beyond=True)
 
 
 def test_drift_is_errors_shared_in_succession_only():
