@@ -152,10 +152,9 @@ def verify(
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
-    `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
-    `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
-    calibration holds: the limit is then `Calibration.limit`. `confidence` is that of the interval;
-    `progress` receives the share done.
+    `sets` are new poses or positions, in the frames of the calibration. Without a `tolerance`, the
+    largest acceptable RMS position error [m], the verdict is whether the calibration holds: the
+    limit is then `Calibration.limit`. `confidence` is that of the interval. `progress`: the share.
 
     With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
     remounted. Their frames are fitted, and absorb the errors of as many configurations, of three

@@ -125,7 +125,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
     return None
 
 
-def stuck(chain: Chain, seen: Observations, largest: float) -> Suspect | None:
+def repeating(chain: Chain, seen: Observations, largest: float) -> Suspect | None:
     """Return rows that repeat the measurement, or the joint values, of the row before them.
 
     They miss the chain, and the other ones moved meanwhile, by more than `largest` [m].

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from calib_ros.decision.lost_rows import dead, in_any_order, row_loss, stuck
+from calib_ros.decision.lost_rows import dead, in_any_order, repeating, row_loss
 from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.decision.suspects import FIRST, ORIENTATIONS, Sets, Suspect, hidden, suspects
@@ -143,7 +143,7 @@ def explained(problem: Problem, far: bool = False) -> Explained | None:
         (missing and Explained((missing,), given.error, np.nan))  # no change restores it
         or _of_a_lost_row(problem, chain, sets, given)
         or _named(problem, chain, sets, given)
-        or _of_stuck(problem, given.chain, _moved(problem, sets[0], 0))
+        or _of_repeats(problem, given.chain, _moved(problem, sets[0], 0))
         or _by_places(problem, chain, sets, given)
         or _in_some_rows(problem, chain, sets, given)
         or _several(problem, chain, given)
@@ -163,7 +163,7 @@ def explained_alone(problem: Problem, chain: Chain) -> Explained | None:
     """Return what explains the measurements that a known chain misses by more than faulty arms."""
     sets = [each for each in problem.all_sets if each.distances is None and each.pixels is None]
     for each in sets:
-        if found := _of_rows(problem, chain, each) or _of_stuck(problem, chain, each):
+        if found := _of_rows(problem, chain, each) or _of_repeats(problem, chain, each):
             return _told(problem, replace(found, where=_among(sets, each) + found.where))
     return None
 
@@ -274,8 +274,8 @@ def _of_a_lost_row(problem: Problem, chain: Chain, sets: Sets, given: Trial) -> 
     return Explained((Suspect(what, remedy),), given.error, corrected)
 
 
-def _of_stuck(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
-    odd = stuck(chain, seen, _largest(problem))
+def _of_repeats(problem: Problem, chain: Chain, seen: Observations) -> Explained | None:
+    odd = repeating(chain, seen, _largest(problem))
     return None if odd is None else Explained((odd,), np.nan, np.nan)
 
 

@@ -121,15 +121,15 @@ def test_a_gross_error_is_named_although_the_others_leave_the_verdict_open(arm):
     errors[7] += [0.0, 0.01, 0.0]
     text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
     assert (found.verdict, found.odd) == ('FAIL', (7,))
-    assert 'pose 8 alone is ' in text
+    assert 'line 8 alone is ' in text
 
 
 @pytest.mark.parametrize(
     ('bad', 'size', 'words'),
     [
-        ([3, 17, 30], 1e-2, 'poses 4, 18, 31 alone are up to 1'),
-        (np.s_[25:], 2e-4, 'poses 26 to 40 alone are up to'),
-        (np.s_[:12], 2e-4, 'poses 1 to 12 alone are up to'),
+        ([3, 17, 30], 1e-2, 'lines 4, 18, 31 alone are up to 1'),
+        (np.s_[25:], 2e-4, 'lines 26 to 40 alone are up to'),
+        (np.s_[:12], 2e-4, 'lines 1 to 12 alone are up to'),
         (np.s_[::2], 2e-4, ''),
     ],
 )
@@ -161,7 +161,7 @@ def test_what_moved_while_poses_were_measured_is_named(cell, arm, moved, words, 
     assert found.verdict == 'FAIL'
     assert f'something moved while you measured: {words}' in text
     assert ' before line 11 ' in text
-    assert 'poses 11 to 24 alone are up to ' in text
+    assert 'lines 11 to 24 alone are up to ' in text
     text = in_words(verify(arm, [then], 2e-4))  # before the first pose
     assert 'something moved' not in text
 
@@ -185,7 +185,7 @@ def test_a_mistake_in_the_measurements_is_named_and_no_verdict_on_the_arm(cell, 
         (replace(seen, joints=np.degrees(seen.joints)), 'are in degrees, not radians'),
         (
             replace(seen, positions=seen.positions * np.where(late, 1e3, 1.0)),
-            'n poses 5 to 10 of 10 alone, the positions are in mm, not metres',
+            'n lines 5 to 10 alone, the positions are in mm, not metres',
         ),
     ):
         for tolerance in (None, 1e-3):
@@ -205,7 +205,7 @@ def test_a_named_cause_is_the_next_step_and_said_once(cell, arm):
     gross = seen.positions + 0.03 * (np.arange(20)[:, np.newaxis] == 7)
     turned = measured(cell[0].with_offsets({'elbow_joint.theta': 0.003}), seen.joints[::3], 3)
     for changed, first in (
-        (replace(seen, positions=gross), 'Pose 8 alone is'),
+        (replace(seen, positions=gross), 'Line 8 alone is'),
         (replace(seen, positions=seen.positions + 0.003), 'One common shift and turn'),
         (turned, 'Check that measuring device'),
     ):

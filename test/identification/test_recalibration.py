@@ -197,7 +197,7 @@ def test_one_gross_error_among_few_poses_is_named(earlier, slip):
     positions[3] += [0.02, -0.01, 0.03]
     found = recalibrate(previous, but(seen, positions=positions), 0.1)
     assert not found.accepted
-    assert found.odd == 'pose 4'
+    assert found.odd == 'line 4'
     assert 'pose 4 contradicts all others' in found.refusal()[0]
     assert not recalibrate(previous, seen, 0.1).odd
 
