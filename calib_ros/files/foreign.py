@@ -172,7 +172,7 @@ class _Table:
         kept, guessed = dict[str, Expression](), []
         lower = [name.lower() for name in self._sheet.header]
         for name, ours in own.items():
-            found = places(lower, name.lower())
+            found = places(self._sheet.header, name) or places(lower, name.lower())
             if ours in kept or ours in self._columns or not found:
                 continue
             if len(found) > 1 and ours not in (*WORDS, *QUATERNION):
@@ -193,15 +193,22 @@ class _Table:
 
     def _complete(self, chain: Chain) -> None:
         """Refuse a table with the values of some joints; those of coupled ones do not count."""
-        if not any(re.fullmatch('q[0-9]+', ours) for ours in self._columns):
-            return
         names = joint_columns(len(chain.joints))
+        given = [name for name in names if name in self._columns]
+        if not given and not {*map(str.lower, chain.joint_names)} & {*NUMBERS}:
+            return
         still = {names[k]: Expression.parse('0') for k in coupled(chain)}
         self._columns = still | self._columns
         if missing := [name for name in names if name not in self._columns]:
+            advice = named_by_option(self.names, missing, len(names), chain.joint_names)
+            moving = [name for name in names if name not in still]
+            if len(given) == len(moving):  # of an arm whose hand is kept level
+                pairs = [(a, b) for a, b in zip(moving, given, strict=True) if a != b]
+                texts = [f'{a}={self._columns[b].text}' for a, b in pairs]
+                option = ','.join([*texts, *(f'{a}=0' for a in still)])
+                advice = f'If these are the joints with motors: --columns "{option}"'
             raise InputError(
-                f'{self.path} has no column for {", ".join(missing)}; {self.has}. '
-                f'{named_by_option(self.names, missing, len(names))}'
+                f'{self.path} has no column for {", ".join(missing)}; {self.has}. {advice}'
             )
 
     def _has_dates(self, number: str) -> bool:

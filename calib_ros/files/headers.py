@@ -10,7 +10,16 @@ from itertools import product
 from pathlib import Path
 
 from calib_ros.errors import ColumnsError, InputError
-from calib_ros.files.vocabulary import LENGTHS, SEPARATORS, UNIT, UNIT_SIGNS, joint_columns
+from calib_ros.files.vocabulary import (
+    LENGTHS,
+    NUMBERS,
+    POSITION,
+    SEPARATORS,
+    UNIT,
+    UNIT_SIGNS,
+    WORDS,
+    joint_columns,
+)
 from calib_ros.shown import some
 
 
@@ -60,8 +69,13 @@ def refuse_separator(path: Path, header: Sequence[str]) -> None:
             )
 
 
-def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) -> str:
-    """Return --columns for the missing columns, with similar names of the header or NAME."""
+def named_by_option(
+    header: Sequence[str], missing: Sequence[str], joints: int, called: Sequence[str] = ()
+) -> str:
+    """Return --columns for the missing columns, with similar names of the header or NAME.
+
+    The joints may be `called` as the positions, in a gantry: these are named too.
+    """
     if several := [name for name in missing if header.count(name) > 1]:
         return f'Several columns are called {", ".join(several)}: rename all but one'
     if _only_numbers(header):
@@ -77,6 +91,13 @@ def named_by_option(header: Sequence[str], missing: Sequence[str], joints: int) 
     fewer = bool(lacking) and 'q1' in header and 'q0' not in header
     like = like_joints(header, joints) if lacking and not fewer else {}
     more = '; joint values in another file: --joints FILE' if whole and not like else ''
+    theirs = [next((each for each in header if each.lower() == n.lower()), '') for n in called]
+    rest = [each for each in header if each.lower() not in (*NUMBERS, *WORDS)]
+    if whole and not like and called and len(rest) == joints and {*POSITION} <= {*header}:
+        like = dict(zip(joint_columns(joints), rest, strict=True))
+    elif whole and not like and called and all(theirs):
+        like = dict(zip(joint_columns(joints), theirs, strict=True))
+        found |= {name: 'NAME' for name in POSITION if name in theirs or name not in header}
     if whole or like:
         others = {name: found[name] for name in found if name not in of_joints}
         found = {**(like or {'q*': 'NAME*'}), **others}

@@ -18,6 +18,8 @@ from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib_ros.errors import MOST_ENTRIES, InputError
 from calib_ros.files.columns import (
     Cells,
@@ -103,7 +105,11 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     if layout.comment:
         text = re.sub(rf'(?m)^[ \t]*{re.escape(layout.comment)}.*$', '', text)
     text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
-    separator = layout.cut or _separator(path, text, notes)
+    guessed = _separator(path, text, notes if not layout.cut else [])
+    separator = layout.cut or guessed
+    if separator not in text and guessed in text:
+        name = next(name for name, mark in SEPARATORS.items() if mark == guessed)
+        raise InputError(f'{path} separates its cells by {name}s: give --separator {name}')
     return _Content(_rows_of_text(path, _narrow(text, separator), separator), notes, separator)
 
 
@@ -141,8 +147,24 @@ def _sheet(
     above = tuple(tuple(cells) for _, cells in head[: max(at, 0)])
     body = chain([whole[first:]], rows)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
+    _refuse_shifted(columns, len(header))
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(path, header, above, replace(columns, decimal=decimal), tuple(notes))
+
+
+def _refuse_shifted(columns: Columns, width: int) -> None:
+    """Refuse a row with a number more than a header of so many names, if others have none there.
+
+    A thousands mark or a doubled separator may have shifted it; a remark there is text.
+    """
+    for name in columns.header[width : width + 1]:
+        filled = ~columns.blank(name)
+        for row in np.flatnonzero(filled)[: not filled.all()].tolist():
+            if _is_number(columns.texts(name)[row], ','):
+                raise InputError(
+                    f'{columns.path}, line {columns.lines[row]}: more numbers than the {width} '
+                    'columns of its header: is there a separator too many, or a thousands mark?'
+                )
 
 
 def text_and_separator(path: Path) -> tuple[str, str]:

@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Forms in which other systems write the same table."""
 
+import re
+
 import numpy as np
 import pytest
 from test_foreign import JOINTS, PLACES, PLAIN, TURNED, assert_same, text_of
@@ -11,7 +13,7 @@ from calib_ros.errors import ConfigError, InputError
 from calib_ros.files import loading
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout, layout_of
-from calib_ros.files.vocabulary import MATRIX
+from calib_ros.files.vocabulary import MATRIX, SEPARATORS
 from calib_ros.kinematics.chain import Joint
 
 ARM = Chain('arm', 'standard', (Joint('a'), Joint('b')))
@@ -203,3 +205,59 @@ def test_a_table_beside_a_log_is_not_asked_for_joint_values(tmp_path):
     with pytest.raises(InputError) as told:
         read_table(path, 2, foreign=Foreign(Layout(), None, log))
     assert str(told.value).endswith('names: --columns "x=NAME,y=NAME,z=NAME"')
+
+
+@pytest.mark.parametrize(
+    ('line', 'said'),
+    [('1,2,3,4,1,234.5', 'is there a separator too many, or a thousands'), ('1,2,3,4,5,hot', '')],
+)
+def test_a_row_with_one_number_more_than_the_header_is_refused(tmp_path, line, said):
+    """Its numbers were read one column further, without a word; a remark is none."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(f'q1,q2,x,y,z\n1,2,3,4,5\n{line}\n1,2,3,4,6\n')
+    if not said:
+        assert len(read_table(path, 2, foreign=Foreign(Layout())).fitted[0]) == 3
+        return
+    with pytest.raises(InputError, match=f'line 3: more numbers than the 5 columns .*{said}'):
+        read_table(path, 2, foreign=Foreign(Layout()))
+
+
+@pytest.mark.parametrize(('given', 'found'), [('space', 'comma'), ('comma', 'semicolon')])
+def test_another_separator_than_the_one_given_is_named(tmp_path, given, found):
+    path = tmp_path / 'cell.csv'
+    path.write_text(PLAIN.replace(',', SEPARATORS[found]))
+    with pytest.raises(InputError, match=f'separates its cells by {found}s: give --separator'):
+        read_table(path, 2, foreign=Foreign(Layout(separator=given)))
+
+
+GANTRY = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 'xyz'))
+
+
+@pytest.mark.parametrize(
+    ('header', 'said'),
+    [
+        ('X,Y,Z,x,y,z', 'q1=X,q2=Y,q3=Z"'),
+        ('X,Y,Z,mx,my,mz', 'q1=X,q2=Y,q3=Z,x=NAME,y=NAME,z=NAME"'),
+        ('Axis_X,Axis_Y,Axis_Z,x,y,z', 'q1=Axis_X,q2=Axis_Y,q3=Axis_Z"'),
+        ('x,y,z', 'q1=x,q2=y,q3=z,x=NAME,y=NAME,z=NAME"'),
+    ],
+)
+def test_joints_called_as_the_positions_are_are_told_apart(tmp_path, header, said):
+    path = tmp_path / 'cell.csv'
+    numbers = ','.join(map(str, range(header.count(',') + 1)))
+    path.write_text(f'{header}\n{numbers}\n{numbers}\n')
+    with pytest.raises(InputError, match=f'--columns "{re.escape(said)}'):
+        read_table(path, 3, foreign=Foreign(Layout(), GANTRY))
+
+
+def test_the_joints_with_motors_of_an_arm_whose_hand_is_kept_level_are_told(tmp_path):
+    joints = [
+        Joint(f'j{k}', a=0.5, lower=0 if k == 2 else None, upper=0 if k == 2 else None)
+        for k in (1, 2, 3)
+    ]
+    level = (('j2.coupling_joint_j1', -1.0),)
+    arm = Chain('level', 'standard', tuple(joints), effects=level)
+    path = tmp_path / 'cell.csv'
+    path.write_text('q1,q2,x,y,z\n1,2,3,4,5\n2,2,3,4,6\n')
+    with pytest.raises(InputError, match='joints with motors: --columns "q3=#2,q2=0"'):
+        read_table(path, 3, foreign=Foreign(Layout(), arm))

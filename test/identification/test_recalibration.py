@@ -198,7 +198,7 @@ def test_one_gross_error_among_few_poses_is_named(earlier, slip):
     found = recalibrate(previous, but(seen, positions=positions), 0.1)
     assert not found.accepted
     assert found.odd == 'line 4'
-    assert 'pose 4 contradicts all others' in found.refusal()[0]
+    assert 'line 4 contradicts all others' in found.refusal()[0]
     assert not recalibrate(previous, seen, 0.1).odd
 
 
