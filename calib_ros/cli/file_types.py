@@ -44,7 +44,7 @@ FILE_KINDS = {
     'image': ('an image', 'use images on its folder'),
     'images': ('a folder of images', 'use images'),
     'workbook': ('a workbook of another kind', 'save it as .xlsx or CSV'),
-    'report': ('a report', 'open it in a browser or PDF reader'),
+    'report': ('a report', 'read it; calibration.yaml beside it is the result'),
 }
 
 

@@ -67,7 +67,8 @@ def workspace_png(survey: Survey) -> bytes:
             name = f'{100.0 * share:.0f} %: {value:.3f} mm'
             axes[0].axvline(value, color='black', linestyle=style, label=name)
         axes[0].set(xlabel=f'{label} [mm]', yticks=[], xlim=(0.0, None))
-        axes[0].legend(frameon=False)
+        axes[0].locator_params(axis='x', nbins=6)
+        axes[0].legend(loc='lower left', bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
         axes[1].set_title('all directions')
         axes[2].set_title(f'height {low:.2f} to {high:.2f} m')
         for place, pair, part, labels in (
@@ -75,7 +76,7 @@ def workspace_png(survey: Survey) -> bytes:
             (axes[2], (x[level], y[level]), 1e3 * errors[level], ('x', 'y')),
         ):
             first, second, rms = rms_map(*pair, part)
-            mesh = place.pcolormesh(first, second, rms.T, cmap='viridis', rasterized=True)
+            mesh = place.pcolormesh(first, second, rms.T, cmap='viridis_r', rasterized=True)
             figure.colorbar(mesh, ax=place, label='RMS [mm]')
             _in_metres(place, *labels)
     return _png(figure)
@@ -89,7 +90,7 @@ def placements_png(placements: Placements) -> bytes:
     figure = _figure(15.0, 4.5)
     for axes, pair in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
         x, y = placements.positions[:, pair].T
-        colours = {'c': errors[reached], 's': 60, 'cmap': 'viridis', 'rasterized': True}
+        colours = {'c': errors[reached], 's': 60, 'cmap': 'viridis_r', 'rasterized': True}
         dots = axes.scatter(x[reached], y[reached], **colours)
         figure.colorbar(dots, ax=axes, label='expected error [mm]')
         for name, k, shape in (('best', placements.best, '*'), ('centre', placements.centre, 'X')):
