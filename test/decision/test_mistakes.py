@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from calib_ros import Chain, Problem, identify, load_chain
 from calib_ros.apply.simulation import Cell, faulty, measure
+from calib_ros.decision.lost_rows import dead
 from calib_ros.decision.mistakes import explained
 from calib_ros.decision.rotation_conventions import misread
-from calib_ros.decision.suspects import _mirrored, _scaled, dead
+from calib_ros.decision.suspects import _mirrored, _scaled
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame, Joint
 
