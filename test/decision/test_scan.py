@@ -87,6 +87,19 @@ def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
     assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
 
 
+@pytest.mark.parametrize('held', [False, True])
+def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held(held):
+    """Measured in one place, then in another, where the weight bends it more."""
+    load = {f'{joint}.gravity_wrist_3_joint': 1e-3 for joint in UR10E.joint_names[1:4]}
+    rng = np.random.default_rng(0)
+    true = arm(rng, 0.0).with_effects(list(load)).with_offsets(load)
+    q = 0.1 * UR10E.random_joints(COUNT, rng)
+    q[AT:, 1:3] += 1.5
+    seen = measure(true, q, rng, *NOISE)
+    fitted = fitting.fit(Problem(UR10E, seen, fixed=('*_joint.*',), **SIGMAS))[2]
+    assert (find_step(fitted, held) is None) == held
+
+
 @pytest.mark.parametrize(('share', 'apart'), [(0.98, True), (1.02, False)])
 def test_places_are_apart_where_a_plane_explains_nearly_all_of_it(share, apart):
     """Of eight poses of one joint: by the adjusted share of the squares, with six freedoms."""
