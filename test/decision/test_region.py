@@ -350,9 +350,10 @@ def test_a_device_out_of_scale_does_not_spoil_an_arm_of_small_errors(seed):
     ],
 )
 def test_a_damaged_region_is_refused(local, change):
-    record = {'region': local.region.document() | change}
+    used = local.region.document() | {'share': 0.0}
+    assert region_of_record({'region': used}, local.chain, 'here').share == 0.0
     with pytest.raises((ConfigError, UnknownNameError), match=r'here: calibration\.region'):
-        region_of_record(record, local.chain, 'here')
+        region_of_record({'region': used | change}, local.chain, 'here')
 
 
 @pytest.mark.parametrize('what', ['yes', 3, ['limit'], {}, {'limit': None}])

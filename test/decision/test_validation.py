@@ -102,7 +102,7 @@ def refused(before, after, judged, **change):
     [
         (3e-3, 1e-3, [Rule.CONVERGENCE, Rule.COMMON_SENSE]),
         (3e-3, 3e-3, [Rule.CONVERGENCE, Rule.COMMON_SENSE, Rule.GAIN]),
-        (0.02, 0.02, [Rule.CONVERGENCE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.COMMON_SENSE]),
+        (0.016, 0.016, [Rule.CONVERGENCE, Rule.LARGEST_ERROR, Rule.GAIN, Rule.COMMON_SENSE]),
         (0.04, 0.02, [Rule.CONVERGENCE, Rule.COMMON_SENSE, Rule.LARGEST_ERROR]),
     ],
 )

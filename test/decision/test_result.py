@@ -1,0 +1,30 @@
+# SPDX-FileCopyrightText: calib_ros contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a result tells of the errors that are left."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from fits import UR10E, measured_arm
+from scipy import stats
+
+from calib_ros import Problem, identify
+
+
+@pytest.mark.parametrize('level', [0.5, 0.95])
+def test_ellipsoids_are_those_of_f_or_of_its_limit(level, unsearched):
+    found = identify(Problem(UR10E, measured_arm(0, 30)[2]))
+    posterior = replace(found.posterior, shift=np.zeros_like(found.posterior.shift))
+    q = UR10E.random_joints(20, np.random.default_rng(1))
+    sizes = 3.0 * stats.f.ppf(level, 3, 5), stats.chi2.ppf(level, 3)
+    for freedom, size in zip((5.0, np.inf), sizes, strict=True):
+        noise = SimpleNamespace(
+            parts=found.uncertainty.parts,
+            freedom_of=lambda shares, freedom=freedom: np.full(shares.shape[1:], freedom),
+        )
+        result = replace(found, posterior=posterior, uncertainty=noise)
+        axes = result.confidence_ellipsoid(q, level)
+        squares = size * result.pose_covariance(q)[:, :3, :3]
+        np.testing.assert_allclose(np.swapaxes(axes, 1, 2) @ axes, squares, rtol=1e-6, atol=1e-15)
