@@ -2,14 +2,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """When mistakes are looked for, and which of several explanations are named."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from fits import UR10E, measured_arm
 
 from calib_ros import Problem, identify
 from calib_ros.decision import mistakes
-from calib_ros.decision.mistakes import _named, _several, _suspicious
+from calib_ros.decision.mistakes import _named, _several, _suspicious, explained
 from calib_ros.decision.suspects import Suspect
 
 FAULTY = SimpleNamespace(largest_error=0.5, largest_length=0.1, largest_angle=0.2, sets=())
@@ -58,6 +60,19 @@ def test_mistakes_are_looked_for_where_errors_are_those_of_no_faulty_arm(change,
         'parameters': (),
     }
     assert _suspicious(FAULTY, SimpleNamespace(**result | change)) == suspicious
+
+
+@pytest.mark.parametrize(('count', 'searched'), [(5, False), (6, True)])
+def test_few_poses_and_wires_alone_are_not_searched(count, searched, monkeypatch):
+    """Base and tool explain nearly all of five."""
+    tried = []
+    monkeypatch.setattr(mistakes, 'in_frames', lambda *given: tried.append(given))
+    seen = measured_arm(1, count)[2]
+    assert explained(Problem(UR10E, seen)) is None
+    assert bool(tried) == searched
+    wire = replace(seen, distances=np.ones(count), oriented=np.zeros(count, dtype=bool))
+    assert explained(Problem(UR10E, wire)) is None
+    assert bool(tried) == searched
 
 
 @pytest.fixture
