@@ -113,7 +113,7 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
             continue
         seen = (each.inverted() if each.inverse else each).positions
         held = np.flatnonzero(np.ptp(seen, axis=0) == 0.0)
-        places = replace(chain, base=None, tool=None).forward(each.joints)[:, :3, 3]
+        places = replace(chain, tool=None).forward(each.joints)[:, :3, 3]
         spreads = np.linalg.svd(places - places.mean(axis=0), compute_uv=False)
         if len(held) and spreads[2] > NEARER**2 * spreads[0]:
             columns = ', '.join('xyz'[k] for k in held)

@@ -11,6 +11,7 @@ from fits import UR10E as UR
 
 from calib_ros.decision import plausibility
 from calib_ros.decision.reasons import Reason, Rule
+from calib_ros.estimation.levels import TELLING
 
 LENGTHS = [f'{j.name}.{kind}' for j in UR.joints for kind in 'ad' if getattr(j, kind)]
 
@@ -57,6 +58,21 @@ def test_all_lengths_grow_alike_where_the_device_is_out_of_scale(scale, change, 
     found = [*plausibility._scale(problem, result)]
     assert told in ' '.join(found)
     assert bool(found) == bool(told)
+
+
+@pytest.mark.parametrize(
+    ('count', 'bend', 'told'), [(TELLING, 0.0, True), (TELLING - 1, 0.0, False), (20, 0.05, False)]
+)
+def test_a_joint_moves_one_way_in_a_session_that_is_long_enough(count, bend, told, rng):
+    """Each configuration counts once, however often it was measured."""
+    q = rng.normal(size=(count, 2))
+    q[:, 1] = np.arange(count) * (1.0 - bend * np.arange(count))
+    twice = np.repeat(np.arange(count), 2)
+    seen = SimpleNamespace(joints=q[twice], configurations=twice)
+    problem = SimpleNamespace(sets=[seen], chain=SimpleNamespace(joint_names=('pan', 'lift')))
+    found = plausibility._order(problem)
+    assert ('an error of lift, moved' in found) == told
+    assert bool(found) == told
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 """Which of two triples of angles was meant. `test_mistakes.py` has the mistakes themselves."""
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from calib_ros.decision.rotation_conventions import _beyond
+from calib_ros.decision.rotation_conventions import _angles, _beyond, _vectors
 
 
 def test_angles_are_beyond_the_usual_range_by_the_one_that_is_furthest():
@@ -12,3 +13,17 @@ def test_angles_are_beyond_the_usual_range_by_the_one_that_is_furthest():
     np.testing.assert_allclose(_beyond(angles, 'ZXY'), [0.0, 3.3 - np.pi, 2.0 - 0.5 * np.pi])
     vectors = np.array([[3.0, 0.0, 0.0], [0.0, 3.0, 4.0]])
     np.testing.assert_allclose(_beyond(vectors, ''), [0.0, 5.0 - np.pi])
+
+
+def test_both_triples_and_both_vectors_are_the_same_rotation():
+    turns = Rotation.random(20, random_state=1)
+    for read in ('XYZ', 'ZXY'):
+        for angles in _angles(turns.as_matrix(), read):
+            columns = ['XYZ'.index(axis) for axis in read]
+            again = Rotation.from_euler(read, angles[:, columns])
+            np.testing.assert_allclose(again.as_matrix(), turns.as_matrix(), atol=1e-9)
+    short, long = (np.linalg.norm(each, axis=1) for each in _vectors(turns.as_matrix()))
+    np.testing.assert_allclose(short + long, 2.0 * np.pi)
+    for vectors in _vectors(turns.as_matrix()):
+        again = Rotation.from_rotvec(vectors)
+        np.testing.assert_allclose(again.as_matrix(), turns.as_matrix(), atol=1e-9)

@@ -87,6 +87,14 @@ def test_the_place_of_a_step_is_told_as_it_is_found(where, told):
     assert f'moved by 1 mm (base) {told}' in str(replace(step, **where))
 
 
+def test_sets_have_their_share_of_the_freedoms_of_the_fit():
+    fitted = bumped()
+    scan = steps._Scan(fitted, loaded=False, gross=True)
+    for group in scan._groups:
+        equations, freedom, _ = scan._budget(group)
+        assert (equations, freedom) == (6 * COUNT, pytest.approx(6 * COUNT - len(fitted.names)))
+
+
 @pytest.mark.parametrize('held', [False, True])
 def test_another_load_from_the_first_pose_on_is_no_step_of_an_arm_that_is_held(held):
     """Measured in one place, then in another, where the weight bends it more."""

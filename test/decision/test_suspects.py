@@ -3,6 +3,8 @@
 """Which of equivalent mistakes are named, and which may occur together."""
 
 from dataclasses import replace
+from functools import reduce
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.printed_board import size_of
-from calib_ros.decision.suspects import Suspect, suspects
+from calib_ros.decision.suspects import Suspect, hidden, suspects
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain import Frame
 
@@ -53,6 +55,22 @@ def test_simple_mistakes_are_named_before_double_and_far_fetched_ones(rng):
     others = [e for e in suspects(sister, (seen.select(np.arange(0)),)) if 'arm is a' in e.what]
     assert {each.rank for each in others} == {2}
     assert 'ur10e' in {each.chain.name for each in others}
+
+
+def test_signs_hide_each_other_in_twos_and_threes_and_behind_another_hand(rng):
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(5, rng), rng)
+    options = [*suspects(arm, (seen,))]
+    found = hidden(arm, options)
+    others = [each for each in options if each.part in ('handed', 'order')]
+    assert len(found) == 15 + 6 * len(others) + 20
+    flipped = set()
+    for these in (*found[:15], *found[-20:]):
+        (undone,) = reduce(lambda sets, each: each.undone(sets), these, (seen,))
+        signs = undone.joints / seen.joints
+        assert (np.abs(signs) == 1.0).all()
+        flipped.add(tuple(np.flatnonzero(signs[0] < 0.0)))
+    assert flipped == {*combinations(range(6), 2), *combinations(range(6), 3)}
 
 
 ALL = 'the positions and linear joints are in'
