@@ -232,17 +232,14 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     """
     scale = 1.0 / np.linalg.norm(factor, axis=0)
     inverse, failed = lapack.dtrtri(factor * scale)
-    if failed:
+    if failed or not np.isfinite(inverse).all():
         raise np.linalg.LinAlgError('singular factor')
     inverse *= scale[:, np.newaxis]
     if middle is None:
         return np.asarray(inverse @ inverse.T)
-    turned = inverse.T @ middle @ inverse
-    root, failed = lapack.dpotrf(turned, lower=1)
-    if failed:
-        sizes, directions = np.linalg.eigh(turned)
-        root = directions * np.sqrt(np.maximum(sizes, 0.0))  # no rounding below zero
-    root = inverse @ root
+    root, order, rank, _ = lapack.dpstrf(inverse.T @ middle @ inverse, lower=1)  # pivoted
+    root[:, rank:] = 0.0  # no rounding below zero
+    root = inverse[:, order - 1] @ np.tril(root)
     return np.asarray(root @ root.T)
 
 

@@ -213,6 +213,9 @@ def test_the_covariance_of_a_factor_by_hand():
     np.testing.assert_allclose(
         covariance(factor, 4.0 * normal), 4.0 * np.linalg.inv(normal), rtol=1e-12
     )
+    some = factor[1:].T @ factor[1:]  # as of a part that shows some parameters only
+    inverse = np.linalg.inv(normal)
+    np.testing.assert_allclose(covariance(factor, some), inverse @ some @ inverse, rtol=1e-12)
 
 
 @pytest.mark.parametrize(('size', 'level'), [(0.9, 0.5), (0.9, 0.95), (5.0, 0.95)])
