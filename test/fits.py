@@ -12,6 +12,7 @@ from calib_ros.decision.comparison import residuals
 from calib_ros.estimation import fitting
 from calib_ros.estimation.fitted import parameter_rows
 from calib_ros.estimation.leastsquares import minimise
+from calib_ros.estimation.problem import Problem
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 
@@ -44,6 +45,14 @@ def measured_arm(rng, count, noise=NOISE, **more):
     rng = np.random.default_rng(rng)
     true = arm(rng)
     return rng, true, measure(true, UR10E.random_joints(count, rng), rng, *noise, **more)
+
+
+def problem(true, count, seed, oriented=True, chain=UR10E, worse=1.0):
+    """Return a problem of poses of an arm, their noise so many times the usual and told."""
+    rng = np.random.default_rng(seed)
+    noise = (worse * sigma for sigma in NOISE)
+    measured = measure(true, chain.random_joints(count, rng), rng, *noise, oriented)
+    return Problem(chain, measured, **{name: worse * sigma for name, sigma in SIGMAS.items()})
 
 
 def rms(chain, true, q, approach=None):

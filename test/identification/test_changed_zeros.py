@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, UR10E, rms
+from fits import NOISE, SCARA, SIGMAS, UR10E, problem, rms
 
 from calib_ros import Calibration, Problem, difference, identify, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
@@ -17,18 +17,11 @@ from calib_ros.kinematics.chain import Chain, Joint
 ALL = np.radians([0.1, -0.15, 0.08, 0.2, -0.12, 0.05])
 
 
-def seen(true, count, seed, oriented=True, chain=UR10E, worse=1.0):
-    rng = np.random.default_rng(seed)
-    noise = (worse * sigma for sigma in NOISE)
-    measured = measure(true, chain.random_joints(count, rng), rng, *noise, oriented)
-    return Problem(chain, measured, **{name: worse * sigma for name, sigma in SIGMAS.items()})
-
-
 @pytest.fixture(scope='module', params=[True, False])
 def earlier(request):
     """Return an arm, its calibration from poses or positions, and which of these."""
     true = faulty(UR10E, Cell(), np.random.default_rng(4))
-    return true, Calibration.of(identify(seen(true, 60, 0, request.param))), request.param
+    return true, Calibration.of(identify(problem(true, 60, 0, request.param))), request.param
 
 
 def slipped(true, zeros):
@@ -44,7 +37,7 @@ def test_new_zeros_of_all_joints_are_one_change(earlier, seed):
     """Mastered again: with at most three changes, one by one, two of three were refused."""
     true, previous, oriented = earlier
     now = slipped(true, ALL)
-    found = recalibrate(previous, seen(now, 8, seed, oriented), 0.1)
+    found = recalibrate(previous, problem(now, 8, seed, oriented), 0.1)
     assert found.accepted
     assert owners(found.changed) == [{'all joints'}]
     assert found.changed[0][0].in_words() == 'all joints (theta)'
@@ -58,7 +51,7 @@ def test_two_changed_zeros_are_told_by_name(earlier, joints):
     true, previous, oriented = earlier
     zeros = np.zeros(6)
     zeros[list(joints)] = 2e-3, -1e-3
-    found = recalibrate(previous, seen(slipped(true, zeros), 8, 1, oriented), 0.1)
+    found = recalibrate(previous, problem(slipped(true, zeros), 8, 1, oriented), 0.1)
     assert found.accepted
     told = owners(found.changed)
     assert set().union(*told) >= {UR10E.joint_names[k] for k in joints}
@@ -71,7 +64,7 @@ def test_a_zero_that_is_off_by_a_turn_of_the_motor_is_the_only_change(earlier, j
     """It is far larger than usual changes: other joints, or the whole link, shared it."""
     true, previous, oriented = earlier
     now = true.with_offsets({f'{joint}.theta': np.radians(turn)})
-    found = recalibrate(previous, seen(now, 8, 1, oriented), 0.1)
+    found = recalibrate(previous, problem(now, 8, 1, oriented), 0.1)
     assert found.accepted
     ((reason,),) = found.changed
     assert reason.names == (f'{joint}.theta',)
@@ -83,7 +76,7 @@ def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):
     """There it moves the target only: a turn of it does not show."""
     true, previous, oriented = earlier
     now = slipped(true, [0.0] * 5 + [4e-3])
-    found = recalibrate(previous, seen(now, 8, 1, oriented), 0.1)
+    found = recalibrate(previous, problem(now, 8, 1, oriented), 0.1)
     assert 'wrist_3_joint' in owners(found.changed)[0]
 
 
@@ -110,7 +103,7 @@ def test_another_load_is_no_change_of_the_arm(earlier, seed):
     last = UR10E.joint_names[-1]
     bent = {f'{joint}.gravity_{last}': 3e-4 for joint in UR10E.joint_names[1:4]}
     now = true.with_effects(list(bent)).with_offsets(bent)
-    poses = seen(now, 12, seed, oriented)
+    poses = problem(now, 12, seed, oriented)
     found = recalibrate(previous, poses, 0.1)
     assert not found.accepted
     assert owners(found.changed)[0] >= {'load'}
@@ -139,7 +132,7 @@ def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show(
 ):
     true = faulty(chain, Cell(), np.random.default_rng(4))
     pair = enumerate((true, change(true)))
-    first, second = (Calibration.of(identify(seen(arm, 50, k, chain=chain))) for k, arm in pair)
+    first, second = (Calibration.of(identify(problem(arm, 50, k, chain=chain))) for k, arm in pair)
     found = difference(first, second)
     assert owners(found.changed) == [{owner}]
     assert f'changed: {owner}{said}' in found.in_words()
@@ -150,7 +143,7 @@ def test_two_calibrations_differ_by_all_zeros_only_if_more_than_three_show(
 def test_a_device_of_ten_times_the_noise_shows_where_frames_are(earlier, new, count):
     """The others predict a pose as well as it fits, if not as well as earlier ones did."""
     true, previous, oriented = earlier
-    found = recalibrate(previous, seen(true, count, 7, oriented, worse=10.0), 0.1, new=new)
+    found = recalibrate(previous, problem(true, count, 7, oriented, worse=10.0), 0.1, new=new)
     assert found.after.rms_mm > 5e3 * previous.residual
     assert found.accepted
     assert not found.changed
@@ -163,7 +156,7 @@ def test_an_unchanged_arm_between_new_frames_is_accepted(earlier, seed, count):
     true, previous, oriented = earlier
     rng = np.random.default_rng(seed)
     there = replace(true, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
-    found = recalibrate(previous, seen(there, count, seed, oriented), 0.1, new=('base', 'tool'))
+    found = recalibrate(previous, problem(there, count, seed, oriented), 0.1, new=('base', 'tool'))
     assert found.accepted
     assert not found.changed
     assert found.after.rms_mm < 1.2 * found.before.rms_mm
@@ -173,7 +166,7 @@ def test_too_few_poses_for_a_new_frame_are_refused(earlier):
     """Two positions leave a turn of the base open; a calibration with that was accepted."""
     true, previous, oriented = earlier
     there = replace(true, base=random_frame(np.random.default_rng(1), 2.0))
-    few = seen(there, 1 if oriented else 2, 1, oriented)
+    few = problem(there, 1 if oriented else 2, 1, oriented)
     new = ('base', 'tool') if oriented else ('base',)
     with pytest.raises(InputError, match=rf'{len(few.observations)} poses? cannot place the new '):
         recalibrate(previous, few, 0.1, new=new)
@@ -183,7 +176,7 @@ def test_a_device_that_stands_far_away_asks_for_its_new_frame(earlier):
     """The remedy was to identify again."""
     true, previous, oriented = earlier
     there = replace(true, base=random_frame(np.random.default_rng(1), 2.0))
-    why, step = recalibrate(previous, seen(there, 8, 1, oriented), 0.1).refusal()
+    why, step = recalibrate(previous, problem(there, 8, 1, oriented), 0.1).refusal()
     assert why == 'no change of a few parameters explains the new poses'
     assert step.startswith('if the device or the target was moved, give --new-base or --new-tool')
 
@@ -197,6 +190,6 @@ def test_new_frames_that_fit_their_poses_exactly_confirm_nothing(earlier, new):
     now = replace(slipped(true, [0.0, 0.0, 3e-3, 0.0, 0.0, 0.0]), **there)
     count = {1: 1 if oriented or new == ('tool',) else 2, 2: 3}[len(new)]
     with pytest.raises(InputError, match=rf'{count} poses? cannot place the new '):
-        recalibrate(previous, seen(now, count, 1, oriented), 0.1, new=new)
-    few = seen(now, 8, 1, oriented)
+        recalibrate(previous, problem(now, count, 1, oriented), 0.1, new=new)
+    few = problem(now, 8, 1, oriented)
     assert 'elbow_joint' in owners(recalibrate(previous, few, 0.1, new=new).changed)[0]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fits import NOISE, SCARA, SIGMAS, UR10E, rms
+from fits import NOISE, SCARA, SIGMAS, UR10E, problem, rms
 from measured import rows_of, write_csv
 from robots import DATA, needs_data
 
@@ -20,11 +20,6 @@ from calib_ros.identification.recalibrated import ANEW
 from calib_ros.identification.recalibration import years_since
 
 Q = UR10E.random_joints(300, np.random.default_rng(99))
-
-
-def problem(true, count, seed):
-    rng = np.random.default_rng(seed)
-    return Problem(UR10E, measure(true, UR10E.random_joints(count, rng), rng, *NOISE), **SIGMAS)
 
 
 def but(seen, **changed):
