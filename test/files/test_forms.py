@@ -55,25 +55,22 @@ def test_rows_that_name_the_joints_are_no_header_of_numbered_columns(tmp_path):
         Foreign(given, ARM, log).convert(path)
 
 
-@pytest.mark.parametrize('cell', ['"5', '5,"as above', '5,"'])
-def test_an_open_quotation_mark_hides_no_rows(tmp_path, cell):
-    """The rows below were one cell with it, of a column that need not be read."""
+@pytest.mark.parametrize(
+    ('rows', 'said'),
+    [
+        ('1,2,3,4,"5\n1,2,3,4,6', '.* quotation marks paired'),
+        ('1,2,3,4,5,"as above\n1,2,3,4,6', '.* quotation marks paired'),
+        ('1,2,3,4,5,"\n1,2,3,4,6', '.* quotation marks paired'),
+        ('1,2,3,4,5,"\n1,2,3,4,6,\n1,2,3,4,7,"', 'whole rows are within quotation marks'),
+        ('1,2,3,4,5,"\n1,2,3,4,6,\n1,2,3,4,",', 'whole rows are within quotation marks'),
+    ],
+)
+def test_a_quotation_mark_hides_no_rows(tmp_path, rows, said):
+    """Those below an open one, or between two ditto marks, were one cell that nobody reads."""
     path = tmp_path / 'cell.csv'
-    path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5\n1,2,3,4,{cell}\n1,2,3,4,6\n1,2,3,4,7\n')
+    path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5,a\n{rows}\n')
     for foreign in (None, Foreign(Layout())):
-        with pytest.raises(InputError, match=r'from line 3: .* quotation marks paired'):
-            read_table(path, 2, foreign=foreign)
-
-
-@pytest.mark.parametrize('again', ['7,"', '",'])
-def test_ditto_marks_hide_no_rows(tmp_path, again):
-    """Two of them are quotation marks around the rows between."""
-    path = tmp_path / 'cell.csv'
-    path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5,a\n1,2,3,4,5,"\n1,2,3,4,6,\n1,2,3,4,{again}\n')
-    for foreign in (None, Foreign(Layout())):
-        with pytest.raises(
-            InputError, match=r'from line 3: whole rows are within quotation marks'
-        ):
+        with pytest.raises(InputError, match=f'from line 3: {said}'):
             read_table(path, 2, foreign=foreign)
 
 

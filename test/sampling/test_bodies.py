@@ -30,6 +30,7 @@ TEXTS = {
     'float32 quality\n',
     NAMED: 'std_msgs/Header header\nNamedPose[] poses\n',
 }
+UNREADABLE = f'defines {MOCAP} by what cannot be read'
 for name, text in TEXTS.items():
     TYPESTORE.register(get_types_from_msg(text, name))
 
@@ -123,13 +124,6 @@ def test_the_line_that_is_proposed_is_of_use_whatever_a_body_is_called(tmp_path,
         parse_source("/bodies type=NamedPoseArray parent=hall child='Tom")
 
 
-def test_a_bag_that_does_not_define_them_says_so(tmp_path, rng):
-    _, come = measured(rng, MOCAP)
-    path = record(tmp_path / 'bag', standing(come, '/bodies'), texts=[('/bodies', '')])
-    with pytest.raises(InputError, match=f'does not define {MOCAP}'):
-        session_of(path, sources=(line(MOCAP),))
-
-
 def test_bodies_are_read_beside_a_wrong_index_too(tmp_path, rng):
     _, come = measured(rng, MOCAP)
     path = record(tmp_path / 'bag', standing(come, '/bodies'))
@@ -147,17 +141,18 @@ def test_bodies_are_read_beside_a_wrong_index_too(tmp_path, rng):
 
 
 @pytest.mark.parametrize(
-    'text',
+    ('text', 'said'),
     [
-        'std_msgs/Header header\nnonsense',
-        f'{TEXTS[MOCAP]}# {"x" * LARGEST_MESSAGE}',
-        'std_msgs/Header header\nuint32 a=b',
+        ('', f'does not define {MOCAP}'),
+        ('std_msgs/Header header\nnonsense', UNREADABLE),
+        (f'{TEXTS[MOCAP]}# {"x" * LARGEST_MESSAGE}', UNREADABLE),
+        ('std_msgs/Header header\nuint32 a=b', UNREADABLE),
     ],
 )
-def test_a_definition_that_cannot_be_read_is_told(tmp_path, rng, text):
+def test_a_definition_that_is_not_there_or_cannot_be_read_is_told(tmp_path, rng, text, said):
     _, come = measured(rng, MOCAP, [105])
     path = record(tmp_path / 'bag', standing(come, '/bodies'), texts=[('/bodies', text)])
-    with pytest.raises(InputError, match=f'defines {MOCAP} by what cannot be read'):
+    with pytest.raises(InputError, match=said):
         session_of(path, sources=(line(MOCAP),))
 
 

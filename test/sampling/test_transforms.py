@@ -294,13 +294,13 @@ def test_messages_are_read_whatever_stands_between_their_names(rng):
     np.testing.assert_array_equal(numbers[0], numbers[1])
 
 
-@pytest.mark.parametrize('cut', range(4, 130, 7))
-def test_messages_that_are_cut_off_are_not_read(rng, cut):
-    data = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
-    assert alike(TRANSFORMS, [data[:cut]], {}) == [] or cut >= len(data)
+WHOLE = bytes(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
+
+
+@pytest.mark.parametrize('cut', range(4, len(WHOLE), 7))
+def test_messages_that_are_cut_off_are_not_read(cut):
+    assert alike(TRANSFORMS, [WHOLE[:cut]], {}) == []
 
 
 def test_a_name_of_absurd_length_is_not_read():
-    data = bytearray(TYPESTORE.serialize_cdr(tf(link('world', 'tool', 105 * MS)), TRANSFORMS))
-    data[16:20] = b'\xff\xff\xff\xff'
-    assert alike(TRANSFORMS, [bytes(data)], {}) == []
+    assert alike(TRANSFORMS, [WHOLE[:16] + b'\xff\xff\xff\xff' + WHOLE[20:]], {}) == []
