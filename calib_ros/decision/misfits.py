@@ -5,15 +5,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib_ros.decision.drift import gain_of
+from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.steps import EXPLAINED
 from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
+from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import stacked
+from calib_ros.estimation.levels import NEARER, SEVERAL, TELLING
+from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
 from calib_ros.kinematics import effects
@@ -83,3 +87,53 @@ def explained_share(
         return 0.0
     gain, _, left = gain_of(rows.T @ rows, len(fitted))
     return gain / left if left > 0.0 else 0.0
+
+
+def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:
+    """Return by how much the distances of a device are too long, if that explains a misfit.
+
+    The zero of a draw-wire, found by refits. A scale is no rival: the arm's lengths imitate it.
+    """
+    problem, found = fitted.problem, 0.0
+    wires = [k for k, e in enumerate(problem.sets) if e.distances is not None and not e.plane]
+    for _ in range(SEVERAL if len(wires) == 1 else 0):
+        offset = _constant(fitted, wires[0])
+        if not found and not offset:
+            return ()
+        found += offset
+        sets = list(problem.sets)
+        sets[wires[0]] = _lengthened(sets[wires[0]], -found)
+        fitted = fit(replace(problem, observations=sets[0], more=tuple(sets[1:])))[2]
+    if not found:
+        return ()
+    remedy = 'correct the zero where they are published'
+    if not problem.of_messages:
+        remedy = f'--columns distance=distance-{found:.4f} (if in metres)'.replace('--0', '+0')
+    way = 'long' if found > 0.0 else 'short'
+    what = f'all distances are {1e3 * abs(found):.1f} mm too {way}, by the zero'
+    return (Reason(Rule.MISTAKE, f'{what}: {remedy}'),)
+
+
+def _constant(fitted: Fitted, wire: int) -> float:
+    """Return the constant [m] in the distances of a set that explains a misfit, or 0."""
+    problem, chain = fitted.problem, fitted.chain
+    sets = [each.select(good) for each, good in zip(problem.sets, fitted.robust.good, strict=True)]
+    longer = [*sets[:wire], _lengthened(sets[wire], 1.0), *sets[wire + 1 :]]
+    rows, moved = (
+        stacked(problem.system(each).rows_of(chain, fitted.names)) for each in (sets, longer)
+    )
+    if len(rows) - rows.shape[1] < TELLING:
+        return 0.0
+    known, measured = rows[:, :-1], rows[:, -1]
+    columns = np.column_stack([known, moved[:, -1] - measured])
+    (alone, _), (left, found) = (
+        (float(np.linalg.norm(measured - each @ by)), float(by[-1]))
+        for each in (known, columns)
+        for by in (np.linalg.lstsq(each, measured)[0],)
+    )
+    return found if left < NEARER * alone else 0.0
+
+
+def _lengthened(each: Observations, more: float) -> Observations:
+    assert each.distances is not None
+    return replace(each, distances=each.distances + more)

@@ -21,7 +21,7 @@ from calib_ros.decision import mistakes, plausibility
 from calib_ros.decision.acceptance import oddities, refusals
 from calib_ros.decision.comparison import GroupVerdict, compare
 from calib_ros.decision.drift import chance_of_gain
-from calib_ros.decision.misfits import arms_own, lacking, outliers_of
+from calib_ros.decision.misfits import arms_own, lacking, outliers_of, zero_of_distances
 from calib_ros.decision.region import Region, region_of
 from calib_ros.decision.result import Identification
 from calib_ros.decision.rounding import may_be_rounding, rounded_joints, rounding_errors
@@ -114,7 +114,7 @@ def _identified(
         world_frame=problem.world_frame,
         converged=before.converged and robust.fit.converged and robust.settled,
         chance=_chance(fitted, before.chain),
-        refusals=(),
+        refusals=zero_of_distances(fitted),
         posterior=posterior,
         region=region,
         weak=_weak(problem, parameters),
@@ -126,7 +126,7 @@ def _identified(
     own_behaviour = None if step else arms_own(fitted)
     rounding = may_be_rounding(fitted, before.chain, coarse)
     refused = refusals(problem, result, own_behaviour, rounding, fitted.held is None, scaled)
-    result = replace(result, refusals=refused)
+    result = replace(result, refusals=(*result.refusals, *refused))
     named = mistakes.with_mistake(problem, result)
     return plausibility.remarked(problem, named, another=named is result)
 
