@@ -107,7 +107,7 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
     guessed = _separator(path, text, notes if not layout.cut else [])
     separator = layout.cut or guessed
-    if separator not in text and guessed in text:
+    if separator not in text and guessed in text.lstrip().partition('\n')[0]:
         name = next(name for name, mark in SEPARATORS.items() if mark == guessed)
         raise InputError(f'{path} separates its cells by {name}s: give --separator {name}')
     return _Content(_rows_of_text(path, _narrow(text, separator), separator), notes, separator)

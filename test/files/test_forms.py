@@ -227,6 +227,15 @@ def test_another_separator_than_the_one_given_is_named(tmp_path, given, found):
         read_table(path, 2, foreign=Foreign(Layout(separator=given)))
 
 
+def test_decimal_commas_of_a_single_column_are_no_separators(tmp_path):
+    path, log = tmp_path / 'cell.csv', tmp_path / 'log.csv'
+    path.write_text('x,y,z\n1,2,3\n2,3,4\n')
+    log.write_text('q1\n0,5\n0,7\n')
+    one = Chain('rail', 'standard', (Joint('a', 'prismatic'),))
+    given = Foreign(Layout(), one, log, Layout(separator='semicolon'))
+    assert read_table(path, 1, foreign=given).fitted[0].joints.tolist() == [[0.5], [0.7]]
+
+
 GANTRY = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 'xyz'))
 
 
