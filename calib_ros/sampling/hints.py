@@ -127,11 +127,12 @@ def unmeasured(stops: int, between: int) -> list[Hint]:
     return [Hint(f'{words}?', f'{words}, and are its frames still named as before?')]
 
 
-def unseen(images: int, used: int, reason: str) -> list[Hint]:
+def unseen(images: int, samples: Sequence[Sample], reason: str) -> list[Hint]:
     """Report that the images of many stops are not used, and why the last of them is not."""
-    if not reason or images <= EXCEPTION * (images + used):
+    stops = images + sum(each.view is not None for each in samples)
+    if not reason or images <= EXCEPTION * stops:
         return []
-    words = f'at {images} of {images + used} stops the images are not used, the last: {reason}'
+    words = f'at {images} of {stops} stops the images are not used, the last: {reason}'
     return [Hint('', words, explains=False)]
 
 
@@ -237,7 +238,7 @@ def progress(
     `fitted` holds the joint values (n,) of each.
     """
     told = counted(len(fitted), 'pose')
-    if estimate is not None and estimate.excess and estimate.rms > settings.largest_error:
+    if estimate is not None and estimate.astray(settings.largest_error):
         apart = f'{1e3 * estimate.rms:.0f} mm from where the joints are'
         told += f', {apart}: check units, clocks and chain'
     elif estimate is not None:

@@ -85,6 +85,10 @@ class Estimate:
         """Tell whether a wanted sigma [m] is reached, and not by the priors."""
         return self.excess is not None and self.sigma <= wanted
 
+    def astray(self, largest_error: float) -> bool:
+        """Tell whether position residuals are further off than any arm [m]."""
+        return bool(self.excess) and self.rms > largest_error
+
     def more_for(self, wanted: float) -> int:
         """Return how many more samples are expected for a wanted sigma [m]."""
         return max(0, int(np.ceil(self.samples * ((self.sigma / wanted) ** 2 - 1.0))))

@@ -29,7 +29,7 @@ from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, SILENCE
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 from calib_ros.values import require
@@ -184,7 +184,7 @@ class CalibrationSession:
         if not self.recording:
             return NOT_RECORDING
         track = self._collector.track
-        for hint in self._names.silent_ones(track.silent(round(1e9 * SILENCE))):
+        for hint in self._names.silent_ones(track.silent()):
             return hint.status
         if others := self._names.foreign_ones(track.missing):
             return others
@@ -243,10 +243,9 @@ class CalibrationSession:
             found.append(Hint(f'{words}: set frame_id', f'{words}, {ONE_FRAME}', explains=False))
         if frozen(self.samples[-NO_ACCIDENT:]) and (hint := frozen(self.samples)):
             found.append(hint)
-        silent = self._collector.track.silent(round(1e9 * SILENCE))
-        found += [*self._names.silent_ones(silent), *refocused(self.samples)]
-        views = sum(each.view is not None for each in self.samples)
-        found += unseen(self.pictures.dropped.total(), views, self.pictures.reason)
+        silent = self._names.silent_ones(self._collector.track.silent())
+        found += [*silent, *refocused(self.samples)]
+        found += unseen(self.pictures.dropped.total(), self.samples, self.pictures.reason)
         found += self._pipeline.hints(self.received[POSES])
         if any(hint.explains for hint in found):
             return found
@@ -256,7 +255,9 @@ class CalibrationSession:
     def doubtful(self) -> bool:
         """Tell whether the status says that messages are refused, or something looks wrong."""
         others = self._names.foreign_ones(self._collector.track.missing)
-        return bool(self._filter.refused or others) or any(hint.status for hint in self.hints)
+        wrong = self._filter.refused, self.pictures.refused, others, self._live.known.refused
+        far = self.estimate and self.estimate.astray(self.settings.largest_error)
+        return bool(any(wrong) or far or any(hint.status for hint in self.hints))
 
     @property
     def delay(self) -> Delay | None:

@@ -18,7 +18,7 @@ from calib_ros.kinematics.se3 import FloatArray, Index
 from calib_ros.sampling.buffers import Rows
 from calib_ros.sampling.interpolation import continuous, interpolated, last_moves
 from calib_ros.sampling.intervals import intersection, silences, standing_intervals, union
-from calib_ros.sampling.slices import Series, Stamps
+from calib_ros.sampling.slices import SILENCE, Series, Stamps
 from calib_ros.sampling.stops import MOST_SPREAD
 
 APART = 'joint states too far apart'
@@ -80,8 +80,8 @@ class Track:
         named = {column for part in self._parts for column in part}
         return tuple(k for k in range(len(self._revolute)) if k not in named)
 
-    def silent(self, time_ns: int) -> tuple[int, ...]:
-        """Return the joints last received so much earlier than others."""
+    def silent(self, time_ns: int = round(1e9 * SILENCE)) -> tuple[int, ...]:
+        """Return the joints last received so much [ns] earlier than others."""
         newest = self._newest()
         return tuple(np.flatnonzero((newest > 0) & (newest < newest.max() - time_ns)).tolist())
 

@@ -69,6 +69,7 @@ def test_no_forecast_where_what_is_left_is_not_noise(rng, model, advice):
 def test_no_accuracy_is_expected_of_positions_in_millimetres():
     made = session([replace(each, position=1e3 * each.position) for each in samples(15)])
     assert re.search(r'15 poses, \d+ mm from where the joints are: check units', made.status())
+    assert made.doubtful
     assert 'expected' not in made.status()
 
 
