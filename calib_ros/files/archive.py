@@ -170,12 +170,15 @@ class Archive:
         self.write()
         words = ''
         if self._unsafe:
-            why = self.error
+            why, before = self.error, self.journal
             with suppress(OSError):
                 self._path = Path(mkdtemp(prefix='calib_ros_')) / self._path.name
                 self._begin(b'' if self._journal is None else self._journal.content)
                 self.write()
-            where = 'are lost' if self._unsafe else f'are in {self._path}, not in {self.folder}'
+            where = f'are in {self._path}, not in {self.folder}'
+            if self._unsafe:
+                others = f'beside those in {before} ' if before and before.is_file() else ''
+                where = f'{others}are lost'
             words = f'poses {where}: {why}'
         if self._journal is not None:
             self._journal.close()
