@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import plants
 import pytest
 from browser import browser, browser_path
 from measured import measured, rows_of, write_csv
@@ -259,23 +260,45 @@ def test_the_first_printed_page_is_the_certificate(wide):
     assert height < 1016
 
 
+WIDTHS = """[...document.querySelectorAll('.plot')].filter((e) => e.checkVisibility())
+    .map((e) => e.querySelector('.main-svg').getBoundingClientRect().right)"""
+
+
+def printed_widths(page):
+    """Return how far the figures of a page reach [px]; the page stays as printed."""
+    page.emulate_media(media='print')
+    page.evaluate("dispatchEvent(new Event('beforeprint'))")
+    return page.evaluate(WIDTHS)
+
+
 def test_printed_figures_are_whole(chromium, result):
     """They were as wide as on the screen, and cut: dots were missing."""
     seen = Seen(chromium, result / 'report.html', 1280)
     seen.drawn()
     page = seen.page
-    widths = """[...document.querySelectorAll('.plot')].filter((e) => e.checkVisibility())
-        .map((e) => e.querySelector('.main-svg').getBoundingClientRect().right)"""
-    page.emulate_media(media='print')
-    page.evaluate("dispatchEvent(new Event('beforeprint'))")
-    printed = page.evaluate(widths)
+    printed = printed_widths(page)
     assert len(printed) > 5
     assert max(printed) <= 688
     assert not page.is_visible('#space')  # empty on paper, and nothing to pick
     page.emulate_media(media='screen')
     page.evaluate("dispatchEvent(new Event('afterprint'))")
-    assert max(page.evaluate(widths)) > 1000
+    assert max(page.evaluate(WIDTHS)) > 1000
     seen.end()
+
+
+def test_a_printed_fleet_is_whole(chromium, tmp_path):
+    plant = plants.write_plant(tmp_path, ['0042'], 2, poses=12)
+    out = tmp_path / 'out'
+    main(['fleet', str(plant), '--history', str(tmp_path / 'history'), '--out', str(out)])
+    page = chromium.new_page()
+    page.goto((out / 'index.html').as_uri())
+    page.set_viewport_size({'width': 1280, 'height': 800})
+    assert max(page.evaluate(WIDTHS)) > 700
+    printed = printed_widths(page)
+    assert len(printed) == 2
+    assert max(printed) <= 688
+    assert 'RMS of 0042' in page.inner_text('#nights')  # its choice is not printed
+    page.close()
 
 
 def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
