@@ -178,7 +178,7 @@ def _sessions(problem: Problem, result: Identification) -> str:
 def _some(each: Observations) -> Observations:
     """Return evenly spread poses or whole images."""
     step = 1 + int(each.images[-1]) // SOME_POSES
-    return each if step == 1 else each.select(each.images % step == 0)
+    return each.select(each.images % step == 0)
 
 
 def _motion(problem: Problem, result: Identification) -> str:

@@ -80,6 +80,7 @@ def test_a_tool_that_points_one_way_is_told(rng, tilt, told):
         ([2], [], 0.0, 'elbow_joint stood still (or was not recorded): '),
         ([], [1, 3], 0.0, 'shoulder_lift_joint, wrist_1_joint only moved together ('),
         ([], [1, 3], 2.0, ''),
+        ([0, 3, 4, 5], [1, 2], 0.0, 'shoulder_lift_joint, elbow_joint only moved together ('),
         ([0, 5], [1, 2, 4], 0.0, 'shoulder_lift_joint, elbow_joint, wrist_2_joint only moved'),
     ],
 )

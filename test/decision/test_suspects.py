@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from fits import SCARA
 
 from calib_ros import load_chain
 from calib_ros.apply.simulation import measure
@@ -71,6 +72,15 @@ def test_signs_hide_each_other_in_twos_and_threes_and_behind_another_hand(rng):
         assert (np.abs(signs) == 1.0).all()
         flipped.add(tuple(np.flatnonzero(signs[0] < 0.0)))
     assert flipped == {*combinations(range(6), 2), *combinations(range(6), 3)}
+
+
+@pytest.mark.parametrize(('count', 'told'), [(3, False), (4, True)])
+def test_three_joints_in_reverse_are_two_that_are_swapped(count, told, rng):
+    arm = replace(SCARA, joints=SCARA.joints[:count])
+    seen = measure(arm, arm.random_joints(5, rng), rng)
+    found = {each.what for each in suspects(arm, (seen,))}
+    assert ('the joints are in the order from tool to base' in found) == told
+    assert 'arm and quill are swapped' in found
 
 
 ALL = 'the positions and linear joints are in'
