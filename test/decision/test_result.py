@@ -11,6 +11,7 @@ from fits import UR10E, measured_arm
 from scipy import stats
 
 from calib_ros import Problem, identify
+from calib_ros.decision.region import region_of
 
 
 @pytest.mark.parametrize('level', [0.5, 0.95])
@@ -28,3 +29,11 @@ def test_ellipsoids_are_those_of_f_or_of_its_limit(level, unsearched):
         axes = result.confidence_ellipsoid(q, level)
         squares = size * result.pose_covariance(q)[:, :3, :3]
         np.testing.assert_allclose(np.swapaxes(axes, 1, 2) @ axes, squares, rtol=1e-6, atol=1e-15)
+
+
+def test_a_calibration_that_changes_nothing_may_be_used_nowhere(unsearched):
+    seen = measured_arm(0, 30)[2]
+    posterior = identify(Problem(UR10E, seen)).posterior
+    assert region_of(posterior, [seen], np.inf)
+    none = replace(posterior, offsets=np.zeros_like(posterior.offsets))
+    assert region_of(none, [seen], np.inf) is None

@@ -11,7 +11,7 @@ from fits import UR10E, measured_arm
 
 from calib_ros import Problem, identify
 from calib_ros.decision import mistakes
-from calib_ros.decision.mistakes import _named, _several, _suspicious, explained
+from calib_ros.decision.mistakes import _by_places, _named, _several, _suspicious, explained
 from calib_ros.decision.suspects import Suspect
 
 FAULTY = SimpleNamespace(largest_error=0.5, largest_length=0.1, largest_angle=0.2, sets=())
@@ -73,6 +73,23 @@ def test_few_poses_and_wires_alone_are_not_searched(count, searched, monkeypatch
     wire = replace(seen, distances=np.ones(count), oriented=np.zeros(count, dtype=bool))
     assert explained(Problem(UR10E, wire)) is None
     assert bool(tried) == searched
+
+
+@pytest.mark.parametrize(
+    ('change', 'tried'),
+    [
+        ({}, True),
+        ({'oriented': np.arange(9) > 0}, False),
+        ({'socket': True}, False),
+        ({'inverse': True}, False),
+    ],
+)
+def test_positions_are_tried_alone_where_all_poses_are_whole(change, tried, monkeypatch):
+    tries = []
+    monkeypatch.setattr(mistakes, 'in_frames', lambda *given: tries.append(given))
+    seen = replace(measured_arm(1, 9)[2], **change)
+    assert _by_places(FAULTY, UR10E, (seen,), given()) is None
+    assert bool(tries) == tried
 
 
 @pytest.fixture
