@@ -179,7 +179,7 @@ def test_a_recording_that_is_played_again_later_or_earlier_gives_its_samples_twi
     once = [sample.stamp_ns for sample in alone]
     later = [stamp + off * S for stamp in once]
     assert [sample.stamp_ns for sample in found.samples] == once + later
-    assert not any('far from' in cause for cause in found.account().dropped)
+    assert not found.account().dropped
 
 
 @pytest.mark.parametrize('seed', range(3))
