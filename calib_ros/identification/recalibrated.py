@@ -4,7 +4,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from calib_ros.decision.steps import Step
 from calib_ros.estimation.levels import ALIKE, CLEARLY
 from calib_ros.identification.calibration import Calibration
 from calib_ros.identification.records import reused_in_words
+from calib_ros.kinematics.chain import Chain
+from calib_ros.kinematics.parameter import Parameter
 from calib_ros.settings import Settings
 from calib_ros.shown import Shown
 from calib_ros.values import SAME
@@ -88,6 +91,37 @@ class Recalibration(Shown):
     def out_of_scale(self) -> bool:
         """Tell whether that is the scale of the device."""
         return self.outside is not None and self.outside.owner != changes.LOAD
+
+    def perhaps_moved(self, frames: Sequence[str]) -> list[str]:
+        """Return those of the frames that are part of changes too many, or of too little.
+
+        Far away the model is linear elsewhere, and a single move looks like several changes.
+        """
+        near = self.before.rms_mm <= 1e3 * Settings.largest_error
+        if near or self.reused or (len(self.changed) < 2 and self.unexplained > changes.FALSE):
+            return []
+        owners = dict.fromkeys(each.owner for reasons in self.changed for each in reasons)
+        return [owner for owner in owners if owner in frames]
+
+    def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
+        """Return the result with a `frame` that was free named as what has changed.
+
+        `earlier` is the arm before, and `found` has its errors.
+        """
+        updated = self.calibration
+        assert updated.covariance is not None
+        own = [k for k, name in enumerate(updated.names) if Parameter(name).owner == frame]
+        names = tuple(Parameter(updated.names[k]) for k in own)
+        change = np.array([updated.chain.offset(name, earlier) for name in names])
+        sigma = np.sqrt(np.diag(updated.covariance)[own])
+        reason = Explanation(frame, names, np.inf, 0.0, 1.0, change, sigma)
+        record = {**updated.record, 'changed': [changes.reason_in_words([reason])]}
+        return replace(
+            self,
+            calibration=replace(updated, record=record),
+            changed=((reason,),),
+            comparison=replace(self.comparison, before=found.comparison.before),
+        )
 
     def document(self) -> dict[str, Any]:
         """Return the result as plain values, without its figures."""

@@ -16,6 +16,7 @@ few or similar poses let one cause imitate another.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import cached_property
@@ -78,6 +79,11 @@ def recalibrate(
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
         raise InputError('the new poses do not fit the arm at all: check their units') from error
+    for frame in found.perhaps_moved(arm.frame_names):
+        with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
+            others, _ = _recalibrated(previous, problem, years, growth, (*new, frame))
+            if others.accepted and not others.changed:
+                return others.with_moved(frame, previous.chain, found)
     if found.accepted or found.reused or found.out_of_scale:
         return found
     for number, pose, rest in _without_one(problem, arm):

@@ -10,6 +10,7 @@ from fits import NOISE, SCARA, SIGMAS, UR10E, problem, rms
 
 from calib_ros import Calibration, Problem, difference, identify, recalibrate
 from calib_ros.apply.simulation import Cell, faulty, measure, random_frame
+from calib_ros.decision.changes import reason_in_words
 from calib_ros.errors import InputError
 from calib_ros.identification.recalibrated import ANEW
 from calib_ros.kinematics.chain import Chain, Joint
@@ -78,6 +79,22 @@ def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):
     now = slipped(true, [0.0] * 5 + [4e-3])
     found = recalibrate(previous, problem(now, 8, 1, oriented), 0.1)
     assert 'wrist_3_joint' in owners(found.changed)[0]
+
+
+@pytest.mark.parametrize('frame', ['base', 'tool'])
+def test_a_frame_far_from_where_it_was_is_the_only_change(earlier, frame):
+    """Moved by metres and turned at will: no linear model of it holds."""
+    true, previous, oriented = earlier
+    rng = np.random.default_rng(3)
+    now = replace(true, **{frame: random_frame(rng, 2.0 if frame == 'base' else 0.2)})
+    found = recalibrate(previous, problem(now, 8, 1, oriented), 0.1)
+    assert found.accepted
+    (reasons,) = found.changed
+    assert reasons[0].owner == frame
+    assert found.calibration.record['changed'] == [reason_in_words(reasons)]
+    moved = true.frame(frame).matrix[:3, 3] - now.frame(frame).matrix[:3, 3]
+    assert found.before.rms_mm > 100.0 * np.linalg.norm(moved)
+    assert rms(found.calibration.chain, now, UR10E.random_joints(300, rng)) < 1e-4
 
 
 @pytest.mark.parametrize(('frame', 'seed'), [('tool', 2), ('base', 37), ('base', 41)])
@@ -172,10 +189,11 @@ def test_too_few_poses_for_a_new_frame_are_refused(earlier):
         recalibrate(previous, few, 0.1, new=new)
 
 
-def test_a_device_that_stands_far_away_asks_for_its_new_frame(earlier):
+def test_a_device_and_a_target_far_away_ask_for_their_new_frames(earlier):
     """The remedy was to identify again."""
     true, previous, oriented = earlier
-    there = replace(true, base=random_frame(np.random.default_rng(1), 2.0))
+    rng = np.random.default_rng(1)
+    there = replace(true, base=random_frame(rng, 2.0), tool=random_frame(rng, 0.2))
     why, step = recalibrate(previous, problem(there, 8, 1, oriented), 0.1).refusal()
     assert why == 'no change of a few parameters explains the new poses'
     assert step.startswith('if the device or the target was moved, give --new-base or --new-tool')
