@@ -123,7 +123,7 @@ def bound(few, kind):
     for _ in range(20):
         many = information(UR.random_joints(MANY, rng))
         for joint in UR.joint_names[: 6 if kind == 'zero' else 5]:
-            sets = [own for owner, own in columns.sets if owner == joint]
+            sets = [own for _, own in columns.sets if {name.owner for name in own} == {joint}]
             wanted = (f'{joint}.{SLIPS[kind]}',) if kind in SLIPS else ()
             own = columns.of(next((each for each in sets if each == wanted), sets[-1]))
             shown = many @ own

@@ -8,9 +8,9 @@ x ~ N(0, K), such as the uncertainty of an earlier calibration, are marginalised
 
     A' = A - A C A        b' = b - A C b        C = R (1 + R^T A R)^-1 R^T,  K = R R^T
 
-An explanation is x = G z: one parameter, all of a joint (a bent link) or of a frame (a moved
-device or target), a shift of a frame, or the scale of the device has changed. It reduces
-chi-squared, with as many degrees of freedom as z, by
+An explanation is x = G z: one parameter, all of a joint, with theta and d of the next (a bent
+link) or not, all of a frame (a moved device or target), a shift of a frame, or the scale of the
+device has changed. It reduces chi-squared, with as many degrees of freedom as z, by
 
     (G^T b')^T (G^T A' G)^-1 (G^T b')
 
@@ -29,7 +29,7 @@ import copy
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, groupby
 from typing import Any
 
 import numpy as np
@@ -48,8 +48,7 @@ from calib_ros.settings import LEVER
 from calib_ros.shown import Shown
 
 FALSE = 0.5 * (1.0 - CERTAIN)
-"""False-alarm probability for an unchanged arm: one side of CERTAIN
-(benchmarks/recalibration.py)."""
+"""False alarms of an unchanged arm: one side of CERTAIN (benchmarks/recalibration.py)."""
 LIKELY = float(special.ndtri(0.5 + 0.5 * CONFIDENT))
 """Half of a 95 % interval in standard deviations."""
 SIZES = {'m': 1e-3, 'rad': 2e-3}
@@ -89,7 +88,10 @@ class Explanation(Shown):
         if self.owner == LOAD:
             return 'the load of the arm'
         if len(self.names) > 1:
-            return f'{self.owner} ({", ".join(dict.fromkeys(n.kind for n in self.names))})'
+            every = self.owner not in {name.owner for name in self.names}  # of all joints
+            parts = groupby(self.names, lambda name: self.owner if every else name.owner)
+            kinds = ((each, dict.fromkeys(name.kind for name in own)) for each, own in parts)
+            return ' with '.join(f'{each} ({", ".join(own)})' for each, own in kinds)
         what = 'the scale of the device' if self.names == (SCALE_OF_DEVICE,) else self.names[0]
         return f'{what} by {self.size_in_words()}'
 
@@ -107,8 +109,10 @@ def with_limits(change: float, sigma: float, unit: str) -> str:
 
 
 def reason_in_words(reasons: Sequence[Explanation]) -> str:
-    """Return the best explanation and those indistinguishable from it."""
-    first, *others = (each.in_words() for each in reasons)
+    """Return the best explanation and those indistinguishable from it, without parts of others."""
+    sets = [set(each.names) for each in reasons]
+    part = [len(own) > 1 and any(own < other for other in sets) for own in sets]
+    first, *others = (e.in_words() for e, of in zip(reasons, part, strict=True) if not of)
     text = f'changed: {first}'
     return f'{text}, indistinguishable from {" or ".join(others)}' if others else text
 
@@ -237,7 +241,7 @@ def likelier(
     """Return changes found one by one, or those of a few or all joint zeros if likelier.
 
     The best single explanation of several changed zeros may be another. Each change is chosen from
-    all explanations; all zeros count as one more than SEVERAL.
+    all explanations, a bent link counting once; all zeros count as one more than SEVERAL.
     """
     if not changed:
         return changed
@@ -245,13 +249,14 @@ def likelier(
     single = [(name,) for name in columns.zeros]
     tried = [given]
     tried += [list(some) for k in range(2, SEVERAL + 1) for some in combinations(single, k)]
-    if len(single) > SEVERAL:  # of fewer all are among these
-        tried.append([columns.zeros])
+    tried += [[columns.zeros]] * (len(single) > SEVERAL)  # of fewer all are among these
+
+    choices = sum(owner in (LOAD, own[-1].owner) for owner, own in columns.sets)
 
     def likely(causes: Sequence[Sequence[Parameter]]) -> float:
         count = SEVERAL + 1 if causes == [columns.zeros] else len(causes)
         names = [name for each in causes for name in each]
-        return columns.evidence(information, names)[0] - count * float(np.log(len(columns.sets)))
+        return columns.evidence(information, names)[0] - count * float(np.log(choices))
 
     best = max(tried, key=likely)
     if best is given:
@@ -290,16 +295,18 @@ class Effects:
         every = [name for joint in chain.joint_names for name in parameters_of(joint, DH_KINDS)]
         every += (name for frame in frames for name in parameters_of(frame))
         mapped, left = gauged(chain, names, every, free=not frames)
-        shows = np.abs(mapped).max(axis=0, initial=0.0) > HALF_THE_DIGITS
-        seen = shows & (left < HALF_THE_DIGITS)
+        shows = np.abs(mapped).max(axis=0, initial=0.0)
+        seen = (shows > HALF_THE_DIGITS) & (left < HALF_THE_DIGITS)
         self._columns = {n: c for n, c, yes in zip(every, mapped.T, seen, strict=True) if yes}
         self._columns |= dict(zip(names, np.eye(len(names)), strict=True))
         self._count = len(names)
         sets: list[tuple[str, tuple[Parameter, ...]]] = []
-        for joint in chain.joint_names:
+        for joint, *after in (chain.joint_names[k : k + 2] for k in range(len(chain.joints))):
             own = self._distinct(parameters_of(joint, ORDER))
             sets += [(joint, (name,)) for name in own]
-            sets += [(joint, own)] if len(own) > 1 else []
+            link = (*own, *(name for each in after for name in parameters_of(each, ORDER[:2])))
+            wholes = dict.fromkeys((own, self._distinct(link)))
+            sets += [(joint, some) for some in wholes if len(own) > 1]
         for frame in frames:
             own = tuple(name for name in parameters_of(frame) if name in self._columns)
             shifts = tuple(name for name in own if name.is_length)
@@ -313,8 +320,7 @@ class Effects:
             self._columns[SCALE_OF_DEVICE] = np.sum(grown, axis=0)
             sets.append((SCALE_OF_DEVICE.owner, (SCALE_OF_DEVICE,)))
         self.sets = tuple(sets)
-        zeros = (joint.driven for joint in chain.joints)
-        self.zeros = tuple(name for name in zeros if name in self._columns)
+        self.zeros = tuple(j.driven for j in chain.joints if j.driven in self._columns)
 
     def _distinct(self, names: Sequence[Parameter]) -> tuple[Parameter, ...]:
         """Return the observable parameters, without those equivalent to an earlier one."""

@@ -81,6 +81,21 @@ def test_a_slipped_zero_of_the_last_joint_is_told_by_positions(earlier):
     assert 'wrist_3_joint' in owners(found.changed)[0]
 
 
+@pytest.mark.parametrize('seed', range(3))
+def test_a_link_that_is_bent_any_way_is_one_change(earlier, seed):
+    """Six numbers place the axis after it: theta and d of its row as well."""
+    true, previous, oriented = earlier
+    kinds = [f'wrist_1_joint.{kind}' for kind in ('a', 'alpha', 'd', 'theta')]
+    kinds += ['wrist_2_joint.d', 'wrist_2_joint.theta']
+    offsets = dict(zip(kinds, np.random.default_rng(seed).normal(scale=2e-3, size=6), strict=True))
+    found = recalibrate(previous, seen(true.with_offsets(offsets), 12, seed, oriented), 0.1)
+    assert found.accepted
+    assert owners(found.changed) == [{'wrist_1_joint'}]
+    words = reason_in_words(found.changed[0])
+    assert 'wrist_1_joint (theta, d, a, alpha) with wrist_2_joint (theta, d)' in words
+    assert words.count('wrist_1_joint (') == 1
+
+
 @pytest.mark.parametrize('frame', ['base', 'tool'])
 def test_a_frame_far_from_where_it_was_is_the_only_change(earlier, frame):
     """Moved by metres and turned at will: no linear model of it holds."""
