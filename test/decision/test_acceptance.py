@@ -102,6 +102,10 @@ def test_the_loss_by_chance_is_that_of_a_paired_t_test(rng):
     old, new = (errors[:, 4:] ** 2).sum(axis=2)
     low, high = stats.ttest_rel(old, new).confidence_interval(2.0 * CERTAIN - 1.0)
     assert _loss_by_chance(judged) == pytest.approx(0.25 * (high - low) / old.mean())
+    sides = {name: vars(getattr(judged, name)) for name in ('before', 'after')}
+    halves = {'configurations': np.arange(30) // 15}
+    pair = {name: SimpleNamespace(**side | halves) for name, side in sides.items()}
+    assert _loss_by_chance(SimpleNamespace(**vars(judged) | pair)) < np.inf
 
 
 def test_a_program_that_runs_in_a_loop_is_judged_as_one_lap():

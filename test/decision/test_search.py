@@ -11,7 +11,14 @@ from fits import UR10E, measured_arm
 
 from calib_ros import Problem, identify
 from calib_ros.decision import mistakes
-from calib_ros.decision.mistakes import _by_places, _named, _several, _suspicious, explained
+from calib_ros.decision.mistakes import (
+    Explained,
+    _by_places,
+    _named,
+    _several,
+    _suspicious,
+    explained,
+)
 from calib_ros.decision.suspects import Suspect
 
 FAULTY = SimpleNamespace(largest_error=0.5, largest_length=0.1, largest_angle=0.2, sets=())
@@ -163,6 +170,15 @@ def test_what_is_wrong_with_some_rows_is_not_the_arm(searched, monkeypatch):
     monkeypatch.setattr(mistakes, 'suspects', lambda *_: [Suspect('arm', 'change', chain=UR10E)])
     assert _named(FAULTY, UR10E, (), given()).suspects[0].what == 'arm'
     assert not _named(FAULTY, UR10E, (), given(), of_rows=True)
+
+
+def test_errors_with_and_without_a_mistake_are_told_in_millimetres():
+    found = Explained((Suspect('a', 'undo a'), Suspect('b', 'undo b')), 0.123456, 0.0012)
+    said = 'a: undo a -- or b: undo b'
+    assert found.reason.short == said
+    assert (
+        str(found) == f'{said} (the uncorrected arm is then typically 1.20 mm off, not 123.5 mm)'
+    )
 
 
 MISTAKES = [('a', 1, 'measured'), ('b', 1, 'order'), ('c', 1, 'j1'), ('d', 1, 'j2')]

@@ -83,6 +83,20 @@ def test_three_joints_in_reverse_are_two_that_are_swapped(count, told, rng):
     assert 'arm and quill are swapped' in found
 
 
+@pytest.mark.parametrize(
+    ('remedy', 'sign', 'zero'),
+    [('q3=-q3', -1.0, 0.0), ('q3=q3+1.57079', 1.0, 0.5), ('q3=-q3-1.57079', -1.0, -0.5)],
+)
+def test_sign_and_zero_of_a_joint_are_undone(remedy, sign, zero, rng):
+    arm = load_chain('ur10e')
+    seen = measure(arm, arm.random_joints(5, rng), rng)
+    found = [each for each in suspects(arm, (seen,)) if f'--columns {remedy}' in each.remedy]
+    (undone,) = found[0].undone((seen,))
+    wanted = seen.joints.copy()
+    wanted[:, 2] = sign * wanted[:, 2] + zero * np.pi
+    np.testing.assert_allclose(undone.joints, wanted)
+
+
 ALL = 'the positions and linear joints are in'
 DEGREE = 180.0 / np.pi
 
@@ -181,7 +195,10 @@ def test_the_size_of_a_board_is_told_as_it_is_stated(size, times, rng):
     (board,) = (each for each in found if each.what.startswith('the board is'))
     assert board.what == f'the board is stated {times} times as large as it is'
     np.testing.assert_allclose(board.undone((stated,))[0].positions, seen.positions)
-    _, *of_prints, joints = found[:4]
+    camera, *of_prints, joints = found[:4]
+    assert camera.published == 'set eye_in_hand=true in sources'
+    (back, *_) = suspects(arm, (stated.inverted(),), of_images=True)
+    assert back.published == 'set eye_in_hand=false in sources'
     assert {each.part for each in found[:4]} == {'measured'}
     assert all(each.published == each.remedy for each in of_prints)
     assert (joints.remedy, joints.published) == ('correct it in --places', Suspect.published)
