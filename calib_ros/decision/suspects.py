@@ -166,15 +166,16 @@ def _of_lengths(key: str, columns: Sequence[str], change: Rescaled) -> Iterator[
 
 def _of_coordinates(seen: Observations) -> Iterator[Suspect]:
     """Yield other axes of the positions alone, and units of one coordinate."""
-    back = (Observations.inverted,) if seen.inverse else ()  # to the measured poses
+    back = (Observations.inverted,) if seen.inverse else ()
     for signs, order in product(product((1, -1), repeat=3), permutations(range(3))):
         if seen.oriented.any() and ({*signs} == {1}) != (order == (0, 1, 2)):
             matrix = np.diag(signs) @ np.eye(3)[[*order]]
             given = [f'{"-" * (n < 0)}{"xyz"[k]}' for n, k in zip(signs, order, strict=True)]
-            option = '--columns ' + ','.join(f'{a}={b}' for a, b in zip('xyz', given, strict=True))
+            option = '--columns x={},y={},z={}'.format(*given)
             what = f'the coordinates x, y, z of the positions are {", ".join(given)}'
-            changes = (*back, partial(_turned, matrix=matrix), *back)
-            yield Suspect(what, option, changes, part='measured')
+            changes = (*back, _in_axes(matrix), *back)
+            rank = 1 + bool(np.linalg.det(matrix) > 0.0)  # Euler angles' may look so
+            yield Suspect(what, option, changes, rank, part='measured')
     for k, name in enumerate('xyz'):
         own = partial(_scaled, axis=k)
         for each in _of_lengths(f'{name} coordinates alone', name, own):
@@ -335,11 +336,10 @@ def _of_joint(chain: Chain, k: int, sign: float, degrees: str, angle: float) -> 
 
 def _of_arms(chain: Chain) -> Iterator[Suspect]:
     """Yield lengths in mm, the other convention, wrong frames, and arms with like joints."""
-    size = SCALES['mm']
-    small = [replace(j, a=size * j.a, b=size * j.b, d=size * j.d) for j in chain.joints]
+    mm = SCALES['mm']
+    small = [replace(j, a=mm * j.a, b=mm * j.b, d=mm * j.d) for j in chain.joints]
     what, remedy = 'the lengths of the chain file are in mm, not metres', 'give metres there'
-    arm = replace(chain, joints=tuple(small))
-    yield Suspect(what, remedy, chain=arm, published=remedy)
+    yield Suspect(what, remedy, chain=replace(chain, joints=tuple(small)), published=remedy)
     other: Convention = 'modified' if chain.convention == 'standard' else 'standard'
     what = f'the DH table is in the {other} convention, not the {chain.convention} one'
     remedy = f'convention: {other} in the chain file'
@@ -384,8 +384,8 @@ def _scaled(size: float, axis: int | None = None) -> DataChange:
     return lambda each: replace(each, positions=sizes * each.positions)
 
 
-def _turned(each: Observations, matrix: FloatArray) -> Observations:
-    return replace(each, positions=each.positions @ matrix.T)
+def _in_axes(matrix: FloatArray) -> DataChange:
+    return lambda each: replace(each, positions=each.positions @ matrix.T)
 
 
 def _with(turn: Turn) -> DataChange:

@@ -121,7 +121,7 @@ def test_one_coordinate_in_another_unit_is_named(size):
 
 @pytest.mark.parametrize(
     ('axes', 'option'),
-    [([1, 0, 2], 'x=y,y=x,z=z'), ([1, 2, 0], 'x=z,y=x,z=y')],
+    [([1, 0, 2], 'x=y,y=x,z=z'), ([2, 1, 0], 'x=z,y=y,z=x')],
 )
 def test_coordinates_of_the_positions_alone_in_another_order_are_named(axes, option):
     seen = seen_of(30, True)
