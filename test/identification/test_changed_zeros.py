@@ -88,7 +88,7 @@ def test_a_link_that_is_bent_any_way_is_one_change(earlier, seed):
     kinds = [f'wrist_1_joint.{kind}' for kind in ('a', 'alpha', 'd', 'theta')]
     kinds += ['wrist_2_joint.d', 'wrist_2_joint.theta']
     offsets = dict(zip(kinds, np.random.default_rng(seed).normal(scale=2e-3, size=6), strict=True))
-    found = recalibrate(previous, seen(true.with_offsets(offsets), 12, seed, oriented), 0.1)
+    found = recalibrate(previous, problem(true.with_offsets(offsets), 12, seed, oriented), 0.1)
     assert found.accepted
     assert owners(found.changed) == [{'wrist_1_joint'}]
     words = reason_in_words(found.changed[0])
