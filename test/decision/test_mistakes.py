@@ -390,7 +390,6 @@ def test_a_planar_arm_square_to_the_device_has_no_dead_column():
     ends = {'lower': -2.5, 'upper': 2.5}
     chain = Chain('flat', 'standard', tuple(Joint(f'j{k}', a=0.3, **ends) for k in range(3)))
     rng = np.random.default_rng(0)
-    q = chain.random_joints(40, rng)
-    seen = measure(chain, q, rng, 0.0, 0.0, oriented=False)
+    seen = measure(chain, chain.random_joints(40, rng), rng, 0.0, 0.0, oriented=False)
     assert np.ptp(seen.positions[:, 2]) == 0.0
     assert dead(chain, (seen,)) is None
