@@ -16,7 +16,7 @@ from calib_ros.estimation.configurations import STILL
 from calib_ros.estimation.fitted import Fitted
 from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.leastsquares import stacked
-from calib_ros.estimation.levels import NEARER, SEVERAL, TELLING
+from calib_ros.estimation.levels import ALIKE, NEARER, SEVERAL, TELLING
 from calib_ros.estimation.observations import Observations
 from calib_ros.estimation.problem import Problem
 from calib_ros.estimation.robust import OUTLIER, SUSPICIOUS
@@ -97,9 +97,8 @@ def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:
     problem, found = fitted.problem, 0.0
     wires = [k for k, e in enumerate(problem.sets) if e.distances is not None and not e.plane]
     for _ in range(SEVERAL if len(wires) == 1 else 0):
-        offset = _constant(fitted, wires[0])
-        if not found and not offset:
-            return ()
+        if not (offset := _constant(fitted, wires[0])):
+            break
         found += offset
         sets = list(problem.sets)
         sets[wires[0]] = _lengthened(sets[wires[0]], -found)
@@ -108,30 +107,38 @@ def zero_of_distances(fitted: Fitted) -> tuple[Reason, ...]:
         return ()
     remedy = 'correct the zero where they are published'
     if not problem.of_messages:
-        remedy = f'--columns distance=distance-{found:.4f} (if in metres)'.replace('--0', '+0')
+        remedy = f'--columns distance=distance{-found:+.5f} (if in metres)'
     way = 'long' if found > 0.0 else 'short'
-    what = f'all distances are {1e3 * abs(found):.1f} mm too {way}, by the zero'
+    what = f'all distances are {1e3 * abs(found):.3g} mm too {way}, by the zero'
     return (Reason(Rule.MISTAKE, f'{what}: {remedy}'),)
 
 
 def _constant(fitted: Fitted, wire: int) -> float:
-    """Return the constant [m] in the distances of a set that explains a misfit, or 0."""
-    problem, chain = fitted.problem, fitted.chain
+    """Return the constant [m] in the distances of a set that explains a misfit, or 0.
+
+    Nor must a usual sag of the arm explain as much.
+    """
+    problem, names = fitted.problem, fitted.names
+    sags = [n for n in effects.members(problem.chain, 'gravity') if n not in names]
+    chain = fitted.chain.with_effects(sags)
     sets = [each.select(good) for each, good in zip(problem.sets, fitted.robust.good, strict=True)]
     longer = [*sets[:wire], _lengthened(sets[wire], 1.0), *sets[wire + 1 :]]
     rows, moved = (
-        stacked(problem.system(each).rows_of(chain, fitted.names)) for each in (sets, longer)
+        stacked(problem.system(each).rows_of(chain, (*names, *sags))) for each in (sets, longer)
     )
-    if len(rows) - rows.shape[1] < TELLING:
+    count, known, measured = len(names), rows[:, :-1], rows[:, -1]
+    if len(rows) - count < TELLING:
         return 0.0
-    known, measured = rows[:, :-1], rows[:, -1]
-    columns = np.column_stack([known, moved[:, -1] - measured])
-    (alone, _), (left, found) = (
-        (float(np.linalg.norm(measured - each @ by)), float(by[-1]))
-        for each in (known, columns)
-        for by in (np.linalg.lstsq(each, measured)[0],)
+    usual = np.eye(known.shape[1])[count:] / [[effects.expected(name)] for name in sags]
+    columns = np.column_stack([known[:, :count], moved[:, -1] - measured])
+    tried = (known[:, :count], columns, np.concatenate([known, usual]))
+    wanted = (measured, measured, np.append(measured, np.zeros(len(sags))))
+    found = [np.linalg.lstsq(*each)[0] for each in zip(tried, wanted, strict=True)]
+    alone, left, bent = (
+        float(np.linalg.norm(right - each @ by))
+        for each, by, right in zip(tried, found, wanted, strict=True)
     )
-    return found if left < NEARER * alone else 0.0
+    return float(found[1][-1]) if left < NEARER * alone and ALIKE * left < bent else 0.0
 
 
 def _lengthened(each: Observations, more: float) -> Observations:

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 from calib_ros import Problem, identify
 from calib_ros.apply.simulation import Cell, faulty, measure
 from calib_ros.decision.lost_rows import _apart, _where, row_loss
+from calib_ros.decision.misfits import zero_of_distances
 from calib_ros.decision.mistakes import explained
+from calib_ros.estimation.fitting import fit
 from calib_ros.estimation.levels import LEAST_ASIDE
 from calib_ros.kinematics.chain_file import load_chain
 
@@ -158,3 +160,17 @@ def test_the_zero_of_a_draw_wire_is_named(zero):
     )
     assert (found is not None) is bool(zero)
     assert not zero or float(found[1]) == pytest.approx(1e3 * abs(zero), abs=0.5)
+
+
+@pytest.mark.parametrize('seed', [112, 127, 177])
+def test_a_sag_that_looks_like_the_zero_of_a_draw_wire_is_not_taken_for_it(seed):
+    tx90 = load_chain('staubli_tx90l')
+    rng, names = np.random.default_rng(seed), tx90.joint_names
+    bends = dict.fromkeys(
+        [f'{names[1]}.gravity_{names[2]}', f'{names[1]}.gravity_{names[5]}'], 3e-4
+    )
+    bends[f'{names[2]}.gravity_{names[4]}'] = 3e-4
+    true = faulty(tx90, Cell(), rng).with_effect_values(bends)
+    seen = measure(true, tx90.random_joints(60, rng), rng, 3e-5, oriented=False)
+    lengths = np.linalg.norm(seen.positions, axis=1)
+    assert not zero_of_distances(fit(Problem(tx90, replace(seen, distances=lengths)))[2])
