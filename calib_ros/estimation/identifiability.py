@@ -232,12 +232,13 @@ def covariance(factor: FloatArray, middle: FloatArray | None = None) -> FloatArr
     """
     scale = 1.0 / np.linalg.norm(factor, axis=0)
     inverse, failed = lapack.dtrtri(factor * scale)
-    if failed or not np.isfinite(inverse).all():
-        raise np.linalg.LinAlgError('singular factor')
     inverse *= scale[:, np.newaxis]
+    turned = inverse if middle is None else inverse.T @ middle @ inverse
+    if failed or not np.isfinite(turned).all():
+        raise np.linalg.LinAlgError('singular factor')
     if middle is None:
         return np.asarray(inverse @ inverse.T)
-    root, order, rank, _ = lapack.dpstrf(inverse.T @ middle @ inverse, lower=1)  # pivoted
+    root, order, rank, _ = lapack.dpstrf(turned, lower=1)  # pivoted
     root[:, rank:] = 0.0  # no rounding below zero
     root = inverse[:, order - 1] @ np.tril(root)
     return np.asarray(root @ root.T)

@@ -216,6 +216,8 @@ def test_the_covariance_of_a_factor_by_hand():
     some = factor[1:].T @ factor[1:]  # as of a part that shows some parameters only
     inverse = np.linalg.inv(normal)
     np.testing.assert_allclose(covariance(factor, some), inverse @ some @ inverse, rtol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError):  # not the certainty of zeros
+        covariance(factor, np.full_like(normal, np.nan))
 
 
 @pytest.mark.parametrize(('size', 'level'), [(0.9, 0.5), (0.9, 0.95), (5.0, 0.95)])
