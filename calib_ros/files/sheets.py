@@ -107,10 +107,14 @@ def _of_text(path: Path, layout: Layout) -> _Content:
     text = re.sub(r'(?m)^[#%]+[ \t]+(?=[A-Za-z])', '', text)  # a header, as numpy writes it
     guessed = _separator(path, text, notes if not layout.cut else [])
     separator = layout.cut or guessed
-    if separator not in text and guessed in text.lstrip().partition('\n')[0]:
+    narrow = _narrow(text, separator)
+    if separator not in narrow and guessed in text.lstrip().partition('\n')[0]:
         name = next(name for name, mark in SEPARATORS.items() if mark == guessed)
-        raise InputError(f'{path} separates its cells by {name}s: give --separator {name}')
-    return _Content(_rows_of_text(path, _narrow(text, separator), separator), notes, separator)
+        raise InputError(
+            f'{path} separates its cells by {name}s: give --separator {name}'
+            + ', or to --joints-preset a layout of your own' * bool(layout.source)
+        )
+    return _Content(_rows_of_text(path, narrow, separator), notes, separator)
 
 
 def _rows_of_text(path: Path, text: str, separator: str) -> Iterator[list[Cells]]:
@@ -147,7 +151,8 @@ def _sheet(
     above = tuple(tuple(cells) for _, cells in head[: max(at, 0)])
     body = chain([whole[first:]], rows)
     columns = of_rows(path, body, [f'#{k + 1}' for k in range(len(header))])
-    _refuse_shifted(columns, len(header))
+    if at >= 0:
+        _refuse_shifted(columns, len(header))
     header = (*header, *[''] * (len(columns.header) - len(header)))
     return Sheet(path, header, above, replace(columns, decimal=decimal), tuple(notes))
 

@@ -219,6 +219,24 @@ def test_a_row_with_one_number_more_than_the_header_is_refused(tmp_path, line, s
         read_table(path, 2, foreign=Foreign(Layout()))
 
 
+@pytest.mark.parametrize(
+    'text', ['0,1,2,3,4,5\n,1,2,3,4,5\n', 'a log\n1,1,2,3,4,5\n2,1,2,3,4,5,7\n']
+)
+def test_rows_without_a_header_have_no_number_too_many(tmp_path, text):
+    """A blank first cell was told as one beyond a header of no columns."""
+    path = tmp_path / 'cell.csv'
+    path.write_text(text)
+    numbered = Layout(columns={'q1': '#2', 'q2': '#3', 'x': '#4', 'y': '#5', 'z': '#6'})
+    (found,) = read_table(path, 2, foreign=Foreign(numbered)).fitted
+    assert found.positions.tolist() == [[3.0, 4.0, 5.0]] * 2
+
+
+def test_tabs_are_blanks_between_cells(tmp_path):
+    path = tmp_path / 'cell.csv'
+    path.write_text(PLAIN.replace(',', '\t'))
+    assert read_table(path, 2, foreign=Foreign(Layout(separator='space'))).fitted
+
+
 @pytest.mark.parametrize(('given', 'found'), [('space', 'comma'), ('comma', 'semicolon')])
 def test_another_separator_than_the_one_given_is_named(tmp_path, given, found):
     path = tmp_path / 'cell.csv'
