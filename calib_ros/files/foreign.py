@@ -169,7 +169,7 @@ class _Table:
 
     def _named(self, own: Mapping[str, str]) -> dict[str, Expression]:
         """Return more of our columns, that the header calls by our names or the chain's."""
-        kept, guessed = dict[str, Expression](), []
+        kept, guessed = dict[str, Expression](), dict[str, str]()
         lower = [name.lower() for name in self._sheet.header]
         for name, ours in own.items():
             found = places(self._sheet.header, name) or places(lower, name.lower())
@@ -186,9 +186,13 @@ class _Table:
                 continue
             kept[ours] = Expression.parse(number)
             if name != ours:
-                guessed.append(f'{ours} = {name}')
+                guessed[ours] = f'{ours} = {name}'
+        known = self._columns | kept
+        measured = {name for ours in POSITION if ours in known for name in known[ours].names}
+        for ours in [ours for ours in guessed if measured & {*kept[ours].names}]:
+            del kept[ours], guessed[ours]  # of a gantry: no column is both
         if guessed:
-            self.notes.append(f'by the names of the joints, {", ".join(guessed)}')
+            self.notes.append(f'by the names of the joints, {", ".join(guessed.values())}')
         return kept
 
     def _complete(self, chain: Chain) -> None:

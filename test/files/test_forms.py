@@ -274,6 +274,15 @@ def test_joints_called_as_the_positions_are_are_told_apart(tmp_path, header, sai
         read_table(path, 3, foreign=Foreign(Layout(), GANTRY))
 
 
+@pytest.mark.parametrize('named', [{}, {'x': 'X', 'y': 'Y', 'z': 'Z'}])
+def test_a_column_is_not_a_joint_value_and_a_position(tmp_path, named):
+    path = tmp_path / 'cell.csv'
+    path.write_text('A1,A2,A3,X,Y,Z\n1,2,3,4,5,6\n2,3,4,5,6,7\n')
+    arm = Chain('gantry', 'standard', tuple(Joint(name, 'prismatic') for name in 'XYZ'))
+    with pytest.raises(InputError, match=re.escape('--columns "q*=A*"')):
+        read_table(path, 3, foreign=Foreign(Layout(columns=named), arm))
+
+
 def test_the_joints_with_motors_of_an_arm_whose_hand_is_kept_level_are_told(tmp_path):
     joints = [
         Joint(f'j{k}', a=0.5, lower=0 if k == 2 else None, upper=0 if k == 2 else None)
