@@ -38,9 +38,7 @@ CLOSER = (
     'to get closer, identify with --model auto: it also corrects gears, gravity and backlash '
     'where that helps'
 )
-UNPROVEN = (
-    'All these poses were used to compute the correction: a small error "after" proves nothing.'
-)
+UNPROVEN = 'All these poses were fitted: a small error "after" proves nothing.'
 SURVEYED = 20 * SOME_POSES  # random poses of the error map: several per cell
 
 
@@ -57,6 +55,7 @@ def identification_report(
     reasons = advice_of(result)
     text = filter(None, _text(result, reasons, tolerance))
     gain = sections.gain(judged) if result.accepted else ''
+    effects = words.notes(result)[:1] if result.chain.effects else []
     scale = f'scale checked to {1e6 * problem.sigma_scale:g} ppm'
     scale = scale if problem.sigma_scale else 'scale not checked'
     corrected, notes = 'none: not accepted', words.other_remarks(result)
@@ -87,7 +86,7 @@ def identification_report(
             origin,
             poses,
             (
-                ('Fitted', _fitted(result)),
+                ('Fitted', ', '.join((counted(result.rank, 'parameter'), *effects))),
                 ('Stated device noise', f'{_stated(problem, poses)}; one sigma; {scale}'),
                 ('Remaining error', words.times_in_words(result.noise)),
                 ('Judged by', result.validated_by),
@@ -179,10 +178,8 @@ def may_be_closer(result: Identification, beyond: bool = False) -> bool:
 def _steps(
     result: Identification, reasons: Sequence[Advice], tolerance: float | None
 ) -> tuple[str, ...]:
-    if not result.accepted and reasons[0].heading == GOOD_ARM.heading:
-        return ()
     if not result.accepted:
-        return (reasons[0].again,)
+        return () if reasons[0].heading == GOOD_ARM.heading else (reasons[0].again,)
     lower, upper = interval_of(result.validation or result.fitted, 1)
     beyond = tolerance is not None and lower > tolerance
     undecided = tolerance is not None and lower <= tolerance < upper
@@ -262,11 +259,6 @@ def _stated(problem: Problem, poses: Poses) -> str:
         for name, (measured, text) in found.items()
         if measured
     )
-
-
-def _fitted(result: Identification) -> str:
-    effects = words.notes(result)[:1] if result.chain.effects else []
-    return ', '.join((counted(result.rank, 'parameter'), *effects))
 
 
 def _unmodelled(result: Identification) -> list[str]:
