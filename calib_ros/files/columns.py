@@ -279,7 +279,8 @@ def csv_blocks(
     try:
         for row in reader:
             before, line = line, reader.line_num
-            within = separator.join(row).split('\n') if line - before > 1 < width else ()
+            ends = '\r\n?|\n'  # of lines, as csv has them
+            within = re.split(ends, separator.join(row)) if line - before > 1 < width else ()
             if {part.count(separator) for part in within} == {width - 1}:  # a note has others
                 line = before
                 raise csv.Error('whole rows are within quotation marks')

@@ -83,10 +83,11 @@ def test_a_note_of_several_lines_is_one_cell(tmp_path):
         assert_same(read_table(path, 2, foreign=foreign), None)
 
 
-@pytest.mark.parametrize('note', ['a, b, c, d, e\nf', 'a, b\nc, d, e, f', 'a\n, b, c\nd'])
+@pytest.mark.parametrize('note', ['a, b, c, d, e\nf', 'a, b\nc, d, e, f', 'a\n, b, c\nd', 'a\rb'])
 def test_a_note_with_as_many_commas_as_a_row_hides_none(tmp_path, note):
     path = tmp_path / 'cell.csv'
-    path.write_text(f'q1,q2,x,y,z,note\n1,2,3,4,5,\n1,2,3,4,6,"{note}"\n1,2,3,4,7,\n')
+    rows = f'q1,q2,x,y,z,note\n1,2,3,4,5,\n1,2,3,4,6,"{note}"\n1,2,3,4,7,\n'
+    path.write_bytes(rows.encode())  # as they are
     (found,) = read_table(path, 2).fitted
     assert found.positions[:, 2].tolist() == [5.0, 6.0, 7.0]
 
