@@ -138,7 +138,11 @@ def unseen(images: int, samples: Sequence[Sample], reason: str) -> list[Hint]:
 
 def refocused(samples: Sequence[Sample]) -> list[Hint]:
     """Report a lens that changed between samples: no calibration may have several."""
-    seen = [each for each in samples if each.view is not None]
+    seen = {
+        (each.view.lens, each.session, each.device, each.target, each.eye_in_hand): each
+        for each in samples
+        if each.view is not None
+    }.values()  # one of each, whatever their number
     try:
         lenses_by_frame(seen, named(seen))
     except InputError as err:
