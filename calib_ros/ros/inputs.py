@@ -161,7 +161,8 @@ class Inputs:
 
     def troubles(self) -> list[str]:
         """Return problems of topics as text."""
-        losing = ', '.join(topic for topic, hearing in self._topics.items() if hearing.losing)
+        topics = self._topics.items()
+        losing = ', '.join(topic for topic, each in topics if each.losing and not each.gone)
         return [*self.failures, *([f'messages are lost on {losing}'] if losing else [])]
 
     def figures(self) -> dict[str, Any]:

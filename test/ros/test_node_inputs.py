@@ -171,13 +171,16 @@ def test_a_large_share_is_told_as_lost_as_long_as_more_is():
     heard.note_lost(20)
     heard.look(1.0, 1.0)
     assert heard.gone == 0.2
+    inputs = object.__new__(inputs_module.Inputs)
+    inputs._topics, inputs.failures = {'/joint_states': heard}, []
+    assert not inputs.troubles()  # it is among the failures
     heard.count = 200
     heard.look(2.0, 1.0)
     assert heard.gone == 0.0
     heard.note_lost(21)  # of so many that it is an exception
     heard.look(3.0, 1.0)
-    assert heard.losing
     assert heard.gone == 0.0
+    assert inputs.troubles() == ['messages are lost on /joint_states']
 
 
 def test_what_dds_tells_of_losses_never_goes_below_zero():
