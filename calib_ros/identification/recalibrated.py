@@ -93,15 +93,15 @@ class Recalibration(Shown):
         return self.outside is not None and self.outside.owner != changes.LOAD
 
     def perhaps_moved(self, frames: Sequence[str]) -> list[str]:
-        """Return those of the frames that are part of changes too many, or of too little.
+        """Return the frames if changes are too many or too little, those named in them first.
 
         Far away the model is linear elsewhere, and a single move looks like several changes.
         """
         near = self.before.rms_mm <= 1e3 * Settings.largest_error
         if near or self.reused or (len(self.changed) < 2 and self.unexplained > changes.FALSE):
             return []
-        owners = dict.fromkeys(each.owner for reasons in self.changed for each in reasons)
-        return [owner for owner in owners if owner in frames]
+        owners = {each.owner for reasons in self.changed for each in reasons}
+        return sorted(frames, key=lambda frame: frame not in owners)
 
     def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
         """Return the result with a `frame` that was free named as what has changed.

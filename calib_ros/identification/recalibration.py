@@ -79,7 +79,7 @@ def recalibrate(
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
         raise InputError('the new poses do not fit the arm at all: check their units') from error
-    for frame in found.perhaps_moved(arm.frame_names):
+    for frame in found.perhaps_moved(_movable(arm, problem.all_sets, new)):
         with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
             others, _ = _recalibrated(previous, problem, years, growth, (*new, frame))
             if others.accepted and not others.changed:
@@ -143,8 +143,7 @@ def _recalibrated(
         chain, kept = in_new_frames(problem, arm.chain, new, system), anywhere == 0.0
         square = arm.square * np.outer(kept, kept) + np.diag(anywhere**2)
         arm = replace(arm, chain=chain, square=square)
-    ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
-    movable = [end for end in ends if end not in new and not arm.chain.frame(end).fixed]
+    movable = _movable(arm.chain, sets, new)
     columns = Effects(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
     named: list[tuple[Parameter, ...]] = []
     then, earlier = arm, arm.changed(np.zeros(len(arm.names)), arm.square)
@@ -169,6 +168,12 @@ def _recalibrated(
         compare(earlier, updated.chain, sets).figures[1].rms_mm,
     )
     return result, earlier
+
+
+def _movable(chain: Chain, sets: Sequence[Observations], new: Sequence[str]) -> list[str]:
+    """Return the frames of the sets that are neither new nor fixed."""
+    ends = dict.fromkeys(end for each in sets for end in (each.base, each.tool))
+    return [end for end in ends if end not in new and not chain.frame(end).fixed]
 
 
 def _known(arm: _Arm, before: FloatArray, found: _Found) -> tuple[float, float, float]:
