@@ -377,16 +377,16 @@ def gauged(
     return taken[[fitted.index(name) for name in names]], np.linalg.norm(left, axis=0) / size
 
 
-def shown(
-    chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter]
-) -> list[Parameter]:
-    """Return those of the names in which changes of others show.
+def shown(chain: Chain, names: Sequence[Parameter], others: Sequence[Parameter]) -> FloatArray:
+    """Return the changes (P, K) of P named parameters in which unit changes of others show.
 
     A target at another height on a SCARA shows as a device at another height.
     """
-    mapped, left = gauged(chain, names, others, free=False)
-    sizes = np.abs(mapped[:, left < HALF_THE_DIGITS]).max(axis=1, initial=0.0)
-    return [name for name, size in zip(names, sizes, strict=True) if size > HALF_THE_DIGITS]
+    own = np.eye(len(names))[:, [name in others for name in names]]
+    mapped, left = gauged(chain, names, [n for n in others if n not in names], free=False)
+    mapped = np.where(np.abs(mapped) > HALF_THE_DIGITS, mapped, 0.0)
+    shows = (left < HALF_THE_DIGITS) & mapped.any(axis=0)
+    return np.column_stack([own, mapped[:, shows]])
 
 
 def mean_square_change(chain: Chain, names: Sequence[Parameter]) -> FloatArray:

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -92,16 +91,14 @@ class Recalibration(Shown):
         """Tell whether that is the scale of the device."""
         return self.outside is not None and self.outside.owner != changes.LOAD
 
-    def perhaps_moved(self, frames: Sequence[str]) -> list[str]:
-        """Return the frames if changes are too many or too little, those named in them first.
+    @property
+    def perhaps_moved(self) -> bool:
+        """Tell whether changes too many, or too little, may be a single frame moved far away.
 
-        Far away the model is linear elsewhere, and a single move looks like several changes.
+        There the model is linear elsewhere.
         """
-        near = self.before.rms_mm <= 1e3 * Settings.largest_error
-        if near or self.reused or (len(self.changed) < 2 and self.unexplained > changes.FALSE):
-            return []
-        owners = {each.owner for reasons in self.changed for each in reasons}
-        return sorted(frames, key=lambda frame: frame not in owners)
+        far = self.before.rms_mm > 1e3 * Settings.largest_error and not self.reused
+        return far and (len(self.changed) > 1 or self.unexplained <= changes.FALSE)
 
     def with_moved(self, frame: str, earlier: Chain, found: Recalibration) -> Recalibration:
         """Return the result with a `frame` that was free named as what has changed.

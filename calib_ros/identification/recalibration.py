@@ -79,11 +79,15 @@ def recalibrate(
         found, arm = _recalibrated(previous, problem, years, growth, new)
     except (np.linalg.LinAlgError, FloatingPointError) as error:  # some are kilometres off
         raise InputError('the new poses do not fit the arm at all: check their units') from error
-    for frame in found.perhaps_moved(_movable(arm, problem.all_sets, new)):
+    moved: dict[str, Recalibration] = {}
+    for frame in _movable(arm, problem.all_sets, new) if found.perhaps_moved else ():
         with suppress(InputError, np.linalg.LinAlgError, FloatingPointError):
             others, _ = _recalibrated(previous, problem, years, growth, (*new, frame))
             if others.accepted and not others.changed:
-                return others.with_moved(frame, previous.chain, found)
+                moved[frame] = others
+    if len(moved) == 1:  # either of two may have moved
+        ((frame, others),) = moved.items()
+        return others.with_moved(frame, previous.chain, found)
     if found.accepted or found.reused or found.out_of_scale:
         return found
     for number, pose, rest in _without_one(problem, arm):
@@ -136,13 +140,10 @@ def _recalibrated(
     nominal = previous.before.with_effects([name for name, _ in arm.chain.effects])
     free = (frame for frame in new if not arm.chain.frame(frame).fixed)
     own = [name for frame in free for name in parameters_of(frame)]
-    shown = changes.shown(nominal, arm.names, own)
-    names = [name for name in arm.names if name in own or name in shown]
-    anywhere = np.isin(arm.names, names) * 10.0  # m, rad
-    if names:
-        chain, kept = in_new_frames(problem, arm.chain, new, system), anywhere == 0.0
-        square = arm.square * np.outer(kept, kept) + np.diag(anywhere**2)
-        arm = replace(arm, chain=chain, square=square)
+    anywhere = 10.0 * changes.shown(nominal, arm.names, own)  # m, rad
+    if anywhere.size:
+        chain = in_new_frames(problem, arm.chain, new, system)
+        arm = replace(arm, chain=chain, square=arm.square + anywhere @ anywhere.T)
     movable = _movable(arm.chain, sets, new)
     columns = Effects(nominal, arm.names, movable, _may_be_scaled(arm.chain, sets))
     named: list[tuple[Parameter, ...]] = []
@@ -162,7 +163,7 @@ def _recalibrated(
         updated,
         tuple(changed),
         chance_of(left, system.rows, previous.freedom),
-        _judged(arm, np.diag(anywhere), found, system, sets),
+        _judged(arm, anywhere, found, system, sets),
         *_known(arm, then.square, found),
         previous.reused(sets),
         compare(earlier, updated.chain, sets).figures[1].rms_mm,
@@ -343,7 +344,7 @@ def _judged(
 ) -> Comparison:
     """Return the errors of the new poses by the earlier arm, and predicted from the others.
 
-    `frames` (P, P) is a root of the covariance of new frames alone, which the others tell too.
+    `frames` (P, K) is a root of the covariance of new frames alone, which the others tell too.
     """
     groups = numbered(sets)
     count = min(SOME_POSES, distinct(np.concatenate(groups)))

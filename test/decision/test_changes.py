@@ -34,8 +34,10 @@ def test_frames_that_cannot_have_moved_take_what_they_can(frames, owners):
 
 def test_another_height_of_the_target_shows_as_one_of_the_device():
     names = [Parameter('elbow.theta'), Parameter('base.z')]
-    assert shown(SCARA, names, [Parameter('tool.z')]) == names[1:]
-    assert shown(SCARA, names, [Parameter('tool.x')]) == []
+    assert shown(SCARA, names, [Parameter('tool.z')])[0] == 0.0
+    assert abs(shown(SCARA, names, [Parameter('tool.z')])[1]) == pytest.approx(1.0)
+    assert shown(SCARA, names, [Parameter('tool.x')]).shape == (2, 0)
+    assert shown(SCARA, names, names[1:]).T.tolist() == [[0.0, 1.0]]
 
 
 @pytest.mark.parametrize(

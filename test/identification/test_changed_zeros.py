@@ -218,6 +218,22 @@ def test_too_few_poses_for_a_new_frame_are_refused(earlier):
         recalibrate(previous, few, 0.1, new=new)
 
 
+@pytest.mark.parametrize('oriented', [True, False])
+@pytest.mark.parametrize('seed', [0, 3])
+def test_another_target_of_a_scara_leaves_its_device_where_it_stands(seed, oriented):
+    """Its height shows as another height of the device, which was free to go sideways too."""
+    true = faulty(SCARA, Cell(), np.random.default_rng(0))
+    previous = Calibration.of(identify(problem(true, 60, 0, oriented, SCARA)))
+    rng = np.random.default_rng(seed)
+    now = replace(true, tool=random_frame(rng, 0.2))
+    joints = SCARA.random_joints(1, rng) + rng.uniform(-0.2, 0.2, (8, 4))
+    few = Problem(SCARA, measure(now, joints, rng, *NOISE, oriented), **SIGMAS)
+    found = recalibrate(previous, few, 0.1, new=('tool',))
+    assert found.accepted
+    q = SCARA.random_joints(300, rng)
+    assert rms(found.calibration.chain, now, q) < 2.0 * rms(previous.chain, true, q)
+
+
 def test_a_device_and_a_target_far_away_ask_for_their_new_frames(earlier):
     """The remedy was to identify again."""
     true, previous, oriented = earlier
