@@ -27,7 +27,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME
 from calib_ros.kinematics.se3 import Flags, FloatArray
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import row_name, rows_in_words
+from calib_ros.shown import rows_in_words
 
 SLIPS = (0, 1, -1, 2, -2)  # rows that may be missing (benchmarks/mistakes.py loses one)
 FEWEST_ROWS = 3 * IN_A_FRAME
@@ -69,7 +69,7 @@ def row_loss(
             fitting = int(np.count_nonzero(pieced <= largest))
             if fitting >= good and _apart(tables[before], tables[after], row, largest):
                 good = fitting + 1
-                name = row_name(row, seen.stamps_ns[row])
+                name = rows_in_words([row], seen.stamps_ns)
                 where = f'from {name} on' if after else f'before {name}'
                 error = float(np.median(pieced[np.isfinite(pieced)]))
                 best = f'{where} {rows_away(after or before)}', error
@@ -128,7 +128,8 @@ def dead(chain: Chain, sets: Sets) -> Suspect | None:
 def repeating(chain: Chain, seen: Observations, largest: float) -> Suspect | None:
     """Return rows that repeat the measurement, or the joint values, of the row before them.
 
-    They miss the chain, and the other ones moved meanwhile, by more than `largest` [m].
+    They miss the chain, and the other ones moved meanwhile, by more than `largest` [m]; so do most
+    that repeat, or some of the poses measured again and again have gross errors.
     """
     if seen.socket:
         return None
@@ -142,8 +143,8 @@ def repeating(chain: Chain, seen: Observations, largest: float) -> Suspect | Non
         moved = np.linalg.norm(np.diff(others, axis=0), axis=1) > largest
         again = (np.diff(values, axis=0) == 0.0).all(axis=1)
         rows = 1 + np.flatnonzero(again & moved & far[1:])
-        if len(rows) >= LEAST_ASIDE:
-            names = rows_in_words(rows.tolist(), seen.stamps_ns.tolist())
+        if len(rows) >= max(LEAST_ASIDE, 0.5 * np.count_nonzero(again)):
+            names = rows_in_words(rows.tolist(), seen.stamps_ns)
             return Suspect(
                 f'{what} repeated in {names} while the rest moved',
                 'leave these rows out, and look why its source stood still',

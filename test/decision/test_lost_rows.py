@@ -174,3 +174,13 @@ def test_a_sag_that_looks_like_the_zero_of_a_draw_wire_is_not_taken_for_it(seed)
     seen = measure(true, tx90.random_joints(60, rng), rng, 3e-5, oriented=False)
     lengths = np.linalg.norm(seen.positions, axis=1)
     assert not zero_of_distances(fit(Problem(tx90, replace(seen, distances=lengths)))[2])
+
+
+def test_gross_errors_at_poses_measured_again_and_again_are_no_repeated_joint_values():
+    rng = np.random.default_rng(2)
+    q = np.repeat(UR10E.random_joints(25, rng), 4, axis=0)
+    seen = measure(arm(rng), q, rng, *NOISE, False)
+    seen.positions[rng.random(100) < 0.15] += 0.08
+    result = identify(Problem(UR10E, seen))
+    assert result.accepted
+    assert 'repeated' not in ' '.join(map(str, result.remarks))
