@@ -16,6 +16,7 @@ from itertools import chain, takewhile
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib_ros.errors import ConfigError
 
@@ -50,22 +51,17 @@ def of_them(count: int, what: str) -> str:
     return f'1 of them an {what}' if count == 1 else f'{count} of them {what}s'
 
 
-def row_name(number: int, stamp_ns: int) -> str:
-    """Return what a measurement, by its number from 0, is called: its line of a table, if known.
+def rows_in_words(rows: Sequence[int], stamps_ns: NDArray[np.int64]) -> str:
+    """Return measurements, by their numbers from 0, as text: line 2, or poses 3 to 5, 8.
 
-    The stamps of a table without any are its lines, in whole seconds.
+    The stamps (N,) of a table without any are its lines, in whole seconds.
     """
-    line, fraction = divmod(int(stamp_ns), 10**9)
-    return f'pose {number + 1}' if fraction or not 0 < line <= 10**6 else f'line {line}'
-
-
-def rows_in_words(rows: Sequence[int], stamps_ns: Sequence[int]) -> str:
-    """Return measurements, by their numbers from 0, as text: lines 2 to 4, 7."""
-    names = [row_name(k, stamps_ns[k]).split() for k in rows]
-    numbers = np.array([int(number) for _, number in names])
-    runs = np.split(numbers, np.flatnonzero(np.diff(rows) > 1) + 1)
+    lines, fractions = np.divmod(stamps_ns, 10**9)
+    by_line = bool(not fractions.any() and lines.min() > 0 and lines.max() <= 10**6)
+    numbers = np.take(lines, rows) if by_line else np.add(rows, 1)
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     words = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
-    return f'{names[0][0]}{"s" * (len(rows) > 1)} {", ".join(some(words))}'
+    return f'{"line" if by_line else "pose"}{"s" * (len(rows) > 1)} {", ".join(some(words))}'
 
 
 class Shown:

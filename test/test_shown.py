@@ -17,7 +17,7 @@ from calib_ros.apply.design import Design
 from calib_ros.apply.planning import plan
 from calib_ros.apply.simulation import measure
 from calib_ros.decision.reasons import Reason, Rule
-from calib_ros.shown import Shown
+from calib_ros.shown import Shown, rows_in_words
 
 CHAIN = calib_ros.load_chain('ur10e')
 JOINTS = CHAIN.random_joints(200, np.random.default_rng(1))
@@ -122,3 +122,19 @@ def test_values_are_frozen_and_those_of_arrays_equal_themselves_alone():
 def test_names_of_others_stay_text_in_html():
     robot = calib_ros.Chain('<b>arm</b>', 'standard', CHAIN.joints)
     assert '<b>' not in robot._repr_html_()
+
+
+@pytest.mark.parametrize(
+    ('stamps', 'rows', 'said'),
+    [
+        ([2, 3, 5, 6, 9], [0, 1, 2, 4], 'lines 2 to 3, 5, 9'),  # another set has line 4
+        ([10, 10.5, 11, 12], [0, 1, 3], 'poses 1 to 2, 4'),  # in simulated time
+        ([10, 10.5, 11, 12], [3], 'pose 4'),
+        ([0, 1, 2], [1], 'pose 2'),
+        ([2, 3], [1], 'line 3'),
+        ([9, 2, 3], [0, 1, 2], 'lines 9, 2 to 3'),
+    ],
+)
+def test_measurements_are_called_by_their_lines_or_numbers(stamps, rows, said):
+    stamps_ns = (1e9 * np.array(stamps)).astype(np.int64)
+    assert rows_in_words(rows, stamps_ns) == said

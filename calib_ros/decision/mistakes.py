@@ -184,7 +184,7 @@ def _of_rows(problem: Problem, chain: Chain, seen: Observations) -> Explained | 
     found = _named(problem, chain, given.sets, given, of_rows=True)
     if found is None or len(rows) == len(seen):
         return found
-    poses = rows_in_words(rows.tolist(), seen.stamps_ns.tolist())
+    poses = rows_in_words(rows.tolist(), seen.stamps_ns)
     among = f' of {len(seen)}' * poses.startswith('pose')
     alike = 'write them as the others ({} reads them)'
     named = (replace(each, remedy=alike.format(each.remedy)) for each in found.suspects)

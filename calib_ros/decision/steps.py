@@ -37,7 +37,7 @@ from calib_ros.kinematics.jacobian import ErrorModel
 from calib_ros.kinematics.parameter import Parameter, parameters_of
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.settings import EXCEPTION
-from calib_ros.shown import row_name
+from calib_ros.shown import rows_in_words
 
 FRAMES = ('base', 'tool')
 OF_THE_ARM = {'load': 'the load of the arm', 'joints': 'the zeros of several joints'}
@@ -84,12 +84,12 @@ class Step:
     @property
     def reason(self) -> Reason:
         """Return the reason to refuse a result."""
-        name = row_name(self.sample, self.stamp_ns)
-        where = name if self.image is None else f'image {self.image + 1}'
+        where = f'pose {self.sample + 1}' if self.image is None else f'image {self.image + 1}'
         where += f' of set {self.set + 1}' if self.set else ''
         when = f'stamp {1e-9 * self.stamp_ns:.3f} s'
-        if name.startswith('line'):  # instead of a clock
-            where = name if self.image is None else f'{where}, {name}'
+        line = rows_in_words([0], np.array([self.stamp_ns]))
+        if line.startswith('line'):  # instead of a clock
+            where = line if self.image is None else f'{where}, {line}'
             when = 'if rows are in the order of measurement'
         size = f'by {float(f"{1e3 * self.size:.2g}"):g} m{self.unit}'
         if self.held:

@@ -45,7 +45,7 @@ from calib_ros.kinematics.chain import Chain
 from calib_ros.kinematics.parameter import IN_A_FRAME, Parameter, parameters_of
 from calib_ros.kinematics.se3 import FloatArray, norms
 from calib_ros.settings import GROWTH
-from calib_ros.shown import row_name
+from calib_ros.shown import rows_in_words
 from calib_ros.values import require
 
 
@@ -100,7 +100,7 @@ def recalibrate(
         if others.accepted and 1e3 * np.linalg.norm(away) > OUTLIER * others.after.rms_mm:
             where = f' of set {number + 1}' if 0 < number < len(problem.sets) else ''
             held_out = 'held-out ' if number >= len(problem.sets) else ''
-            name = row_name(pose, problem.all_sets[number].stamps_ns[pose])
+            name = rows_in_words([pose], problem.all_sets[number].stamps_ns)
             return replace(found, odd=f'{held_out}{name}{where}')
     if found.unexplained <= changes.FALSE:
         if mistake := mistakes.explained_alone(problem, arm):

@@ -186,7 +186,7 @@ def causes(found: Verification) -> list[str]:
 def _apart(found: Verification) -> str:
     """Return which poses are beyond the limit while the others are within it."""
     _, first = np.unique(found.group, return_index=True)
-    names = rows_in_words(found.odd, found.stamps_ns[first].tolist())
+    names = rows_in_words(found.odd, found.stamps_ns[first])
     names += ' alone are up to' if len(found.odd) > 1 else ' alone is'
     far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
