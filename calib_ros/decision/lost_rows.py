@@ -76,7 +76,7 @@ def row_loss(
     return best
 
 
-def in_any_order(chain: Chain, seen: Observations) -> Iterator[Suspect]:
+def in_any_order(chain: Chain, seen: Observations, of_images: bool) -> Iterator[Suspect]:
     """Yield the orders of joints that fit best the distances of positions, tools being short."""
     count = len(chain.joints)
     if not 3 < count < 8 or seen.socket:
@@ -90,9 +90,10 @@ def in_any_order(chain: Chain, seen: Observations) -> Iterator[Suspect]:
     away = np.median(np.abs(np.subtract(*steps)), axis=0)
     for order in orders[np.argsort(away)[: SEVERAL * TRIED]].tolist():
         columns = ','.join(f'q{k}=q{place + 1}' for k, place in enumerate(order, 1))
+        given = [chain.joint_names[k] for k in np.argsort(order)]
         yield Suspect(
-            'the joints are in another order',
-            f'--columns {columns}',
+            f'the joint values are in the order {", ".join(given)}',
+            'correct it in --places' if of_images else f'--columns {columns}',
             (partial(_ordered, order=order),),
             3,
             published='set the order of joint_names, start without resume',

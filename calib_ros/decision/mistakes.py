@@ -226,8 +226,9 @@ def _named(
     """Return the mistakes that explain the sets best; only of what is written in each row."""
     rough, tried = [], []
     bare: Bare = {}
-    likely = suspects(chain, given.sets, _of_images(problem))
-    for each in (*likely, *in_any_order(chain, given.sets[0])):
+    of_images = _of_images(problem)
+    likely = suspects(chain, given.sets, of_images)
+    for each in (*likely, *in_any_order(chain, given.sets[0], of_images)):
         if of_rows and not each.changes:
             continue
         few = given.sets

@@ -95,6 +95,8 @@ def test_any_order_of_the_joints_is_named(name, oriented):
     columns = ','.join(f'q{k + 1}=q{place + 1}' for k, place in enumerate(back))
     assert found.suspects[0].remedy == f'--columns {columns}'
     assert len(found.suspects) == 1
+    stand = ', '.join(chain.joint_names[k] for k in order)  # the remedy of messages has no columns
+    assert found.suspects[0].what == f'the joint values are in the order {stand}'
 
 
 @pytest.mark.parametrize('part', ['measurement is', 'joint values are'])
