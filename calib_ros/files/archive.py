@@ -177,7 +177,7 @@ class Archive:
                 self.write()
             where = f'are in {self._path}, not in {self.folder}'
             if self._unsafe:
-                others = f'beside those in {before} ' if before and before.is_file() else ''
+                others = f'other than those in {before} ' if before and before.is_file() else ''
                 where = f'{others}are lost'
             words = f'poses {where}: {why}'
         if self._journal is not None:

@@ -204,7 +204,7 @@ def test_what_the_folder_does_not_take_is_kept_elsewhere_at_the_end(tmp_path, mo
     journal = archive.journal
     with full_disk(journal.stat().st_size):
         archive.add(sample(5))
-        assert archive.close().startswith(f'poses beside those in {journal} are lost: ')
+        assert archive.close().startswith(f'poses other than those in {journal} are lost: ')
 
 
 def test_what_waits_for_room_is_not_lost_by_a_clear(tmp_path):
