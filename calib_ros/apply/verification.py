@@ -91,8 +91,6 @@ class Verification(Shown):
     """Of the interval."""
     group: Index
     """(N,) configuration of each measurement; `configurations` counts them."""
-    stamps_ns: Index
-    """(N,) of each measurement; lines of a table without stamps."""
     rms: float
     lower: float
     upper: float
@@ -152,9 +150,10 @@ def verify(
 ) -> Verification:
     """Judge a calibrated arm on measurements that were not used for it.
 
-    `sets` are new poses or positions, in the frames of the calibration. Without a `tolerance`, the
-    largest acceptable RMS position error [m], the verdict is whether the calibration holds: the
-    limit is then `Calibration.limit`. `confidence` is that of the interval. `progress`: the share.
+    `sets` are new measurements of poses or positions, in the frames of the calibration. Without a
+    `tolerance`, the largest acceptable RMS position error [m], the verdict is whether the
+    calibration holds: the limit is then `Calibration.limit`. `confidence` is that of the interval;
+    `progress` receives the share done.
 
     With `new_base` the measuring device was moved, with `new_tool` the target was replaced or
     remounted. Their frames are fitted, and absorb the errors of as many configurations, of three
@@ -184,7 +183,6 @@ def verify(
         limit=limit,
         confidence=confidence,
         group=group,
-        stamps_ns=np.concatenate([each.stamps_ns for each in sets]),
         rms=rms,
         lower=float(lower[0]),
         upper=float(upper[0]),

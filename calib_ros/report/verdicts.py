@@ -22,7 +22,7 @@ from calib_ros.report.page import Headline, Origin, Report, Section, section
 from calib_ros.report.poses import Poses
 from calib_ros.report.words import interval_mm
 from calib_ros.settings import Settings
-from calib_ros.shown import rounded, rows_in_words, sentence
+from calib_ros.shown import rounded, sentence, some
 
 SOMETHING_MOVED = (
     'Check that measuring device, target and robot have not moved since the calibration; if one '
@@ -185,9 +185,12 @@ def causes(found: Verification) -> list[str]:
 
 def _apart(found: Verification) -> str:
     """Return which poses are beyond the limit while the others are within it."""
-    _, first = np.unique(found.group, return_index=True)
-    names = rows_in_words(found.odd, found.stamps_ns[first])
-    names += ' alone are up to' if len(found.odd) > 1 else ' alone is'
+    first, last = found.odd[0] + 1, found.odd[-1] + 1
+    names = f'poses {", ".join(some([str(k + 1) for k in found.odd]))} alone are up to'
+    if first == last:
+        names = f'pose {first} alone is'
+    elif last - first < len(found.odd):
+        names = f'poses {first} to {last} alone are up to'
     far = 1e3 * norms(found.comparison.after.position[np.isin(found.group, found.odd)]).max()
     return (
         f'{names} {rounded(far)} mm off; the others are within the limit: measure again; if the '

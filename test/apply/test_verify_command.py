@@ -121,15 +121,15 @@ def test_a_gross_error_is_named_although_the_others_leave_the_verdict_open(arm):
     errors[7] += [0.0, 0.01, 0.0]
     text = in_words(found := verify(arm, [with_errors(arm, errors)], 1e-4))
     assert (found.verdict, found.odd) == ('FAIL', (7,))
-    assert 'line 8 alone is ' in text
+    assert 'pose 8 alone is ' in text
 
 
 @pytest.mark.parametrize(
     ('bad', 'size', 'words'),
     [
-        ([3, 17, 30], 1e-2, 'lines 4, 18, 31 alone are up to 1'),
-        (np.s_[25:], 2e-4, 'lines 26 to 40 alone are up to'),
-        (np.s_[:12], 2e-4, 'lines 1 to 12 alone are up to'),
+        ([3, 17, 30], 1e-2, 'poses 4, 18, 31 alone are up to 1'),
+        (np.s_[25:], 2e-4, 'poses 26 to 40 alone are up to'),
+        (np.s_[:12], 2e-4, 'poses 1 to 12 alone are up to'),
         (np.s_[::2], 2e-4, ''),
     ],
 )
@@ -161,7 +161,7 @@ def test_what_moved_while_poses_were_measured_is_named(cell, arm, moved, words, 
     assert found.verdict == 'FAIL'
     assert f'something moved while you measured: {words}' in text
     assert ' before line 11 ' in text
-    assert 'lines 11 to 24 alone are up to ' in text
+    assert 'poses 11 to 24 alone are up to ' in text
     text = in_words(verify(arm, [then], 2e-4))  # before the first pose
     assert 'something moved' not in text
 
