@@ -205,7 +205,7 @@ def test_a_named_cause_is_the_next_step_and_said_once(cell, arm):
     gross = seen.positions + 0.03 * (np.arange(20)[:, np.newaxis] == 7)
     turned = measured(cell[0].with_offsets({'elbow_joint.theta': 0.003}), seen.joints[::3], 3)
     for changed, first in (
-        (replace(seen, positions=gross), 'Line 8 alone is'),
+        (replace(seen, positions=gross), 'Pose 8 alone is'),
         (replace(seen, positions=seen.positions + 0.003), 'One common shift and turn'),
         (turned, 'Check that measuring device'),
     ):
