@@ -162,7 +162,7 @@ class Normal:
         products[:, -1, -1] = products[:, -1] @ along
         moved = self.matrix @ step
         cost = self.cost + float(step @ (moved - 2.0 * self.gradient))
-        return Normal(self.matrix, self.gradient - moved, cost, products)
+        return Normal(self.matrix, self.gradient - moved, max(cost, 0.0), products)  # by rounding
 
     def factor(self) -> FloatArray | None:
         """Return R (P, P) with R^T R = H; None if H has lost too many digits."""

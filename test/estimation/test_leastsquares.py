@@ -16,6 +16,7 @@ from calib_ros.estimation import leastsquares
 from calib_ros.estimation.identifiability import structurally_independent
 from calib_ros.estimation.leastsquares import (
     SEPARATION_SIGMA,
+    Normal,
     Prior,
     System,
     factor_of_some,
@@ -240,6 +241,12 @@ def test_equations_after_a_step_are_those_of_the_moved_chain():
     found = normal_equations(start.with_offsets(step), [*step], system)
     for name in ('matrix', 'gradient', 'cost', 'products'):
         np.testing.assert_allclose(getattr(after, name), getattr(found, name), rtol=1e-9)
+
+
+def test_a_step_that_explains_all_leaves_no_negative_cost():
+    """By rounding, as of a device that was moved by metres; its root was not a number."""
+    nearly = np.nextafter(1.0, 0.0)
+    assert Normal(np.eye(1), np.ones(1), nearly, np.zeros((2, 2, 2))).after(np.ones(1)).cost == 0.0
 
 
 @pytest.mark.parametrize('seed', range(6))
