@@ -57,7 +57,7 @@ def rows_in_words(rows: Sequence[int], stamps_ns: NDArray[np.int64]) -> str:
     The stamps (N,) of a table without any are its lines, in whole seconds.
     """
     lines, fractions = np.divmod(stamps_ns, 10**9)
-    by_line = bool(not fractions.any() and lines.min() > 0 and lines.max() <= 10**6)
+    by_line = bool(not fractions.any() and lines.min() > 0 and lines.max() < 10**6)
     numbers = np.take(lines, rows) if by_line else np.add(rows, 1)
     runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     words = [' to '.join(map(str, dict.fromkeys((run[0], run[-1])))) for run in runs]
