@@ -183,7 +183,7 @@ class Cell:
         """Return a publisher that somebody listens to."""
         key = topic, reliability
         if key not in self._publishers:
-            qos = QoSProfile(depth=1000, reliability=reliability)
+            qos = QoSProfile(depth=10_000, reliability=reliability)  # a child may be slow
             publisher = self.peer.create_publisher(kind, topic, qos)
             self.spin_until(lambda: publisher.get_subscription_count() > 0)
             self._publishers[key] = publisher
