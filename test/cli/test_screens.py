@@ -307,8 +307,7 @@ def test_a_warning_goes_above_the_bar(monkeypatch):
     monkeypatch.setenv('TERM', 'xterm-256color')
     monkeypatch.setattr(screen, 'FIRST_S', 1e-4)
     monkeypatch.setattr(sys, 'stderr', Terminal())
-    made = screen.Screen()
-    end = time.monotonic() + 60
+    made, end = screen.Screen(), time.monotonic() + 60
     with made.work('counting'):
         while 'counting' not in sys.stderr.getvalue():
             assert time.monotonic() < end, 'no bar'
