@@ -158,7 +158,7 @@ class Information(Shown):
 
     def mean(self, root: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return posterior mean (P,) and covariance (P, P) with the prior N(0, root root^T)."""
-        values, axes = linalg.eigh(np.eye(root.shape[1]) + root.T @ self.matrix @ root)
+        values, axes = np.linalg.eigh(np.eye(root.shape[1]) + root.T @ self.matrix @ root)
         # less than one only by rounding, of poses far away
         left = (root @ (axes / np.sqrt(np.maximum(values, 1.0)))).T
         return left.T @ (left @ self.vector), left.T @ left
