@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages of reports in a real Chromium: what a reader sees and can do."""
 
+import json
 import os
 import re
 from dataclasses import replace
@@ -112,6 +113,15 @@ def wide(chromium, result):
     seen.drawn()
     yield seen
     seen.end()
+
+
+def test_the_numbers_are_those_of_the_result(wide, result):
+    document = json.loads((result / 'result.json').read_text())
+    text = wide.page.inner_text('main')
+    for when in ('before', 'after'):
+        assert f'{document["validation"][when]["rms_mm"]:.3f} mm (' in text
+        for name in ('rms_mm', 'mean_mm', 'max_mm', 'mean_plus_3_sigma_mm', 'rms_mrad'):
+            assert f'{document["validation"][when][name]:.3f}' in text
 
 
 def test_all_text_can_be_read(wide):
@@ -260,8 +270,8 @@ def test_the_first_printed_page_is_the_certificate(wide):
     assert height < 1016
 
 
-WIDTHS = """[...document.querySelectorAll('.plot')].filter((e) => e.checkVisibility())
-    .map((e) => e.querySelector('.main-svg').getBoundingClientRect().right)"""
+WIDTHS = """[...document.querySelectorAll('div.plot')].filter((e) => e.checkVisibility())
+    .map((e) => e.querySelector('.main-svg')?.getBoundingClientRect().right ?? 0)"""
 
 
 def printed_widths(page):
@@ -290,15 +300,13 @@ def test_a_printed_fleet_is_whole(chromium, tmp_path):
     plant = plants.write_plant(tmp_path, ['0042'], 2, poses=12)
     out = tmp_path / 'out'
     main(['fleet', str(plant), '--history', str(tmp_path / 'history'), '--out', str(out)])
-    page = chromium.new_page()
-    page.goto((out / 'index.html').as_uri())
-    page.set_viewport_size({'width': 1280, 'height': 800})
-    assert max(page.evaluate(WIDTHS)) > 700
-    printed = printed_widths(page)
+    seen = Seen(chromium, out / 'index.html', 1280)
+    seen.page.wait_for_function(f'Math.max(...{WIDTHS}) > 700')
+    printed = printed_widths(seen.page)
     assert len(printed) == 2
     assert max(printed) <= 688
-    assert 'RMS of 0042' in page.inner_text('#nights')  # its choice is not printed
-    page.close()
+    assert 'RMS of 0042' in seen.page.inner_text('#nights')  # its choice is not printed
+    seen.page.close()
 
 
 def test_many_refused_poses_on_a_telephone(chromium, tmp_path, monkeypatch):
