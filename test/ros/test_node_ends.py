@@ -172,14 +172,26 @@ def test_a_full_disk(tmp_path, recording):
     with cell_and_child(data_dir=tmp_path) as (cell, child):
         heard = cell.listen(DiagnosticArray, '/diagnostics', 10)
         status = cell.listen(String, '/calibration_node/status')
-        cell.play(part(recording, 0.0, 6.0))
+        count = 0
+
+        def play(begin, end):  # a second at a time: else joint states may overtake poses by more
+            nonlocal count
+            for second in range(begin, end):
+                streams = part(recording, second, second + 1.0)
+                cell.play(streams)
+                count += sum(isinstance(m, JointState) for each in streams.values() for m in each)
+                cell.spin_until(
+                    lambda n=count: heard and int(values_of(heard[-1])['joint states']) >= n
+                )
+
+        play(0, 6)
         cell.spin_until(lambda: begun(tmp_path))
         cell.spin_until(lambda: len(samples_in(tmp_path)) == 4)
         (path,) = tmp_path.glob('*Z.csv')
         _, hard = resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE)
         full = path.stat().st_size + 100  # there is room for a part of the next row
         resource.prlimit(child.process.pid, resource.RLIMIT_FSIZE, (full, hard))
-        cell.play(part(recording, 6.0, 24.0))
+        play(6, 24)
 
         def level(wanted, said):
             cell.spin_until(lambda: heard and heard[-1].status[0].level == wanted)
