@@ -250,7 +250,7 @@ def likelier(
     tried = [given]
     tried += [list(some) for k in range(2, SEVERAL + 1) for some in combinations(single, k)]
     tried += [[columns.zeros]] * (len(single) > SEVERAL)  # of fewer all are among these
-
+    # a link with parts of the next joint is the same link
     choices = sum(owner in (LOAD, own[-1].owner) for owner, own in columns.sets)
 
     def likely(causes: Sequence[Sequence[Parameter]]) -> float:
