@@ -33,9 +33,8 @@ from calib_ros.decision.reasons import Rule
 from calib_ros.errors import CalibrationError
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
-from calib_ros.sampling.message_filter import Part
-from calib_ros.sampling.messages import Readings
 from calib_ros.sampling.session import CalibrationSession
+from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
@@ -97,8 +96,8 @@ class Session:
         names = ('', *session.joint_names)
         session.take(
             [
-                Part(first, None, Readings(nanoseconds(self.joint_stamps), names, self.joints)),
-                Part(second, Source('pose'), Readings(nanoseconds(self.stamps), ('d',), rows)),
+                Part(first, None, names, nanoseconds(self.joint_stamps), self.joints),
+                Part(second, Source('pose'), ('d',), nanoseconds(self.stamps), rows),
             ]
         )
         session.finish()

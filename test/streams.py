@@ -8,8 +8,8 @@ import numpy as np
 
 from calib_ros.kinematics import se3
 from calib_ros.sampling.batches import Stream, feed
-from calib_ros.sampling.message_filter import Part
-from calib_ros.sampling.messages import JOINT_STATE, Readings
+from calib_ros.sampling.messages import JOINT_STATE
+from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
 
 MS = 1_000_000
@@ -41,10 +41,9 @@ def hear(session, joints, measured):
     places[np.argsort(np.concatenate([came, seen]), kind='stable')] = np.arange(len(places))
     if rotations is not None:
         positions = np.hstack([positions, se3.to_quat(rotations)])
-    named = Readings(joint_stamps, ('', *session.joint_names), values)
-    poses = Readings(seen_stamps, ('tracker',), positions)
     first, second = np.split(places, [len(came)])
-    session.take([Part(first, None, named), Part(second, TRACKER, poses)])
+    named = Part(first, None, ('', *session.joint_names), joint_stamps, values)
+    session.take([named, Part(second, TRACKER, ('tracker',), seen_stamps, positions)])
 
 
 def header(stamp_ns, frame_id='tracker'):

@@ -19,7 +19,8 @@ from calib_ros.files.vocabulary import COVARIANCE
 from calib_ros.kinematics.chain import Chain, Joint
 from calib_ros.kinematics.chain_file import load_chain, parse_chain
 from calib_ros.kinematics.urdf import chain_from_urdf
-from calib_ros.sampling.messages import Readings, usable
+from calib_ros.sampling.message_filter import usable
+from calib_ros.sampling.slices import Part
 from calib_ros.texts import LARGEST_TABLE, parse_yaml
 
 ARM = Chain('arm', 'standard', (Joint('a', alpha=1.5, d=0.3), Joint('b', a=0.4)))
@@ -170,7 +171,7 @@ def test_a_camera_with_a_covariance_of_the_position_alone(tmp_path):
 def fault(covariance):
     """Return why a measured pose with a covariance cannot be used."""
     row = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *np.ravel(covariance)])
-    return usable('', Readings(np.array([1]), ('tracker',), row[np.newaxis]))[1]
+    return usable(Part(np.zeros(1), None, ('tracker',), np.array([1]), row[np.newaxis]))[1]
 
 
 @pytest.mark.parametrize(

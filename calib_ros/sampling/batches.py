@@ -17,9 +17,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from calib_ros.kinematics.se3 import FloatArray, Index
+from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import alike, read_header
-from calib_ros.sampling.message_filter import Part
 from calib_ros.sampling.messages import (
     CAMERA_INFO,
     JOINT_STATE,
@@ -28,14 +27,13 @@ from calib_ros.sampling.messages import (
     TRANSFORMS,
     MessageError,
     Reading,
-    Readings,
     frame_name,
     head_of,
     readings_of,
 )
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.session import CalibrationSession
-from calib_ros.sampling.slices import JOINTS, POSES
+from calib_ros.sampling.slices import JOINTS, POSES, Part
 from calib_ros.sampling.sources import Source
 from calib_ros.sampling.transforms import STATIC, Links
 from calib_ros.texts import LARGEST_TABLE
@@ -137,11 +135,9 @@ def decode(
     parts: list[Part] = []
     problems: list[str] = []
     linked: dict[Links, tuple[list[Part], list[Part]]] = {}  # moving and still ones
-    for stream, places, found in _read(batch, deserialise, pictures, miss, problems):
-        names = found.strings
-        if stream.type != JOINT_STATE and any(name[:1] == '/' for name in names):
-            found = found._replace(strings=tuple(map(frame_name, names)))
-        part = Part(places, stream.source, found)
+    for stream, part in _read(batch, deserialise, pictures, miss, problems):
+        if stream.type != JOINT_STATE and any(name[:1] == '/' for name in part.strings):
+            part = part._replace(strings=tuple(map(frame_name, part.strings)))
         if stream.links is None:
             parts.append(part)
         else:
@@ -160,8 +156,8 @@ def _read(
     pictures: Pictures | None,
     miss: Callable[[str, int, str], None],
     problems: list[str],
-) -> Iterator[tuple[Stream, Index, Readings]]:
-    """Yield readings with the same names, and the places (N,) of their messages."""
+) -> Iterator[tuple[Stream, Part]]:
+    """Yield messages with the same names, and their stream."""
     single: list[int] = []
     groups: dict[tuple[str, int], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
@@ -172,11 +168,10 @@ def _read(
         stream, places = batch[group[0]][0], np.array(group)
         left = np.ones(len(places), dtype=bool)
         known = {} if stream.links is None else stream.links.layouts
-        for some in alike(stream.type, [batch[place][1] for place in group], known):
-            left[some.which] = False
-            read = places[some.which]
-            for part in some.readings():
-                yield stream, read, part
+        blobs = [batch[place][1] for place in group]
+        for which, names, stamps, numbers in alike(stream.type, blobs, known):
+            left[which] = False
+            yield stream, Part(places[which], stream.source, names, stamps, numbers)
         single += places[left].tolist()
     rows: dict[tuple[Stream, tuple[str, ...], int], list[tuple[int, int, FloatArray]]] = {}
     for place in sorted(single):
@@ -196,9 +191,8 @@ def _read(
             for stamp, names, row in held:
                 rows.setdefault((stream, names, len(row)), []).append((place, stamp, row))
     for (stream, names, _), same in rows.items():
-        where, stamps, numbers = zip(*same, strict=True)
-        readings = Readings(np.array(stamps, dtype=np.int64), names, np.array(numbers))
-        yield stream, np.array(where), readings
+        places, stamps, numbers = map(np.array, zip(*same, strict=True))
+        yield stream, Part(places, stream.source, names, stamps, numbers)
 
 
 def _kept(

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib_ros.kinematics.se3 import Flags, Index
-from calib_ros.sampling.messages import JOINT_STATE, TRANSFORM, TRANSFORMS, Readings
+from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.messages import JOINT_STATE, TRANSFORM, TRANSFORMS
+from calib_ros.sampling.slices import Stamps
 from calib_ros.values import MOST_NAMES
 
 LITTLE_ENDIAN = b'\x00\x01'
@@ -63,43 +64,39 @@ class MessageLayout:
         equal[equal] = ~((rows[equal, part] ^ self.text[part]) & self.mask[part]).any(axis=1)
         return np.asarray(equal)
 
-
-@dataclass(frozen=True, eq=False)
-class Alike:
-    """Messages of one layout: their indices in a batch, and their bytes (N, ...)."""
-
-    layout: MessageLayout
-    which: Index
-    rows: NDArray[np.uint8]
-
-    def readings(self) -> Iterator[Readings]:
-        """Yield the readings of each part."""
-        layout, length = self.layout, self.rows.shape[1] - _HEAD
-        whole = slice(_HEAD, _HEAD + length - length % int(layout.kind[2:]))
-        words = np.ascontiguousarray(self.rows[:, whole]).view('<i4')
-        times = words.take(layout.stamps, axis=1)  # nanoseconds are without sign
+    def read(
+        self, rows: NDArray[np.uint8]
+    ) -> Iterator[tuple[tuple[str, ...], Stamps, FloatArray]]:
+        """Yield the strings, stamps (N,) and numbers (N, w) of each part of messages (N, ...)."""
+        length = rows.shape[1] - _HEAD
+        whole = slice(_HEAD, _HEAD + length - length % int(self.kind[2:]))
+        words = np.ascontiguousarray(rows[:, whole]).view('<i4')
+        times = words.take(self.stamps, axis=1)  # nanoseconds are without sign
         stamps = times[..., 0].astype(np.int64) * 1_000_000_000 + times.view('<u4')[..., 1]
-        numbers = words.view(layout.kind).take(layout.numbers, axis=1).astype(float, copy=False)
-        for k, strings in enumerate(layout.strings):
-            yield Readings(stamps[:, k], strings, numbers[:, k])
+        numbers = words.view(self.kind).take(self.numbers, axis=1).astype(float, copy=False)
+        for k, strings in enumerate(self.strings):
+            yield strings, stamps[:, k], numbers[:, k]
 
 
-def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]) -> list[Alike]:
-    """Return messages of one type and length grouped by layout, without those that have none.
+def alike(
+    kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout]]
+) -> Iterator[tuple[Index, tuple[str, ...], Stamps, FloatArray]]:
+    """Yield what messages of one type and length hold, those of each layout at once.
 
-    Layouts `known` by message length are reused, and new ones added, up to MOST_NAMES.
+    Their indices (N,), the strings, stamps (N,) and numbers (N, w) of a part; those without a
+    layout are left out. Layouts `known` by message length are reused, and new ones added, up to
+    MOST_NAMES.
     """
     length = len(blobs[0])
     if length < _HEAD or kind not in _FORMS:
-        return []
+        return
     rows = np.frombuffer(b''.join(blobs), dtype=np.uint8).reshape(len(blobs), length)
     rest = np.flatnonzero((rows[:, :2] == tuple(LITTLE_ENDIAN)).all(axis=1))
     if len(known) == MOST_NAMES:
         known.clear()
     layouts = known.setdefault(length, [])
-    untried = list(layouts)
-    found: list[Alike] = []
-    while len(rest) and len(found) < MOST_NAMES:
+    untried, found = list(layouts), 0
+    while len(rest) and found < MOST_NAMES:
         if untried:
             layout = untried.pop(0)
         else:
@@ -114,9 +111,10 @@ def alike(kind: str, blobs: Sequence[bytes], known: dict[int, list[MessageLayout
         left = rows if len(rest) == len(rows) else rows[rest]
         equal = layout.among(left)
         if equal.any():
-            found.append(Alike(layout, rest[equal], left if equal.all() else left[equal]))
+            found += 1
+            for part in layout.read(left if equal.all() else left[equal]):
+                yield rest[equal], *part
         rest = rest[~equal]
-    return found
 
 
 def _layout(kind: str, blob: bytes) -> MessageLayout:

@@ -6,20 +6,27 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from calib_ros.estimation.configurations import STILL
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
 from calib_ros.sampling.hints import Hint
-from calib_ros.sampling.messages import JOINT_STATE, PICTURES, Readings, usable
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, JointIndices, Piece, StreamKey
-from calib_ros.sampling.sources import Source
+from calib_ros.sampling.slices import (
+    JOINTS,
+    NO_ACCIDENT,
+    POSES,
+    JointIndices,
+    Part,
+    Piece,
+    StreamKey,
+)
 from calib_ros.settings import EXCEPTION
-from calib_ros.values import MOST_NAMES
+from calib_ros.values import LARGEST, MOST_NAMES, ROUNDED, covariance_faults
 
 OTHERS = 'none of the joints in the message'
+NO_STAMP = 'zero stamp (fill header.stamp where it is published)'
+NOT_UNIT = 'quaternion not of length 1 (normalise it where it is published)'
 NOWHERE = -1  # column of a joint that needs no name
 
 
@@ -159,23 +166,48 @@ class FrameNames:
         return ()
 
 
-class Part(NamedTuple):
-    """Readings of one stream and their places (N,) in a batch; source None for joints."""
+def usable(found: Part, joints: bool = False) -> tuple[Flags, Counter[str]]:
+    """Return which messages (N,) can be used, of joints or measurements, and why others not."""
+    numbers, causes = found.numbers, Counter[str]()
+    good = np.ones(len(numbers), dtype=bool)
 
-    places: Index
-    source: Source | None
-    readings: Readings
+    def refuse(wrong: np.bool_ | Flags, cause: str) -> None:
+        count = int((good & wrong).sum())
+        if count:
+            causes[cause] += count
+            good[wrong] = False
 
-    @property
-    def type(self) -> str:
-        """Return what tells kinds of numbers apart (`usable`)."""
-        if self.source is None:
-            return JOINT_STATE
-        return PICTURES[0] if self.source.board else ''
-
-    def rows(self, which: Flags | slice) -> Part:
-        """Return some readings, by a mask (N,) or a slice."""
-        return Part(self.places[which], self.source, self.readings.rows(which))
+    refuse(found.stamps <= 0, NO_STAMP)
+    if joints:
+        size = np.abs(numbers).max(axis=1)
+        refuse(~np.isfinite(size), 'NaN or infinite joint value')
+        refuse(size > LARGEST, 'joint value beyond 1e6')
+        return good, causes
+    if found.source and found.source.board:
+        return good, causes
+    width = numbers.shape[1]
+    if width == 1:
+        far = numbers[:, 0]
+        refuse(~((far > 0.0) & (far < np.inf)), 'distance not a positive number')
+        refuse(far > LARGEST, 'distance beyond 1000 km')
+    else:
+        at = numbers[:, :3]
+        refuse(~np.isfinite(at).all(axis=1), 'NaN or infinite position')
+        refuse((np.abs(at) > LARGEST).any(axis=1), 'position beyond 1000 km')
+    if width >= 7:
+        with np.errstate(over='ignore'):  # refused anyway
+            length = np.sqrt((numbers[:, 3:7] ** 2).sum(axis=1))
+        refuse(~(np.abs(length - 1.0) <= ROUNDED), NOT_UNIT)
+    if width > 7:
+        rows = numbers[:, 7:]
+        fresh = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))  # most devices repeat one
+        faults = covariance_faults(rows[fresh].reshape(-1, 6, 6))[np.cumsum(fresh) - 1]
+        for fault in dict.fromkeys(faults.tolist()):
+            if fault:
+                refuse(faults == fault, f'{fault} (leave it zero if it is not known)')
+    if not found.child.isprintable():  # it is written to tables
+        refuse(good.copy(), 'child frame whose name cannot be printed')
+    return good, causes
 
 
 class MessageFilter:
@@ -204,14 +236,15 @@ class MessageFilter:
             self.refused[kind] = cause
 
     def _usable(self, part: Part) -> Part:
-        good, causes = usable(part.type, part.readings)
+        good, causes = usable(part, joints=part.source is None)
         for cause, count in causes.items():
             self.miss(POSES if part.source else JOINTS, count, cause)
         return part if good.all() else part.rows(good)
 
     def _joints(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
         latest = -1
-        for places, _, (stamps, (_, *names), numbers) in parts:
+        for part in parts:
+            places, _, (_, *names), stamps, numbers = part
             self._names.hear(names, numbers)
             columns, index, fault = self._names.layout(names)
             if fault:
@@ -220,8 +253,7 @@ class MessageFilter:
             values = numbers[:, index]
             for place in np.flatnonzero(index == NOWHERE):
                 values[:, place] = self._names.held[columns[place]]
-            part = self._usable(Part(places, None, Readings(stamps, (), values)))
-            places, _, (stamps, _, values) = part
+            places, *_, stamps, values = self._usable(part._replace(numbers=values))
             if not len(stamps):
                 continue
             self.received[JOINTS] += len(stamps)
@@ -235,9 +267,10 @@ class MessageFilter:
                 self.unused['joints: not recording'] += len(stamps)
 
     def _measured(self, parts: Sequence[Part], recording: bool) -> Iterator[Piece]:
-        for places, source, readings in self._by_frame(parts):
+        for part in self._by_frame(parts):
+            places, source, (frame_id, *_), stamps, numbers = part
             assert source is not None
-            count, frame_id = len(places), readings.strings[0]
+            count = len(places)
             self.received[POSES] += count
             self.refused.pop(POSES, None)
             if not recording:
@@ -246,14 +279,14 @@ class MessageFilter:
                 self.dropped[f'{POSES}: {fault}'] += count
                 self.refused[POSES] = fault
             else:
-                width = readings.numbers.shape[1]
+                width = numbers.shape[1]
                 if width > 7:  # a covariance of zeros means none
-                    none = ~readings.numbers[:, 7:].any(axis=1)
-                    readings.numbers[none, 7:] = np.nan
-                target, board = source.target or readings.child, bool(source.board)
+                    none = ~numbers[:, 7:].any(axis=1)
+                    numbers[none, 7:] = np.nan
+                target, board = source.target or part.child, bool(source.board)
                 kind = source.validation, width == 1 and not board, source.eye_in_hand
                 key = StreamKey(source.device, target, *kind, frame_id, board)
-                yield Piece(key, places, readings.stamps_ns, readings.numbers)
+                yield Piece(key, places, stamps, numbers)
 
     def _by_frame(self, parts: Sequence[Part]) -> list[Part]:
         """Return measurements one by one until the one of several frames is decided."""
@@ -261,7 +294,7 @@ class MessageFilter:
         deciding = False
         for each in parts:
             assert each.source is not None
-            device, frame_id = each.source.device, each.readings.strings[0]
+            device, frame_id = each.source.device, each.strings[0]
             deciding = deciding or self._frames.decides(device, frame_id)
             if device not in self._frames.usual:
                 frames.setdefault(device, set()).add(frame_id)

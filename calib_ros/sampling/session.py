@@ -24,12 +24,12 @@ from calib_ros.sampling.dataset import Dataset, check_settings, collect, dataset
 from calib_ros.sampling.delay import Delay
 from calib_ros.sampling.hints import Hint, frozen, losses, progress, refocused, unheard, unseen
 from calib_ros.sampling.live import Estimate, LiveEstimate
-from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter, Part
+from calib_ros.sampling.message_filter import FrameNames, JointNames, MessageFilter
 from calib_ros.sampling.messages import frame_name
 from calib_ros.sampling.pictures import Pictures
 from calib_ros.sampling.pipeline import Pipeline
 from calib_ros.sampling.sample import Frames, Sample, named, socket_place
-from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES
+from calib_ros.sampling.slices import JOINTS, NO_ACCIDENT, POSES, Part
 from calib_ros.settings import Settings
 from calib_ros.shown import some
 from calib_ros.values import require

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib_ros.estimation.levels import CONFIDENT
 from calib_ros.kinematics.se3 import Flags, FloatArray, Index
+from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 
 Stamps: TypeAlias = NDArray[np.int64]
@@ -25,6 +26,32 @@ NO_ACCIDENT = round(1.0 / (1.0 - CONFIDENT))
 """Number of differing messages that cannot be chance."""
 SILENCE = 5.0 * Settings.lateness
 """Silence [s] after which an active joint or topic is reported."""
+
+
+class Part(NamedTuple):
+    """Messages of one source with the same names, their places (N,) in a batch and stamps (N,).
+
+    The source is None for joint states and transforms. `strings` are frame and child frame (if
+    any) of a measurement, or the frame and the joint names. `numbers` (N, w) are joint values [rad
+    or m]; or a distance [m] (w = 1), a position [m] (3), a pose with its quaternion x y z w (7),
+    or a pose and a covariance row by row (43); of an image its number (1).
+    """
+
+    places: Index
+    source: Source | None
+    strings: tuple[str, ...]
+    stamps: Stamps
+    numbers: FloatArray
+
+    @property
+    def child(self) -> str:
+        """Return the child frame of a measurement, or empty text."""
+        return self.strings[1] if len(self.strings) > 1 else ''
+
+    def rows(self, which: Flags | slice) -> Part:
+        """Return some messages, by a mask (N,) or a slice."""
+        places, source, strings, stamps, numbers = self
+        return Part(places[which], source, strings, stamps[which], numbers[which])
 
 
 class StreamKey(NamedTuple):

@@ -22,8 +22,9 @@ from calib_ros.errors import MOST_ENTRIES
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.se3 import FloatArray
 from calib_ros.sampling.cdr import MessageLayout
-from calib_ros.sampling.message_filter import Part
-from calib_ros.sampling.messages import TRANSFORM, TRANSFORMS, Readings, short_type, usable
+from calib_ros.sampling.message_filter import usable
+from calib_ros.sampling.messages import TRANSFORMS, short_type
+from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
 from calib_ros.settings import Settings
 from calib_ros.shown import LISTED, some
@@ -75,7 +76,7 @@ class Links:
         self._parents = defaultdict[str, list[Pair]](list)  # links by child frame
         self._known = False  # whether the routes are up to date
         self.layouts: dict[int, list[MessageLayout]] = {}  # layouts by message length
-        self._held: deque[Readings] = deque()
+        self._held: deque[Part] = deque()
         self._let_go: Counter[Pair] = Counter()
 
     def take(
@@ -87,41 +88,41 @@ class Links:
         between their frames are unknown.
         """
         for each in still:
-            self._fix(each.readings)
+            self._fix(each)
         for each in moving:
-            self._move(each.readings)
+            self._move(each)
         open_before = {source for source, route in self._routes.items() if route == ''}
         self._update()
         first, faults = min(int(each.places[0]) for each in (*moving, *still)), Counter[str]()
         found = [
-            Part(np.full(len(waited.stamps_ns), first), s, self._reading(s, route, waited))
+            self._measured(s, route, waited)._replace(places=np.full(len(waited.places), first))
             for waited in self._held
             for s, route in self._of(waited.strings)
             if s in open_before
         ]
         is_open = '' in self._routes.values()  # frames of a source are not linked yet
-        for places, _, readings in moving:
-            measured = self._of(readings.strings)
+        for part in moving:
+            measured = self._of(part.strings)
             if not (is_open or measured):
                 continue
-            good, causes = usable(TRANSFORM, readings)
-            places, read = places[good], readings.rows(good)
+            good, causes = usable(part)
+            read = part.rows(good)
             faults += Counter({cause: n * len(measured) for cause, n in causes.items()})
             self._held.append(read)
-            found += [Part(places, s, self._reading(s, route, read)) for s, route in measured]
+            found += [self._measured(s, route, read) for s, route in measured]
         if not is_open:
             lost_count = sum(n * len(self._of(link)) for link, n in self._let_go.items())
             faults += Counter({'buffer full before their frames were linked': lost_count})
             self._let_go.clear()
             self._held.clear()
-        while sum(len(waiting.stamps_ns) for waiting in self._held) > Settings.pose_buffer:
+        while sum(len(waiting.places) for waiting in self._held) > Settings.pose_buffer:
             lost = self._held.popleft()
-            self._let_go[lost.strings] += len(lost.stamps_ns)
+            self._let_go[lost.strings] += len(lost.places)
         return found, faults
 
-    def _fix(self, come: Readings) -> None:
-        link, stampless = come.strings, come._replace(stamps_ns=np.ones_like(come.stamps_ns))
-        good, _ = usable(TRANSFORM, stampless)
+    def _fix(self, come: Part) -> None:
+        link = come.strings
+        good, _ = usable(come._replace(stamps=np.ones_like(come.stamps)))  # they have none
         for numbers in come.numbers[good]:
             matrix = se3.transform(se3.from_quat(numbers[3:]), numbers[:3])
             before = self._fixed.setdefault(link, matrix)
@@ -129,8 +130,8 @@ class Links:
                 self._changed.add(link)
             self._known = False
 
-    def _move(self, come: Readings) -> None:
-        link, first_ns, last_ns = come.strings, int(come.stamps_ns[0]), int(come.stamps_ns[-1])
+    def _move(self, come: Part) -> None:
+        link, first_ns, last_ns = come.strings, int(come.stamps[0]), int(come.stamps[-1])
         if link not in self._moving:
             if len(self._moving) == MOST_ENTRIES:  # a tracker may number its markers without end
                 self._update()
@@ -140,7 +141,7 @@ class Links:
             self._moving[link] = Seen(0, first_ns, last_ns)
             self._known = False
         seen = self._moving[link]
-        seen.count += len(come.stamps_ns)
+        seen.count += len(come.places)
         seen.first_ns, seen.last_ns = min(seen.first_ns, first_ns), max(seen.last_ns, last_ns)
 
     def problems(self) -> list[str]:
@@ -256,10 +257,11 @@ class Links:
             matrix = matrix @ (se3.invert(self._fixed[link]) if inverse else self._fixed[link])
         return matrix
 
-    def _reading(self, source: Source, route: Route, found: Readings) -> Readings:
+    def _measured(self, source: Source, route: Route, found: Part) -> Part:
         numbers = found.numbers
         if route.inverse or route.link != (source.parent, source.child):
             links = se3.transform(se3.from_quat(numbers[:, 3:]), numbers[:, :3])
             poses = route.before @ (se3.invert(links) if route.inverse else links) @ route.after
             numbers = np.hstack([poses[:, :3, 3], se3.to_quat(poses[:, :3, :3])])
-        return Readings(found.stamps_ns, (source.parent, source.child), numbers)
+        frames = source.parent, source.child
+        return found._replace(source=source, strings=frames, numbers=numbers)

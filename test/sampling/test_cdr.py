@@ -16,7 +16,9 @@ from recorded import (
 )
 
 from calib_ros.sampling.cdr import alike, trajectory_size
-from calib_ros.sampling.messages import DECODERS, JOINT_STATE, Readings, readings_of, usable
+from calib_ros.sampling.message_filter import usable
+from calib_ros.sampling.messages import DECODERS, JOINT_STATE, readings_of
+from calib_ros.sampling.slices import Part
 
 NAMES = st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=12)
 NUMBERS = st.floats(-1e6, 1e6)
@@ -25,12 +27,11 @@ STAMPS = st.integers(0, 2**31 * 10**9 - 1)
 
 def decode(kind, blobs):
     """Return what messages of one layout say; None where they are of several or of none."""
-    found = alike(kind, blobs, {})
-    return (
-        next(found[0].readings())
-        if len(found) == 1 and len(found[0].which) == len(blobs)
-        else None
-    )
+    found = list(alike(kind, blobs, {}))
+    if len(found) != 1 or len(found[0][0]) != len(blobs):
+        return None
+    which, *held = found[0]
+    return Part(which, None, *held)
 
 
 def assert_decoded(kind, blobs):
@@ -39,7 +40,7 @@ def assert_decoded(kind, blobs):
     assert found.numbers.flags.writeable
     for k, blob in enumerate(blobs):
         ((stamp_ns, strings, numbers),) = readings_of(kind, TYPESTORE.deserialize_cdr(blob, kind))
-        assert (stamp_ns, strings) == (found.stamps_ns[k], found.strings)
+        assert (stamp_ns, strings) == (found.stamps[k], found.strings)
         np.testing.assert_array_equal(numbers, found.numbers[k])
 
 
@@ -92,7 +93,7 @@ def joint_blob(names, positions, frame_id='', stamp_ns=10**9, velocities=()):
 def test_of_more_layouts_than_there_are_names_the_others_are_left():
     blobs = [joint_blob([f'{k:03d}'], [float(k)]) for k in range(60)]
     found = alike(JOINT_STATE, blobs, {})
-    assert [next(each.readings()).strings[1] for each in found] == [f'{k:03d}' for k in range(50)]
+    assert [strings[1] for _, strings, *_ in found] == [f'{k:03d}' for k in range(50)]
 
 
 @pytest.mark.parametrize('cut', [3, 9, 14, 30, -9, -1])
@@ -113,8 +114,8 @@ def test_broken_messages_are_left_to_others(cut):
     ],
 )
 def test_what_cannot_be_used_is_told_by_its_cause(good, bad, cause):
-    found = Readings(np.array([5, 6, 0]), ('tracker',), np.array([good, bad, good]))
-    usable_, causes = usable('', found)
+    stamps, numbers = np.array([5, 6, 0]), np.array([good, bad, good])
+    usable_, causes = usable(Part(np.arange(3), None, ('tracker',), stamps, numbers))
     assert usable_.tolist() == [True, False, False]
     assert causes == {cause: 1, 'zero stamp (fill header.stamp where it is published)': 1}
 

@@ -29,8 +29,8 @@ from calib_ros.apply.simulation import measure, random_frame
 from calib_ros.errors import InputError
 from calib_ros.kinematics import se3
 from calib_ros.sampling.account import too_much_lost
-from calib_ros.sampling.message_filter import Part
-from calib_ros.sampling.messages import PICTURES, Readings
+from calib_ros.sampling.messages import PICTURES
+from calib_ros.sampling.slices import Part
 from calib_ros.sampling.sources import Source
 
 PERIOD = 2.0
@@ -287,12 +287,12 @@ def test_images_that_come_twice_are_no_loss():
     """As of a camera whose images are published raw and compressed: each has its own number."""
     motion, camera = tour(5), Source('image', PICTURES[0], board='board.yaml')
     times, seen = np.arange(0.0, 9.5, 0.01), np.repeat(np.arange(0.003, 9.2, 0.05), 2)
-    named = Readings(stamps(times), ('', *UR5E.joint_names), motion(times))
-    images = Readings(stamps(seen), ('camera',), 1.0 + np.arange(float(len(seen)))[:, np.newaxis])
+    named = ('', *UR5E.joint_names), stamps(times), motion(times)
+    images = ('camera',), stamps(seen), 1.0 + np.arange(float(len(seen)))[:, np.newaxis]
     places = np.argsort(np.argsort(np.concatenate([times, seen]), kind='stable'))
     first, second = np.split(places, [len(times)])
     made = CalibrationSession(UR5E)
-    made.take([Part(first, None, named), Part(second, camera, images)])
+    made.take([Part(first, None, *named), Part(second, camera, *images)])
     made.finish()
     dropped = made.account().dropped
     assert dropped['measurements: same stamp twice'] == len(seen) // 2
@@ -382,13 +382,13 @@ def test_clocks_of_two_devices_are_watched_as_of_one():
     """What one device sees lies elsewhere for the other: between them nothing moves."""
     motion, rng = tour(15), np.random.default_rng(3)
     times = np.arange(0.0, 29.5, 0.01)
-    come = [(times, None, Readings(stamps(times), ('', *UR5E.joint_names), motion(times)))]
+    come = [(times, None, ('', *UR5E.joint_names), stamps(times), motion(times))]
     for k, device in enumerate(('', 'B')):
         seen = np.arange(0.003 + 0.01 * k, 29.2, 0.02)
         found = measure(replace(TRUE, base=random_frame(rng, 1.0)), motion(seen), rng, 2e-5, 1e-4)
         rows = np.hstack([found.positions, se3.to_quat(found.rotations)])
         source = Source(f'tracker{device}', device=device)
-        come.append((seen + 0.3, source, Readings(stamps(seen + 0.3), ('tracker',), rows)))
+        come.append((seen + 0.3, source, ('tracker',), stamps(seen + 0.3), rows))
     order = np.argsort(np.concatenate([each for each, *_ in come]), kind='stable')
     places = np.split(np.argsort(order), np.cumsum([len(each) for each, *_ in come])[:-1])
     made = CalibrationSession(UR5E)
