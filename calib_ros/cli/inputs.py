@@ -16,7 +16,7 @@ from calib_ros.cli.screen import Screen
 from calib_ros.errors import InputError
 from calib_ros.estimation.observations import Observations
 from calib_ros.files import loading
-from calib_ros.files.bags import Replayed
+from calib_ros.files.bags import Replayed, replay
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.history import History
 from calib_ros.files.layouts import Layout, layout_of
@@ -140,8 +140,9 @@ def replayed_bag(
     path: Path, chain: Chain, settings: Settings, screen: Screen
 ) -> tuple[CalibrationSession, Replayed]:
     """Return a session that has replayed a bag."""
+    session = CalibrationSession(chain, settings)
     with screen.work(f'reading {path.name}') as work:
-        return loading.replayed(path, chain, settings, work)
+        return session, replay(path, session, work)
 
 
 def table_of(

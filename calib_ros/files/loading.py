@@ -14,7 +14,7 @@ from calib_ros.decision.reasons import Reason, Rule
 from calib_ros.decision.result import Identification
 from calib_ros.errors import ColumnsError, TooFewObservationsError
 from calib_ros.estimation.problem import Problem
-from calib_ros.files.bags import Replayed, replay
+from calib_ros.files.bags import Replayed
 from calib_ros.files.foreign import Foreign
 from calib_ros.files.layouts import Layout
 from calib_ros.files.tables import read_table
@@ -68,14 +68,6 @@ class Loaded:
             raise
         own = [e for e in result.refusals if not self.instead or e.rule in MEASURED]
         return replace(result, refusals=(*own, *self.refusals))
-
-
-def replayed(
-    path: Path, chain: Chain, settings: Settings, progress: Notify = quiet
-) -> tuple[CalibrationSession, Replayed]:
-    """Return a session that has replayed a bag."""
-    session = CalibrationSession(chain, settings)
-    return session, replay(path, session, progress)
 
 
 def of_bag(session: CalibrationSession, read: Replayed, largest_loss: float = 1.0) -> Loaded:

@@ -14,8 +14,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from calib_ros.errors import CalibrationError, ConfigError, shortened
+from calib_ros.files.bags import replay
 from calib_ros.files.history import is_local
-from calib_ros.files.loading import TABLES, of_bag, of_table, replayed, table
+from calib_ros.files.loading import TABLES, of_bag, of_table, table
 from calib_ros.files.rows import (
     Filing,
     Row,
@@ -31,6 +32,7 @@ from calib_ros.report.documents import configuration_yaml
 from calib_ros.report.page import Origin, render
 from calib_ros.report.poses import poses_of
 from calib_ros.report.reports import identification_report
+from calib_ros.sampling.session import CalibrationSession
 
 DATES = ('mtime', 'LastModified', 'last_modified', 'Last-Modified')
 SUMS = ('ETag', 'etag', 'CRC')  # names of checksums in file systems
@@ -122,7 +124,8 @@ def _outcome(task: Task) -> Outcome:
             sessions = (source.session,) if source.session else ()
             loaded = of_table(table(path, chain, settings, sessions), chain, settings)
         else:
-            loaded = of_bag(*replayed(path, chain, settings), robot.largest_loss)
+            session = CalibrationSession(chain, settings)
+            loaded = of_bag(session, replay(path, session), robot.largest_loss)
         problem, result = loaded.problem, loaded.identified(settings.model)
         time_of = measured_at(problem.all_sets, source.modified)
         known = (content, robot.settings_hash, source.name, source.fingerprint)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,18 +26,18 @@ from calib_ros.shown import Shown
 def collect(
     samples: Sequence[Sample],
     sigmas: tuple[float, float],
-    frames: Frames | None = None,
+    frames: Frames,
     posed: bool = False,
     observed: Callable[[Sequence[int]], Observations] | None = None,
-) -> tuple[tuple[Observations, ...], tuple[Observations, ...]]:
-    """Return sets of observations to fit and sets held out, one for each pair of frames.
+) -> Iterator[tuple[list[int], Observations]]:
+    """Yield the indices of the samples of each set, and its observations.
 
-    `sigmas` (position [m], orientation [rad]) are those of poses seen by a camera on the flange
-    without a covariance of their own. `frames` remembers the names given to earlier samples. With
-    `posed` the poses of boards are taken instead of their corners. If the samples are examples of
-    each kind only, `observed` returns the observations of one set by their indices.
+    Samples to fit and held out of each pair of frames make sets of their own. `sigmas` (position
+    [m], orientation [rad]) are those of poses seen by a camera on the flange without a covariance
+    of their own. `frames` remembers the names given to earlier samples. With `posed` the poses of
+    boards are taken instead of their corners. If the samples are examples of each kind only,
+    `observed` returns the observations of one set by their indices.
     """
-    frames = Frames() if frames is None else frames
     observed = observed or (lambda some: _observations([samples[k] for k in some], posed))
     groups: dict[tuple[Any, ...], list[int]] = {}
     for k, sample in enumerate(samples):
@@ -45,11 +45,9 @@ def collect(
         kind = (sample.socket, sample.plane, sample.distance is None, cornered)
         key = (*frames.of(sample), sample.eye_in_hand and not cornered, sample.validation, kind)
         groups.setdefault(key, []).append(k)
-    sets: tuple[list[Observations], list[Observations]] = ([], [])
-    for (base, tool, inverted, validation, _), members in groups.items():
+    for (base, tool, inverted, *_), members in groups.items():
         found = replace(observed(members), base=base, tool=tool)
-        sets[validation].append(found.inverted(sigmas) if inverted else found)
-    return tuple(sets[0]), tuple(sets[1])
+        yield members, found.inverted(sigmas) if inverted else found
 
 
 def lenses_by_frame(samples: Iterable[Sample], frames: Frames) -> dict[str, Lens]:
@@ -171,7 +169,9 @@ def dataset_of(
 ) -> Dataset:
     """Return the sets of samples with their frames; arguments as in `collect`."""
     frames = Frames()
-    fitted, held_out = collect(samples, sigmas, frames, posed, observed)
+    sets: tuple[list[Observations], list[Observations]] = ([], [])  # fitted, held out
+    for members, found in collect(samples, sigmas, frames, posed, observed):
+        sets[samples[members[0]].validation].append(found)
     pairs, world_frame = tuple(socket_pairs(samples, frames)), samples[0].frame_id  # of `base`
     cameras = {} if posed else lenses_by_frame(samples, frames)
-    return Dataset(fitted, held_out, pairs, world_frame, cameras, frames.owners)
+    return Dataset(*sets, pairs, world_frame, cameras, frames.owners)

@@ -19,7 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -226,15 +226,8 @@ class LiveEstimate:
         return rows > 2 * len(self._names)
 
     def _groups(self, samples: Sequence[Sample]) -> list[tuple[list[Sample], Observations]]:
-        groups: dict[tuple[Any, ...], list[Sample]] = {}
-        for sample in samples:
-            key = (*self._frames.of(sample), sample.distance is None, sample.eye_in_hand)
-            groups.setdefault(key, []).append(sample)
-        found = []
-        for members in groups.values():
-            ((observations,), _) = collect(members, self._sigmas, self._frames, posed=True)
-            found.append((members, observations))
-        return found
+        found = collect(samples, self._sigmas, self._frames, posed=True)
+        return [([samples[k] for k in members], each) for members, each in found]
 
     def _system(
         self, groups: Sequence[tuple[list[Sample], Observations]], prior: Prior | None = None

@@ -368,8 +368,7 @@ class CalibrationSession:
         since = since[-most:] if most else since
         # without owners, the first device and target have the frames
         frames = Frames(calibration.owners) if calibration.owners else named(self.usable)
-        found = collect(since, self.settings.sigmas, frames)
-        sets = [each for part in found for each in part]
+        sets = [each for _, each in collect(since, self.settings.sigmas, frames)]
         if not sets:
             raise InputError('no poses since the calibration came into use: measure some new ones')
         known = calibration.chain.frame_names

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, strategies as st
 
-from calib_ros.sampling.dataset import collect
+from calib_ros.sampling.dataset import dataset_of
 from calib_ros.sampling.sample import Frames, Sample
 
 SIGMAS = (1e-4, 3e-4)
@@ -55,13 +55,14 @@ def test_frames_are_shared_by_those_that_share_them_and_by_no_others(many):
     assert len(owners) == len({(name[:4], *owner) for name, owner in owners.items()})
 
 
-@given(labels)
+@given(labels.filter(bool))
 def test_every_sample_is_in_one_set(many):
     samples = [
         replace(labelled(*label), stamp_ns=k + 1, validation=k % 3 == 0)
         for k, label in enumerate(many)
     ]
-    fitted, held_out = collect(samples, SIGMAS)
+    found = dataset_of(samples, SIGMAS)
+    fitted, held_out = found.fitted, found.held_out
     found = [int(stamp) for each in (*fitted, *held_out) for stamp in each.stamps_ns]
     assert sorted(found) == [sample.stamp_ns for sample in samples]
     judging = {int(stamp) for each in held_out for stamp in each.stamps_ns}
@@ -76,7 +77,7 @@ def test_what_only_some_samples_have_is_zero_or_blank():
         replace(PLAIN, covariance=covariance, velocity=speed, approach=speed),
         replace(PLAIN, stamp_ns=2, rotation=None, approach=-speed),
     ]
-    ((both,), _) = collect(mixed, SIGMAS)
+    (both,) = dataset_of(mixed, SIGMAS).fitted
     assert both.oriented.tolist() == [True, False]
     np.testing.assert_array_equal(both.covariance[0], covariance)
     assert np.isnan(both.covariance[1]).all()
