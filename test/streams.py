@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: calib_ros contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Messages by their attributes alone, and streams of them from a moving arm."""
-
-from types import SimpleNamespace
+"""Streams of messages from a moving arm."""
 
 import numpy as np
+import recorded
 
 from calib_ros.kinematics import se3
 from calib_ros.sampling.batches import Stream, feed
@@ -46,40 +45,18 @@ def hear(session, joints, measured):
     session.take([named, Part(second, TRACKER, ('tracker',), seen_stamps, positions)])
 
 
-def header(stamp_ns, frame_id='tracker'):
-    seconds, nanoseconds = divmod(int(stamp_ns), S)
-    return SimpleNamespace(
-        stamp=SimpleNamespace(sec=seconds, nanosec=nanoseconds), frame_id=frame_id
-    )
-
-
 def joint_state(stamp_ns, names, values):
-    return SimpleNamespace(header=header(stamp_ns, ''), name=list(names), position=values)
-
-
-def xyz(position):
-    return SimpleNamespace(**dict(zip('xyz', map(float, position), strict=True)))
-
-
-def xyzw(rotation):
-    quat = se3.to_quat(rotation).tolist()
-    return SimpleNamespace(**dict(zip('xyzw', quat, strict=True)))
+    return recorded.joint_state(stamp_ns, values, names)
 
 
 def pose(stamp_ns, position, rotation=None):
-    turn = xyzw(np.eye(3) if rotation is None else rotation)
-    both = SimpleNamespace(position=xyz(position), orientation=turn)
-    return SimpleNamespace(header=header(stamp_ns), pose=both)
+    turn = [] if rotation is None else [se3.to_quat(rotation).tolist()]
+    return recorded.pose_stamped(stamp_ns, position, *turn)
 
 
 def transform(stamp_ns, position, child, rotation=None):
-    turn = xyzw(np.eye(3) if rotation is None else rotation)
-    both = SimpleNamespace(translation=xyz(position), rotation=turn)
-    return SimpleNamespace(header=header(stamp_ns), child_frame_id=child, transform=both)
-
-
-def distance(stamp_ns, length):
-    return SimpleNamespace(header=header(stamp_ns), range=float(length))
+    turn = {} if rotation is None else {'quat': se3.to_quat(rotation).tolist()}
+    return recorded.transform_stamped(stamp_ns, position, child=child, **turn)
 
 
 def stops(configurations, move=1.0, stand=1.0):

@@ -4,13 +4,13 @@
 
 import numpy as np
 from hypothesis import Phase, given, settings, strategies as st
+from recorded import distance
 from streams import (
     MS,
     POSE,
     RANGE,
     START,
     TRANSFORM,
-    distance,
     joint_state,
     of_joints,
     pose,
