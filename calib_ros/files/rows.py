@@ -30,7 +30,7 @@ from calib_ros.shown import Shown
 from calib_ros.values import parse_name
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Filing:
     """Robot, time and source of a filed result."""
 
@@ -54,22 +54,16 @@ def parse_serial(value: object, where: str) -> str:
     return value
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Row(Shown):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Row(Shown, Filing):
     """A filed result; docs/fleet.md describes the columns.
 
     Figures are in mm and mrad; offsets and covariance (P, P) of the parameters `names` in m and
     rad; the parameters follow T waves of wobble of size `tilt` by `tilts` (P, T).
     """
 
-    serial: str
     kind: str
-    time: datetime
     verdict: str
-    inputs: str
-    settings: str
-    source: str = ''
-    fingerprint: str = ''
     software: str = calib_ros.__version__
     filed: datetime = field(default_factory=lambda: datetime.now(timezone.utc))
     model: str = ''

@@ -127,13 +127,11 @@ class Guide:
         if samples == self._advised or session.settings.mode == 'continuous':
             return
         self._advised = samples
-        if all(sample.validation for sample in samples):
-            return
         estimate = session.estimate
         try:
             problem = session.problem_of(samples)
             design = Design.of(problem, estimate)
-        except CalibrationError:  # shown by the status, or distances, which cannot be planned
+        except CalibrationError:  # shown by the status, or nothing to fit, or distances
             return
         taken = np.concatenate([each.joints for each in problem.sets])
         if estimate is None:

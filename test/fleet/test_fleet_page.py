@@ -26,8 +26,8 @@ CHANGE = Change(plants.when(1), plants.when(1), (REASON,))
 
 
 def status(serial, errors=None, changes=(), errors_mm=(0.1, 0.1, 0.1), **more):
-    rows = [Row(serial, 'identify', plants.when(k), 'accepted', '', '') for k in range(3)]
-    rows = [replace(row, rms_mm=0.1 + 0.01 * k, **more) for k, row in enumerate(rows)]
+    about = {'kind': 'identify', 'verdict': 'accepted'} | more
+    rows = [Row(serial, plants.when(k), '', '', rms_mm=0.1 + 0.01 * k, **about) for k in range(3)]
     nights = [Night(row, {'a': 0.5, '<b>': 6.0}) for row in rows]
     robot = Robot(serial, load_chain('ur10e'), (Pattern('*'),), tolerance=0.11)
     watched = Watched(tuple(nights), changes)

@@ -151,7 +151,8 @@ def test_sessions_without_stamps_are_nights_and_a_night_put_right_is_no_other_se
     """Both sessions have the date of their table, and so its time."""
     history, robot = History(tmp_path / 'history'), plant[0]
     settings = robot.settings_hash
-    row = Row('A', 'identify', plants.when(0), 'accepted', '0', settings, 'a#A', chain=CHAIN)
+    about = {'kind': 'identify', 'verdict': 'accepted', 'chain': CHAIN}
+    row = Row('A', plants.when(0), '0', settings, 'a#A', **about)
     corrected = replace(row, inputs='1', filed=row.filed + timedelta(hours=1))
     other = replace(row, inputs='2', source='a#B')
     for each in (row, corrected, other):
@@ -165,7 +166,8 @@ def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
     history, robot = History(tmp_path / 'history'), plant[0]
     day = timedelta(days=1)
     settings = robot.settings_hash
-    row = Row('A', 'identify', plants.when(0), 'accepted', '0', settings, 'a.csv', chain=CHAIN)
+    about = {'kind': 'identify', 'verdict': 'accepted', 'chain': CHAIN}
+    row = Row('A', plants.when(0), '0', settings, 'a.csv', **about)
     rows = [
         replace(row, time=plants.when(k), filed=plants.when(k) + day / 4, inputs=str(k))
         for k in range(4)
@@ -190,7 +192,8 @@ def test_a_clock_that_is_wrong_hides_no_newer_night(plant, tmp_path):
 
 def test_poses_verified_twice_count_once(plant, tmp_path):
     errors = {'rms_mm': 0.1, 'rms_freedom': 30.0}
-    row = Row('A', 'verify', plants.when(0), 'holds', 'poses', 'settings', chain='{}', **errors)
+    about = {'kind': 'verify', 'verdict': 'holds', 'chain': '{}'}
+    row = Row('A', plants.when(0), 'poses', 'settings', **about, **errors)
     others = (
         replace(row, settings='with a tolerance', filed=row.filed + timedelta(days=1)),
         replace(row, chain='[]'),
@@ -277,7 +280,8 @@ def test_a_row_that_is_no_more_costs_its_robot_only(plant, cluster, tmp_path):
     assert (second.robot.serial, second.state) == ('B', 'fine')
     for number, rms in enumerate((0.1, 0.1, 0.5)):
         errors = {'rms_mm': rms, 'rms_freedom': 30.0}
-        history.file(Row('B', 'verify', plants.when(number), 'holds', str(number), 's', **errors))
+        about = {'kind': 'verify', 'verdict': 'holds'}
+        history.file(Row('B', plants.when(number), str(number), 's', **about, **errors))
     worst = statuses(plant, history, found, 100.0)[0]
     assert (worst.robot.serial, worst.state) == ('B', 'worse')
     assert worst.alarms == ('2025-10-11: the errors of its verifications have grown',)
