@@ -39,6 +39,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState, Range
 from std_msgs.msg import Header
@@ -49,6 +50,7 @@ from calib_ros.files.recording import Recording
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.ros import advisor as advisor_module, inputs as inputs_module, node as node_module
+from calib_ros.ros.inputs import deserialised
 from calib_ros.ros.node import CalibrationNode
 from calib_ros.sampling.batches import Stream, feed
 from calib_ros.sampling.messages import JOINT_STATE
@@ -374,10 +376,10 @@ def direct(recording, **settings):
     messages = [*joint_messages(recording), *pose_messages(recording.poses)]
     pose, joints = Stream('poses', STANDARD[0].type, STANDARD[0]), Stream('joints', JOINT_STATE)
     batch = [
-        (pose if isinstance(message, PoseStamped) else joints, message)
+        (pose if isinstance(message, PoseStamped) else joints, serialize_message(message))
         for message in sorted(messages, key=stamp_ns)
     ]
-    assert feed(session, batch, lambda message, kind: message) == []
+    assert feed(session, batch, deserialised) == []
     return session
 
 

@@ -22,8 +22,11 @@ TRACKER = Source('measured_pose')
 
 def take(session, *come):
     """Let a session take messages (source or None for joints, type, message) in their order."""
-    batch = [(Stream(source.topic if source else '', kind, source), m) for source, kind, m in come]
-    assert feed(session, batch, lambda message, kind: message) == []
+    batch = [
+        (Stream(source.topic if source else '', kind, source), recorded.serialised(message))
+        for source, kind, message in come
+    ]
+    assert feed(session, batch, recorded.TYPESTORE.deserialize_cdr) == []
 
 
 def of_joints(message):

@@ -28,7 +28,6 @@ from calib_ros.sampling.messages import (
     MessageError,
     Reading,
     frame_name,
-    head_of,
     readings_of,
 )
 from calib_ros.sampling.pictures import Pictures
@@ -40,9 +39,9 @@ from calib_ros.texts import LARGEST_TABLE
 
 BATCH = 2000  # messages taken at once (benchmarks/bags.py, benchmarks/soak.py)
 OF_CAMERAS = (*PICTURES, CAMERA_INFO)
-Deserialise: TypeAlias = Callable[[Any, str], Any]  # converts bytes and a type to a message
-Batch: TypeAlias = 'Sequence[tuple[Stream, Any]]'
-"""Streams and their messages, serialised or not, in order of arrival."""
+Deserialise: TypeAlias = Callable[[bytes, str], Any]  # converts bytes and a type to a message
+Batch: TypeAlias = 'Sequence[tuple[Stream, bytes]]'
+"""Streams and their serialised messages, in order of arrival."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ def links_of(streams: Iterable[Stream]) -> list[Links]:
 
 def batches(
     messages: Iterator[tuple[Stream, bytes]],
-) -> Iterator[tuple[list[tuple[Stream, bytes]], Exception | None]]:
+) -> Iterator[tuple[Batch, Exception | None]]:
     """Yield batches of messages; the last one has the error that ended them, if any."""
     error, ended = None, False
     while not ended:
@@ -161,8 +160,8 @@ def _read(
     single: list[int] = []
     groups: dict[tuple[str, int], list[int]] = {}
     for place, (stream, data) in enumerate(batch):
-        whole = stream.type in OF_CAMERAS or not isinstance(data, bytes)
-        group = single if whole else groups.setdefault((stream.topic, len(data)), [])
+        of_camera = stream.type in OF_CAMERAS
+        group = single if of_camera else groups.setdefault((stream.topic, len(data)), [])
         group.append(place)
     for group in groups.values():
         stream, places = batch[group[0]][0], np.array(group)
@@ -196,7 +195,7 @@ def _read(
 
 
 def _kept(
-    stream: Stream, data: Any, message: Callable[[], Any], pictures: Pictures | None
+    stream: Stream, data: bytes, message: Callable[[], Any], pictures: Pictures | None
 ) -> list[Reading]:
     """Keep an image, or learn from a CameraInfo; return the stamp and number of an image."""
     if stream.source is None or pictures is None:
@@ -204,7 +203,6 @@ def _kept(
     if stream.type == CAMERA_INFO:
         pictures.cameras[stream.source.topic].learn(message())
         return []
-    serialised = isinstance(data, bytes)
-    stamp_ns, frame_id = read_header(data) if serialised else head_of(message())
-    number = pictures.keep(stream.source.topic, len(data) if serialised else 0, message)
+    stamp_ns, frame_id = read_header(data)
+    number = pictures.keep(stream.source.topic, len(data), message)
     return [(stamp_ns, (frame_id,), (float(number),))]

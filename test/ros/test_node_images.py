@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rclpy.serialization import serialize_message
 from recorded import TYPES, serialised, write
 from ros_cell import PATIENCE, START, Cell, header, joint_messages, stamp_ns
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, RegionOfInterest
@@ -31,6 +32,7 @@ from calib_ros.files.tables import read_table
 from calib_ros.kinematics import se3
 from calib_ros.kinematics.chain_file import load_chain
 from calib_ros.kinematics.lens import Lens
+from calib_ros.ros.inputs import deserialised
 from calib_ros.sampling import pictures
 from calib_ros.sampling.batches import Stream, feed, source_streams
 from calib_ros.sampling.messages import CAMERA_INFO, JOINT_STATE, PICTURES
@@ -132,8 +134,8 @@ def directly(come, given):
     session = CalibrationSession(load_chain('ur10e'), Settings(sources=given))
     session.pictures.cameras, session.pictures.patient = cameras_of(given), True
     streams = streams_of(given)
-    batch = [(streams[topic], message) for topic, message in come]
-    assert feed(session, batch, lambda message, kind: message) == []
+    batch = [(streams[topic], serialize_message(message)) for topic, message in come]
+    assert feed(session, batch, deserialised) == []
     return session
 
 
@@ -261,8 +263,9 @@ def test_images_that_come_while_others_are_looked_at_are_counted_and_hold_up_not
     camera = Slow()
     session.pictures.cameras = {TOPICS[Image]: camera}
     come = [each for each in messages(shift, Image) if not isinstance(each[1], CameraInfo)]
-    batch = [(streams_of(given)[topic], message) for topic, message in come]
-    assert feed(session, batch, lambda message, kind: message) == []
+    streams = streams_of(given)
+    batch = [(streams[topic], serialize_message(message)) for topic, message in come]
+    assert feed(session, batch, deserialised) == []
     assert session.account().joint_states == len(shift[0])  # none has waited
     assert (
         session.account().dropped['measurements: image while others were processed'] > STOPS // 2

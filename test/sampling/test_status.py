@@ -193,7 +193,10 @@ def test_a_joint_that_moves_but_is_not_in_the_chain_is_told():
     (note,) = made.account().notes
     assert note.endswith('finger, rail')
     hands = [f'finger {k}' for k in range(40)]
-    take(made, *(of_joints(joint_state(3 * 10**18 + k, hands, [0.1 * k] * 40)) for k in range(2)))
+    take(
+        made,
+        *(of_joints(joint_state(2 * 10**18 + 1 + k, hands, [0.1 * k] * 40)) for k in range(2)),
+    )
     (note,) = made.account().notes
     assert note.endswith(' more')
 
